@@ -40,7 +40,7 @@ def _decay(v, s):
 def weight_sums(n, v, s):
     """Sums of the weights, and of their squares, of ``n`` differences."""
     v, s, q, theta = _decay(v, s)
-    both = 1.0 + math.exp(-(n + 1) * theta)
+    mirrored = 1.0 + math.exp(-(n + 1) * theta)
     total = 0.0
     squares = 0.0
     if (n + 1) * theta < _SMALL:
@@ -48,13 +48,13 @@ def weight_sums(n, v, s):
             w = math.expm1(-i * theta) * math.expm1(-(n + 1 - i) * theta)
             total += w
             squares += w * w
-        return total / (both * v), squares / (both * v) ** 2
+        return total / (mirrored * v), squares / (mirrored * v) ** 2
     power = math.exp(-n * theta)
     # sums of l^i and of l^(2 i)
     first = (1.0 - power) / q
     second = (1.0 - power * power) / (q * (2.0 + q))
-    total = n - 2.0 * first / both
-    squares = n - (4.0 * first - 2.0 * (second + n * (both - 1.0)) / both) / both
+    total = n - 2.0 * first / mirrored
+    squares = n - (4.0 * first - 2.0 * (second + n * (mirrored - 1.0)) / mirrored) / mirrored
     return total / v, squares / (v * v)
 
 
@@ -62,7 +62,8 @@ def weight_sums(n, v, s):
 def difference_weight(i, n, v, s):
     """Weight w_i of difference i (from 1) of ``n``, and (C^-1)_ii."""
     v, s, q, theta = _decay(v, s)
-    f, g = -math.expm1(-i * theta), -math.expm1(-(n + 1 - i) * theta)
+    f = -math.expm1(-i * theta)
+    g = -math.expm1(-(n + 1 - i) * theta)
     end = -math.expm1(-2 * (n + 1) * theta)
     # 1 + l^(n+1), by l^i = 1 - f
     weight = f * g / (v * (1.0 + (1.0 - f) * (1.0 - g)))

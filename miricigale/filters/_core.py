@@ -5,7 +5,8 @@ import numpy as np
 # Gauss-Legendre on each piece, where F and T are linear: the integrand is a quadratic over
 # the wavelength, exact to rounding for the narrow pieces that `refine` leaves
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
-_NODES, _WEIGHTS = 0.5 * (_NODES + 1), 0.5 * _WEIGHTS
+_NODES = 0.5 * (_NODES + 1)
+_WEIGHTS = 0.5 * _WEIGHTS
 
 _LARGEST_RATIO = 1.05
 
@@ -43,7 +44,8 @@ def band_weights(wave, band_wave, throughput, norm):
     ``wave`` of the first weight, and the weights: sum 1, or less by the share of the band that
     ``wave`` does not cover.
     """
-    low, high = max(band_wave[0], wave[0]), min(band_wave[-1], wave[-1])
+    low = max(band_wave[0], wave[0])
+    high = min(band_wave[-1], wave[-1])
     if not low < high:
         return 0, np.zeros(0)
     # indices of the values that can matter
@@ -56,15 +58,18 @@ def band_weights(wave, band_wave, throughput, norm):
         inside = band_wave[(band_wave >= low) & (band_wave <= high)]
     edges = np.concatenate([inside, nodes[(nodes >= low) & (nodes <= high)]])
     edges.sort(kind="stable")
-    left, step = edges[:-1], np.diff(edges)
+    low_edge = edges[:-1]
+    step = np.diff(edges)
     values = np.interp(edges, band_wave, throughput)
     rise = np.diff(values)
     # the piece of the spectrum that each piece of the union lies on
-    k = np.clip(np.searchsorted(nodes, left + 0.5 * step, side="right") - 1, 0, nodes.size - 2)
-    start, length = nodes[k], nodes[k + 1] - nodes[k]
-    to_left, to_right = np.zeros(left.size), np.zeros(left.size)
+    k = np.clip(np.searchsorted(nodes, low_edge + 0.5 * step, side="right") - 1, 0, nodes.size - 2)
+    start = nodes[k]
+    length = nodes[k + 1] - nodes[k]
+    to_left = np.zeros(low_edge.size)
+    to_right = np.zeros(low_edge.size)
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-        lam = left + node * step
+        lam = low_edge + node * step
         amount = weight * step * (values[:-1] + node * rise) / lam
         share = (lam - start) / length
         to_right += amount * share

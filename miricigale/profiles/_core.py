@@ -34,7 +34,8 @@ TABLE_SIZE = 600
 
 #: Largest relative change of the brightness within a cell (exponent) for which one value with
 #: the Laplacian does, and for which 3 x 3 points do.
-_LAPLACIAN, _GAUSS3 = 0.12, 1.0
+_LAPLACIAN = 0.12
+_GAUSS3 = 1.0
 
 _NODES8, _WEIGHTS8 = np.polynomial.legendre.leggauss(8)
 _NODES3, _WEIGHTS3 = np.polynomial.legendre.leggauss(3)
@@ -71,20 +72,26 @@ def _lookup(log_r, table):
 @njit(cache=True, nogil=True)
 def _edge(x1, y1, x2, y2, table, out):
     """Add the light (times 2 pi / total) and its first moments of the triangle (0, P1, P2)."""
-    ex, ey = x2 - x1, y2 - y1
+    ex = x2 - x1
+    ey = y2 - y1
     length = math.hypot(ex, ey)
     cross = x1 * y2 - x2 * y1
     d = abs(cross) / length
     if d < 1e-13 * length:
         return
     sign = 1.0 if cross > 0.0 else -1.0
-    ex, ey = ex / length, ey / length
+    ex = ex / length
+    ey = ey / length
     t1 = x1 * ex + y1 * ey
     t2 = x2 * ex + y2 * ey
-    nx, ny = (x1 - t1 * ex) / d, (y1 - t1 * ey) / d
-    u1, u2 = math.asinh(t1 / d), math.asinh(t2 / d)
+    nx = (x1 - t1 * ex) / d
+    ny = (y1 - t1 * ey) / d
+    u1 = math.asinh(t1 / d)
+    u2 = math.asinh(t2 / d)
     log_d = math.log(d)
-    light, moment_n, moment_e = 0.0, 0.0, 0.0
+    light = 0.0
+    moment_n = 0.0
+    moment_e = 0.0
     n_panels = max(1, math.ceil(u2 - u1))
     step = (u2 - u1) / n_panels
     for k in range(n_panels):
@@ -107,9 +114,14 @@ def _exact_cell(dx, dy, size, par, table, out):
     """Light and centroid of a square cell by its edges."""
     h = 0.5 * size
     out[0] = out[1] = out[2] = 0.0
-    xx, xy, yx, yy = par[4], par[5], par[6], par[7]
-    px, py = dx - h, dy - h
-    x0, y0 = xx * px + xy * py, yx * px + yy * py
+    xx = par[4]
+    xy = par[5]
+    yx = par[6]
+    yy = par[7]
+    px = dx - h
+    py = dy - h
+    x0 = xx * px + xy * py
+    y0 = yx * px + yy * py
     sx, sy = xx * size, yx * size  # one cell to the right
     tx, ty = xy * size, yy * size  # one cell up
     _edge(x0, y0, x0 + sx, y0 + sy, table, out)
@@ -119,7 +131,8 @@ def _exact_cell(dx, dy, size, par, table, out):
     scale = par[2] / (2.0 * math.pi)
     light = out[0]
     if light > 1e-12:
-        cx, cy = out[1] / light, out[2] / light
+        cx = out[1] / light
+        cy = out[2] / light
         det = xx * yy - xy * yx
         ox = (yy * cx - xy * cy) / det - dx
         oy = (xx * cy - yx * cx) / det - dy
@@ -148,15 +161,19 @@ def cell(dx, dy, size, par, table, out):
     out : array, shape (3,)
         Filled with the light and the offset of its centroid from the cell's center.
     """
-    a, b, c = par[8], par[9], par[10]
-    gx, gy = a * dx + b * dy, b * dx + c * dy
+    a = par[8]
+    b = par[9]
+    c = par[10]
+    gx = a * dx + b * dy
+    gy = b * dx + c * dy
     w = gx * dx + gy * dy
     # largest change of w within the cell
     change = size * (abs(gx) + abs(gy)) + 0.25 * size * size * (a + c + 2.0 * abs(b))
     if change > 0.4 * w:
         _exact_cell(dx, dy, size, par, table, out)
         return
-    power, bn = par[11], par[12]
+    power = par[11]
+    bn = par[12]
     z = bn * math.exp(power * math.log(w))
     slope = power * z / w  # -d ln f / d w
     out[1] = out[2] = 0.0
@@ -172,15 +189,20 @@ def cell(dx, dy, size, par, table, out):
         out[1] = -2.0 * slope * gx * size * size / 12.0
         out[2] = -2.0 * slope * gy * size * size / 12.0
         return
-    nodes, weights = _NODES6, _WEIGHTS6
+    nodes = _NODES6
+    weights = _WEIGHTS6
     if slope * change < _GAUSS3:
-        nodes, weights = _NODES3, _WEIGHTS3
-    light, mx, my = 0.0, 0.0, 0.0
+        nodes = _NODES3
+        weights = _WEIGHTS3
+    light = 0.0
+    mx = 0.0
+    my = 0.0
     for i in range(nodes.size):
         oy = 0.5 * size * nodes[i]
         for j in range(nodes.size):
             ox = 0.5 * size * nodes[j]
-            x, y = dx + ox, dy + oy
+            x = dx + ox
+            y = dy + oy
             w = a * x * x + 2.0 * b * x * y + c * y * y
             f = weights[i] * weights[j] * math.exp(-bn * math.exp(power * math.log(w)))
             light += f

@@ -68,22 +68,30 @@ def _box(sums, y0, y1, x0, x1):
 def share_row(land, i, j0, share):
     """Fill in what part of the light deposited on a row's nodes from ``j0`` on lands."""
     os_ = land.oversampling
-    y0, y1 = land.low_y[i], land.high_y[i]
+    y0 = land.low_y[i]
+    y1 = land.high_y[i]
     share[:] = 0.0
     if y1 <= y0:
         return
-    low_x, high_x, k_x, t_x = land.low_x, land.high_x, land.k_x, land.t_x
+    low_x = land.low_x
+    high_x = land.high_x
+    k_x = land.k_x
+    t_x = land.t_x
     for m in range(2):
         w_y = land.t_y[i] if m else 1.0 - land.t_y[i]
         if w_y == 0.0:
             continue
-        sums, order = land.sums[:, i % os_], land.order[land.k_y[i] + m]
+        sums = land.sums[:, i % os_]
+        order = land.order[land.k_y[i] + m]
         for n in range(share.size):
             j = j0 + n
-            x0, x1 = low_x[j], high_x[j]
+            x0 = low_x[j]
+            x1 = high_x[j]
             if x1 <= x0:
                 continue
-            phase, k, t = j % os_, k_x[j], t_x[j]
+            phase = j % os_
+            k = k_x[j]
+            t = t_x[j]
             part = _box(sums[order[k], phase], y0, y1, x0, x1)
             if t != 0.0:
                 part += t * (_box(sums[order[k + 1], phase], y0, y1, x0, x1) - part)
@@ -109,14 +117,21 @@ def point_nodes(x, y, flux, land):
     Returns row, column and light of each node that gets any, and the light of each point that lands
     on the image.
     """
-    ny, nx = land.low_y.size, land.low_x.size
-    rows, columns = np.empty(16 * x.size, np.int64), np.empty(16 * x.size, np.int64)
-    light, landed = np.empty(16 * x.size), np.zeros(x.size)
-    wy, wx, share = np.empty(4), np.empty(4), np.empty(4)
+    ny = land.low_y.size
+    nx = land.low_x.size
+    rows = np.empty(16 * x.size, np.int64)
+    columns = np.empty(16 * x.size, np.int64)
+    light = np.empty(16 * x.size)
+    landed = np.zeros(x.size)
+    wy = np.empty(4)
+    wx = np.empty(4)
+    share = np.empty(4)
     n = 0
     for k in range(x.size):
-        iy, ix = math.floor(y[k]), math.floor(x[k])
-        j0, j1 = max(ix - 1, 0), min(ix + 3, nx)
+        iy = math.floor(y[k])
+        ix = math.floor(x[k])
+        j0 = max(ix - 1, 0)
+        j1 = min(ix + 3, nx)
         if j1 <= j0:
             continue
         spline_weights(y[k] - iy, wy)
@@ -127,7 +142,8 @@ def point_nodes(x, y, flux, land):
                 continue
             share_row(land, i, j0, share[: j1 - j0])
             for j in range(j0, j1):
-                rows[n], columns[n] = i, j
+                rows[n] = i
+                columns[n] = j
                 light[n] = flux[k] * wy[a] * wx[j - ix + 1]
                 landed[k] += light[n] * share[j - j0]
                 n += 1
@@ -145,7 +161,8 @@ def deposit_nodes(grid, i, j, light):
 def _deposit(part, y, x, light, wy, wx):
     """Put one point's light on the nodes of a part of the grid; light outside it is dropped."""
     ny, nx = part.shape
-    iy, ix = math.floor(y), math.floor(x)
+    iy = math.floor(y)
+    ix = math.floor(x)
     if iy < -2 or ix < -2 or iy > ny or ix > nx:
         return
     spline_weights(y - iy, wy)
@@ -158,7 +175,8 @@ def _deposit(part, y, x, light, wy, wx):
 @njit(cache=True, nogil=True)
 def deposit_pieces(part, x, y, light):
     """Put pieces at ``x``, ``y`` (nodes) on a separate grid; parts outside it are dropped."""
-    wy, wx = np.empty(4), np.empty(4)
+    wy = np.empty(4)
+    wx = np.empty(4)
     for k in range(x.size):
         _deposit(part, y[k], x[k], light[k], wy, wx)
 
@@ -166,7 +184,8 @@ def deposit_pieces(part, x, y, light):
 @njit(cache=True, nogil=True)
 def add_part(grid, part, i0, j0, land):
     """Add a part to the grid at row ``i0`` and column ``j0``; return what lands on the image."""
-    total, share = 0.0, np.empty(part.shape[1])
+    total = 0.0
+    share = np.empty(part.shape[1])
     for i in range(part.shape[0]):
         share_row(land, i0 + i, j0, share)
         for j in range(part.shape[1]):
@@ -178,7 +197,9 @@ def add_part(grid, part, i0, j0, land):
 @njit(cache=True, nogil=True)
 def _row_span(par, dy, limit, n):
     """First and last column whose node lies within the ellipse w <= limit in a row."""
-    a, b, c = par[8], par[9], par[10]
+    a = par[8]
+    b = par[9]
+    c = par[10]
     root = b * b * dy * dy - a * (c * dy * dy - limit)
     if root < 0.0:
         return 1, 0
@@ -199,7 +220,9 @@ def fill_cusp(part, i0, j0, n_x, par, table, w_zone):
     done here.
     """
     size = 1.0 / SUB
-    wy, wx, out = np.empty(4), np.empty(4), np.empty(3)
+    wy = np.empty(4)
+    wx = np.empty(4)
+    out = np.empty(3)
     for i in range(i0, i0 + part.shape[0]):
         first, last = _row_span(par, i - par[1], w_zone, n_x)
         for j in range(first, last + 1):
@@ -253,8 +276,12 @@ def _add_row(row, share, first, last, low, high, light, shift_x, shift_y, w_ligh
 @njit(cache=True, nogil=True)
 def _smooth_deposit(par, dx, dy):
     """Deposit on a node where the profile is smooth: brightness and a sixth of the Laplacian."""
-    a, b, c, power = par[8], par[9], par[10], par[11]
-    gx, gy = a * dx + b * dy, b * dx + c * dy
+    a = par[8]
+    b = par[9]
+    c = par[10]
+    power = par[11]
+    gx = a * dx + b * dy
+    gy = b * dx + c * dy
     w = gx * dx + gy * dy
     z = par[12] * math.exp(power * math.log(w))
     slope = power * z / w
@@ -270,13 +297,11 @@ def _add_smooth(row, share, par, dy, first, last):
     if last < first:
         return landed
     x = first - par[0]
-    s0, s1, s2, s3, s4 = (
-        _smooth_deposit(par, x - 2 * STEP, dy),
-        _smooth_deposit(par, x - STEP, dy),
-        _smooth_deposit(par, x, dy),
-        _smooth_deposit(par, x + STEP, dy),
-        _smooth_deposit(par, x + 2 * STEP, dy),
-    )
+    s0 = _smooth_deposit(par, x - 2 * STEP, dy)
+    s1 = _smooth_deposit(par, x - STEP, dy)
+    s2 = _smooth_deposit(par, x, dy)
+    s3 = _smooth_deposit(par, x + STEP, dy)
+    s4 = _smooth_deposit(par, x + 2 * STEP, dy)
     for start in range(first, last + 1, STEP):
         s5 = _smooth_deposit(par, start - par[0] + 3 * STEP, dy)
         row[start] += s2
@@ -286,7 +311,11 @@ def _add_smooth(row, share, par, dy, first, last):
             value = q[0] * s0 + q[1] * s1 + q[2] * s2 + q[3] * s3 + q[4] * s4 + q[5] * s5
             row[start + m] += value
             landed += value * share[start + m]
-        s0, s1, s2, s3, s4 = s1, s2, s3, s4, s5
+        s0 = s1
+        s1 = s2
+        s2 = s3
+        s3 = s4
+        s4 = s5
     return landed
 
 
@@ -302,7 +331,9 @@ def fill_outskirts(grid, start, stop, rows, tables, w_zone, w_smooth, w_cut, lan
     the light of these rows that lands on the image.
     """
     ny, nx = grid.shape
-    light, shift_x, shift_y = np.empty(nx + 5), np.empty(nx + 5), np.empty(nx + 5)
+    light = np.empty(nx + 5)
+    shift_x = np.empty(nx + 5)
+    shift_y = np.empty(nx + 5)
     share = np.empty((stop - start, nx))
     os_ = land.oversampling
     for i in range(start, stop):
@@ -313,7 +344,8 @@ def fill_outskirts(grid, start, stop, rows, tables, w_zone, w_smooth, w_cut, lan
         else:
             share_row(land, i, 0, share[i - start])
     for k in range(rows.shape[0]):
-        par, table = rows[k], tables[k]
+        par = rows[k]
+        table = tables[k]
         half = math.sqrt(w_cut[k] * par[8] / (par[8] * par[10] - par[9] * par[9]))
         # cells of the rows just outside reach into this block
         lowest = max(start - 1, 0, math.ceil(par[1] - half))
@@ -328,26 +360,32 @@ def fill_outskirts(grid, start, stop, rows, tables, w_zone, w_smooth, w_cut, lan
             if smooth:
                 inner_first, inner_last = _row_span(par, dy, w_smooth[k], nx)
                 if start <= i < stop:
-                    row, own = grid[i], share[i - start]
+                    row = grid[i]
+                    share_of_row = share[i - start]
                     if inner_last < inner_first:
-                        total += _add_smooth(row, own, par, dy, first, last)
+                        total += _add_smooth(row, share_of_row, par, dy, first, last)
                     else:
-                        total += _add_smooth(row, own, par, dy, first, inner_first - 1)
-                        total += _add_smooth(row, own, par, dy, inner_last + 1, last)
+                        total += _add_smooth(row, share_of_row, par, dy, first, inner_first - 1)
+                        total += _add_smooth(row, share_of_row, par, dy, inner_last + 1, last)
                 # the cells that reach inner nodes of this row and its neighbors
-                first, last = nx, -1
+                first = nx
+                last = -1
                 for step in range(-1, 2):
-                    one, two = _row_span(par, dy + step, w_smooth[k], nx)
-                    if one <= two:
-                        first, last = min(first, one - 1), max(last, two + 1)
-                first, last = max(first, 0), min(last, nx - 1)
+                    first_column, two = _row_span(par, dy + step, w_smooth[k], nx)
+                    if first_column <= two:
+                        first = min(first, first_column - 1)
+                        last = max(last, two + 1)
+                first = max(first, 0)
+                last = min(last, nx - 1)
                 if last < first:
                     continue
             hole_first, hole_last = _row_span(par, dy, w_zone[k], nx)
             _fill_row(par, table, dy, first, last, hole_first, hole_last, light, shift_x, shift_y)
             for step in range(-1, 2):
                 if start <= i + step < stop:
-                    low, high, w_light = 0, nx - 1, 5 / 24
+                    low = 0
+                    high = nx - 1
+                    w_light = 5 / 24
                     if smooth:
                         low, high = _row_span(par, dy + step, w_smooth[k], nx)
                     if step == 0:

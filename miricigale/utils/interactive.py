@@ -14,7 +14,7 @@ from miricigale.utils.positions import sky_as_angles
 
 def _no_attribute(owner, label, name, names):
     """The error of an attribute that is not there, with the nearest names or all of them."""
-    known = [one for one in dir(owner) if not one.startswith("_")]
+    known = [attribute for attribute in dir(owner) if not attribute.startswith("_")]
     near = difflib.get_close_matches(name, [*known, *names], n=3, cutoff=0.5)
     msg = f"{label} has no {name!r}; it has {', '.join(near or known)}"
     return AttributeError(msg, name=name, obj=owner)

@@ -57,10 +57,12 @@ def _add_tabulated(s0, s1, s2, s3, mean, slot, tables, out):
     if means[slot] != mean:
         first[slot], _ = fill_table(mean, steps[slot], guide[slot])
         means[slot] = mean
-    step, entry, least = steps[slot], guide[slot], first[slot]
+    step = steps[slot]
+    entry = guide[slot]
+    smallest = first[slot]
     for g in range(out.size):
         s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
-        out[g] += least + table_lookup(bits, step, entry)
+        out[g] += smallest + table_lookup(bits, step, entry)
     return s0, s1, s2, s3
 
 
@@ -90,17 +92,23 @@ def _draw_groups(state, mean, tables, out):
     if tables[0].size == 0 or mean > _TABLE_MEAN:
         _add_single(state, mean, out)
         return
-    s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
-    node, slot, rest = _node(mean)
+    s0 = state[0]
+    s1 = state[1]
+    s2 = state[2]
+    s3 = state[3]
+    node, slot, remainder = _node(mean)
     if node > 0.0:
         s0, s1, s2, s3 = _add_tabulated(s0, s1, s2, s3, node, slot, tables, out)
-    number = int(rest / _REST)
+    number = int(remainder / _REST)
     if number > 0:
         slot = _COARSE + number
         s0, s1, s2, s3 = _add_tabulated(s0, s1, s2, s3, number * _REST, slot, tables, out)
-        rest -= number * _REST
-    state[0], state[1], state[2], state[3] = s0, s1, s2, s3
-    for _ in range(int(poisson(state, rest * n_group))):
+        remainder -= number * _REST
+    state[0] = s0
+    state[1] = s1
+    state[2] = s2
+    state[3] = s3
+    for _ in range(int(poisson(state, remainder * n_group))):
         out[min(int(uniform(state) * n_group), n_group - 1)] += 1.0
 
 
@@ -141,8 +149,8 @@ def add_poisson(ramp, mean, key, first_row):
             for m in range(0, n, _PIXELS):
                 part = min(_PIXELS, n - m)
                 for j in range(part):
-                    one = min(mean[r, columns[m + j]], _MEAN_MAX)
-                    _draw_groups(state, one, tables, drawn[j])
+                    mean_charge = min(mean[r, columns[m + j]], _MEAN_MAX)
+                    _draw_groups(state, mean_charge, tables, drawn[j])
                 total[:] = 0.0
                 for g in range(n_group):
                     row = ramp[i, g, r]
@@ -241,7 +249,8 @@ def _deposits(key, first_row, n_detector_rows, n_row, n_col, n_slot, settings):
             charge = yield_median * strength * math.sqrt(thickness**2 + length**2)
             shower &= charge >= shower_above
             # walk through the pixels that the track crosses (Amanatides & Woo 1987)
-            px, py = math.floor(x), math.floor(y)
+            px = math.floor(x)
+            py = math.floor(y)
             step_x = 1 if dx > 0.0 else -1
             step_y = 1 if dy > 0.0 else -1
             next_x = ((px + (step_x > 0)) - x) / dx if dx != 0.0 else math.inf
@@ -269,7 +278,8 @@ def _deposits(key, first_row, n_detector_rows, n_row, n_col, n_slot, settings):
             if shower:
                 peak = shower_charge * strength / (2.0 * math.pi * shower_sigma**2)
                 r = math.ceil(3.0 * shower_sigma)
-                iy, ix = math.floor(y), math.floor(x)
+                iy = math.floor(y)
+                ix = math.floor(x)
                 for cy in range(max(iy - r, first_row), min(iy + r + 1, last_row)):
                     for cx in range(max(ix - r, 0), min(ix + r + 1, n_col)):
                         d2 = (cy + 0.5 - y) ** 2 + (cx + 0.5 - x) ** 2
@@ -310,19 +320,19 @@ def cosmic_ray_deposits(key, first_row, n_detector_rows, shape, settings):
     deposits, n, head = _deposits(
         key, first_row, n_detector_rows, n_row, n_col, n_int * n_group, settings
     )
-    where = np.empty((3, n), np.int32)
+    places = np.empty((3, n), np.int32)
     charge = np.empty(n)
     m = 0
     for slot in range(head.size):
         k = head[slot]
         while k >= 0:
-            where[0, m] = slot
-            where[1, m] = int(deposits[k, 1])
-            where[2, m] = int(deposits[k, 2])
+            places[0, m] = slot
+            places[1, m] = int(deposits[k, 1])
+            places[2, m] = int(deposits[k, 2])
             charge[m] = deposits[k, 3]
             m += 1
             k = int(deposits[k, 0])
-    return where, charge
+    return places, charge
 
 
 @njit(cache=True, nogil=True)

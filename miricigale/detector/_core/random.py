@@ -133,7 +133,10 @@ def _normal_edge(s, layer, x):
 @njit(cache=True, nogil=True)
 def fill_normals(s, out):
     """Fill a vector with standard normal numbers."""
-    s0, s1, s2, s3 = s[0], s[1], s[2], s[3]
+    s0 = s[0]
+    s1 = s[1]
+    s2 = s[2]
+    s3 = s[3]
     for i in range(out.size):
         while True:
             s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
@@ -142,13 +145,22 @@ def fill_normals(s, out):
             x = (float(bits >> _U11) * (2.0 * _TO_UNIT) - 1.0) * _ZIG_X[layer]
             if abs(x) < _ZIG_X[layer + 1]:
                 break
-            s[0], s[1], s[2], s[3] = s0, s1, s2, s3
+            s[0] = s0
+            s[1] = s1
+            s[2] = s2
+            s[3] = s3
             x = _normal_edge(s, layer, x)
-            s0, s1, s2, s3 = s[0], s[1], s[2], s[3]
+            s0 = s[0]
+            s1 = s[1]
+            s2 = s[2]
+            s3 = s[3]
             if x == x:
                 break
         out[i] = x
-    s[0], s[1], s[2], s[3] = s0, s1, s2, s3
+    s[0] = s0
+    s[1] = s1
+    s[2] = s2
+    s[3] = s3
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -180,33 +192,34 @@ def fill_table(mean, steps, guide):
     """
     mode = int(mean)
     # relative to the mode; what is left out is below a part in 10^18
-    least, p = mode, 1.0
-    while least > 0 and p > 1e-20:
-        p *= least / mean
-        least -= 1
+    smallest = mode
+    p = 1.0
+    while smallest > 0 and p > 1e-20:
+        p *= smallest / mean
+        smallest -= 1
     n = 0
     total = 0.0
-    while n < steps.size and (p > 1e-20 or least + n <= mode):
+    while n < steps.size and (p > 1e-20 or smallest + n <= mode):
         total += p
         n += 1
-        p *= mean / (least + n)
+        p *= mean / (smallest + n)
     # back to the lowest, as the sum is needed first
     p = 1.0
-    for k in range(mode, least, -1):
+    for k in range(mode, smallest, -1):
         p *= k / mean
     end = np.int64(1) << 53
-    below = 0.0
+    cumulative = 0.0
     for j in range(n):
-        below += p / total
-        steps[j] = min(np.int64(below * 2.0**53 + 0.5), end)
-        p *= mean / (least + j + 1)
+        cumulative += p / total
+        steps[j] = min(np.int64(cumulative * 2.0**53 + 0.5), end)
+        p *= mean / (smallest + j + 1)
     steps[n - 1] = end
     j = 0
     for part in range(GUIDE):
         while part * (end // GUIDE) >= steps[j]:
             j += 1
         guide[part] = j
-    return least, n
+    return smallest, n
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -232,8 +245,8 @@ def ptrs_rest(mean, a, b, inverse_alpha, log_mean, v, k, us):
     """The slow part of PTRS; negative if the pair is rejected."""
     if k < 0.0 or (us < 0.013 and v > us):
         return -1.0
-    left = math.log(v * inverse_alpha / (a / (us * us) + b))
-    return k if left <= k * log_mean - mean - log_factorial(k) else -1.0
+    log_ratio = math.log(v * inverse_alpha / (a / (us * us) + b))
+    return k if log_ratio <= k * log_mean - mean - log_factorial(k) else -1.0
 
 
 @njit(cache=True, nogil=True)

@@ -94,9 +94,11 @@ def add_pink_noise(ramp, sigma, n_octave, n_output, key, first_row, n_detector_r
 def digitize(ramp, counts, group_dq, flag_floor, flag_ceiling):
     """Round DN to ``counts`` (uint16), setting flags in ``group_dq`` out of their range."""
     n_int, n_group, n_row, n_col = ramp.shape
-    low, high = np.float32(-0.5), np.float32(65535.5)
+    low = np.float32(-0.5)
+    high = np.float32(65535.5)
     for i, g, r in np.ndindex(n_int, n_group, n_row):
-        smallest, largest = np.float32(0.0), np.float32(0.0)
+        smallest = np.float32(0.0)
+        largest = np.float32(0.0)
         for x in range(n_col):
             value = ramp[i, g, r, x]
             smallest = min(smallest, value)

@@ -5,7 +5,8 @@ import numpy as np
 from miricigale.sed._core.thermal import drude
 
 _BREAK = 0.0912  # nothing is attenuated at this wavelength and below
-_B, _V = 0.44, 0.55
+_B = 0.44
+_V = 0.55
 
 
 def leitherer_calzetti(wave):

@@ -28,17 +28,19 @@ def band_tables(start, band_wave, throughput):
     out = np.zeros((5, band_wave.size))
     bucket = np.zeros((start.size - 1, BUCKETS), dtype=np.int32)
     for band in range(start.size - 1):
-        first, last = start[band], start[band + 1] - 1
+        first = start[band]
+        last = start[band + 1] - 1
         for i in range(first, last + 1):
             out[2, i] = math.log(band_wave[i])
         for i in range(first, last):
             rise = (throughput[i + 1] - throughput[i]) / (band_wave[i + 1] - band_wave[i])
-            out[3, i], out[4, i] = throughput[i] - rise * band_wave[i], rise
+            out[3, i] = throughput[i] - rise * band_wave[i]
+            out[4, i] = rise
             step = band_wave[i + 1] - band_wave[i]
-            one = step * (throughput[i] + 0.5 * rise * step)
+            first_moment = step * (throughput[i] + 0.5 * rise * step)
             zero = out[3, i] * math.log1p(step / band_wave[i]) + rise * step
             out[0, i + 1] = out[0, i] + zero
-            out[1, i + 1] = out[1, i] + one
+            out[1, i + 1] = out[1, i] + first_moment
         width = (band_wave[last] - band_wave[first]) / BUCKETS
         i = first
         for k in range(BUCKETS):
@@ -57,10 +59,11 @@ def _moments_at(x, log_x, band, first, last, band_wave, moments, bucket):
     i = bucket[band, max(min(int((x - band_wave[first]) * scale), BUCKETS) - 1, 0)]
     while i < last - 1 and band_wave[i + 1] <= x:
         i += 1
-    step, rise = x - band_wave[i], moments[4, i]
+    step = x - band_wave[i]
+    rise = moments[4, i]
     zero = moments[0, i] + moments[3, i] * (log_x - moments[2, i]) + rise * step
-    one = moments[1, i] + step * (moments[3, i] + rise * (band_wave[i] + 0.5 * step))
-    return zero, one
+    first_moment = moments[1, i] + step * (moments[3, i] + rise * (band_wave[i] + 0.5 * step))
+    return zero, first_moment
 
 
 @njit(cache=True)
@@ -75,36 +78,46 @@ def band_means(wave, log_wave, fnu, start, band_wave, moments, bucket, tolerance
     """
     n = wave.size
     for band in range(start.size - 1):
-        first, last = start[band], start[band + 1] - 1
-        low, high = band_wave[first], band_wave[last]
+        first = start[band]
+        last = start[band + 1] - 1
+        low = band_wave[first]
+        high = band_wave[last]
         if wave[0] >= high or wave[n - 1] <= low:
             out[band] = np.nan
             continue
         scale = BUCKETS / (high - low)
-        begin, one, total = 0.0, 0.0, 0.0
+        begin = 0.0
+        first_moment = 0.0
+        total = 0.0
         j = np.searchsorted(wave, low, side="right") - 1
         if j < 0:
             j = 0
-            begin, one = _moments_at(
+            begin, first_moment = _moments_at(
                 wave[0], log_wave[0], band, first, last, band_wave, moments, bucket
             )
         zero = begin
         while True:
             if wave[j + 1] < high:
                 # `_moments_at`, whose call for each step would cost more than the step
-                right, log_right = wave[j + 1], log_wave[j + 1]
+                right = wave[j + 1]
+                log_right = log_wave[j + 1]
                 i = bucket[band, max(min(int((right - low) * scale), BUCKETS) - 1, 0)]
                 while i < last - 1 and band_wave[i + 1] <= right:
                     i += 1
-                step, rise = right - band_wave[i], moments[4, i]
+                step = right - band_wave[i]
+                rise = moments[4, i]
                 new_zero = moments[0, i] + moments[3, i] * (log_right - moments[2, i]) + rise * step
                 at = moments[3, i] + rise * band_wave[i]
                 new_one = moments[1, i] + step * (at + 0.5 * rise * step)
             else:
-                new_zero, new_one = moments[0, last], moments[1, last]
+                new_zero = moments[0, last]
+                new_one = moments[1, last]
             slope = (fnu[j + 1] - fnu[j]) / (wave[j + 1] - wave[j])
-            total += (fnu[j] - slope * wave[j]) * (new_zero - zero) + slope * (new_one - one)
-            zero, one = new_zero, new_one
+            total += (fnu[j] - slope * wave[j]) * (new_zero - zero) + slope * (
+                new_one - first_moment
+            )
+            zero = new_zero
+            first_moment = new_one
             if wave[j + 1] >= high or j == n - 2:
                 break
             j += 1

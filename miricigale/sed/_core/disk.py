@@ -26,7 +26,8 @@ def disk_spectrum(wave, delta=0.0, disk="skirtor"):
     breaks, slopes = DISKS[disk]
     slopes = (*slopes[:2], slopes[2] + delta, slopes[3])
     out = np.zeros(wave.shape)
-    value, total = 1.0, 0.0
+    value = 1.0
+    total = 0.0
     for low, high, slope in zip(breaks[:-1], breaks[1:], slopes, strict=True):
         inside = (wave >= low) & (wave <= high)
         out[inside] = value * (wave[inside] / low) ** slope
@@ -47,5 +48,5 @@ def disk_nodes(disk="skirtor", number=241):
     """
     breaks = DISKS[disk][0]
     first = breaks[0]
-    even = first * (30.0 / first) ** (np.arange(number) / (number - 1))
-    return np.unique(np.concatenate([[first * (1.0 - 1e-5)], even, breaks[:-1]]))
+    logarithmic = first * (30.0 / first) ** (np.arange(number) / (number - 1))
+    return np.unique(np.concatenate([[first * (1.0 - 1e-5)], logarithmic, breaks[:-1]]))

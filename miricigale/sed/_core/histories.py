@@ -18,7 +18,8 @@ def _exponential(n, tau, delayed):
     """Compute ``exp(-t / tau)``, or ``t exp(-t / tau)``, for t = 0 ... n - 1, up to a factor."""
     # a rising exponential is counted from its last step, so that nothing overflows
     zero = n - 1 if tau < 0.0 else 0
-    fine, out = np.empty(_BLOCK), np.empty(n)
+    fine = np.empty(_BLOCK)
+    out = np.empty(n)
     for i in range(_BLOCK):
         fine[i] = math.exp(-i / tau)
     for start in range(0, n, _BLOCK):
@@ -119,7 +120,8 @@ def age_steps(age, n_steps):
     k = np.arange(n_steps)
     cell, _ = cells(age, k + 0.1)
     inside = (k + 0.1 >= age[cell]) & (k + 1.0 <= age[cell + 1])
-    steps, mixed = k[inside], k[~inside]
+    steps = k[inside]
+    mixed = k[~inside]
     j, first, n = np.unique(cell[inside], return_index=True, return_counts=True)
     runs = np.array([steps[first], steps[first + n - 1] + 1, j], dtype=np.int64)
     rows = time_weights(age, n_steps)[mixed]
@@ -129,12 +131,14 @@ def age_steps(age, n_steps):
 @njit(cache=True, fastmath={"reassoc", "contract"})
 def _moments(history, first, last):
     """Sums of mass and of mass times (step - first), for steps counted back from the end."""
-    n, zero, one = history.size, 0.0, 0.0
+    n = history.size
+    zero = 0.0
+    first_moment = 0.0
     for i in range(last - first):
         rate = history[n - 1 - first - i]
         zero += rate
-        one += rate * i
-    return 1e6 * zero, 1e6 * one
+        first_moment += rate * i
+    return 1e6 * zero, 1e6 * first_moment
 
 
 @njit(cache=True)
@@ -163,8 +167,10 @@ def _split(history, n_young, age, runs, mixed, indptr, indices, data, mass):
             first = max(runs[0, r], n_young if part else 0)
             last = min(runs[1, r], n if part else min(n, n_young))
             if last > first:
-                zero, one = _moments(history, first, last)
-                old = (one + zero * (first + 0.55 - age[cell])) / (age[cell + 1] - age[cell])
+                zero, first_moment = _moments(history, first, last)
+                old = (first_moment + zero * (first + 0.55 - age[cell])) / (
+                    age[cell + 1] - age[cell]
+                )
                 mass[part, cell] += zero - old
                 mass[part, cell + 1] += old
         if runs[1, r] >= n:

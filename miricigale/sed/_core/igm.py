@@ -79,9 +79,11 @@ def _meiksin(wave, redshift, first, series, lines, depth):
         return out
     z1 = 1.0 + redshift
     if redshift <= 4.0:
-        amplitude, power = 0.00211, 3.7
+        amplitude = 0.00211
+        power = 3.7
     else:
-        amplitude, power = 0.00058, 4.5
+        amplitude = 0.00058
+        power = 4.5
     tau_alpha = amplitude * z1**power
     # powers of 1 + z = w / line, split into one of w and one of the line
     third = (0.25 / lines) ** (1.0 / 3.0)
@@ -96,30 +98,32 @@ def _meiksin(wave, redshift, first, series, lines, depth):
             tau += amplitude * (w / lines[0]) ** power
         cube = w ** (1.0 / 3.0)
         root = math.sqrt(cube)
-        rest = 0.0
+        series_depth = 0.0
         for j in range(1, lines.size):
             if w >= lines[j] * z1:
                 break
             if w <= lines[j]:
                 continue
             if j <= 3:  # n = 3, 4, 5
-                below = w < 4.0 * lines[j]
-                rest += depth[j] * (third[j] * cube if below else sixth[j] * root)
+                is_below_z3 = w < 4.0 * lines[j]
+                series_depth += depth[j] * (third[j] * cube if is_below_z3 else sixth[j] * root)
             elif j <= 7:
-                rest += depth[j] * third[j] * cube
+                series_depth += depth[j] * third[j] * cube
             else:
-                rest += depth[j] * third[7] * cube
-        tau += tau_alpha * rest
+                series_depth += depth[j] * third[7] * cube
+        tau += tau_alpha * series_depth
         x = w / LYMAN_LIMIT
         if x < z1:
             low = max(x, 1.0)  # 1 + z of the nearest absorber
             tau += 0.805 * x**3 * (1.0 / low - 1.0 / z1)
             lls = first * x**1.5 * (z1 - low)
-            far, near = (x / z1) ** 3, (x / low) ** 3
-            a, b = z1**2.5, low**2.5
+            far = (x / z1) ** 3
+            low_cube = (x / low) ** 3
+            a = z1**2.5
+            b = low**2.5
             for k in range(series.size):
                 a *= far
-                b *= near
+                b *= low_cube
                 lls -= series[k] * (a - b)
             tau += 0.25 * lls
         out[i] = math.exp(-tau)
@@ -133,13 +137,16 @@ def _meiksin(wave, redshift, first, series, lines, depth):
 
 def madau_transmission(wave, redshift):
     """Madau 1995: four lines and the continuum (footnote 3)."""
-    wave, z1, lines = np.asarray(wave, dtype=float), 1.0 + float(redshift), lyman_lines(6)
-    out, dimmed = np.ones(wave.size), wave < lines[0] * z1
+    wave = np.asarray(wave, dtype=float)
+    z1 = 1.0 + float(redshift)
+    lines = lyman_lines(6)
+    out = np.ones(wave.size)
+    dimmed = wave < lines[0] * z1
     w = wave[dimmed]
-    between = (w[:, None] < lines * z1) & (w[:, None] > lines)
-    tau = between @ (_MADAU * lines**-3.46) * w**3.46
-    behind = w < LYMAN_LIMIT * z1
-    x = w[behind] / LYMAN_LIMIT
+    in_forest = (w[:, None] < lines * z1) & (w[:, None] > lines)
+    tau = in_forest @ (_MADAU * lines**-3.46) * w**3.46
+    is_continuum = w < LYMAN_LIMIT * z1
+    x = w[is_continuum] / LYMAN_LIMIT
     low = np.maximum(x, 1.0)
     continuum = (
         0.25 * x**3 * (z1**0.46 - low**0.46)
@@ -148,7 +155,7 @@ def madau_transmission(wave, redshift):
         - 0.023 * (z1**1.68 - low**1.68)
     )
     # the last term is a fit that turns the sum negative far in the ultraviolet
-    tau[behind] += np.maximum(continuum, 0.0)
+    tau[is_continuum] += np.maximum(continuum, 0.0)
     out[dimmed] = np.exp(-tau)
     return out
 
@@ -186,8 +193,11 @@ def _inoue(wave, z1, lines, forest, damped):
         if w >= highest:
             continue
         log = math.log(w)
-        w12, w37, w55 = math.exp(1.2 * log), math.exp(3.7 * log), math.exp(5.5 * log)
-        w2, w3 = w * w, w * w * w
+        w12 = math.exp(1.2 * log)
+        w37 = math.exp(3.7 * log)
+        w55 = math.exp(5.5 * log)
+        w2 = w * w
+        w3 = w * w * w
         tau = 0.0
         for j in range(lines.size):
             line = lines[j]
@@ -233,23 +243,23 @@ def _inoue_forest(x, z1):
 @njit(cache=True)
 def _inoue_damped(x, z1):
     """Lyman continuum of damped systems, eq. 28 and 29."""
-    near = x**-0.3
+    root = x**-0.3
     if z1 < 3.0:
-        return 0.2113 * z1**2 - 0.07661 * z1**2.3 * near - 0.1347 * x**2
-    far = 0.04696 * z1**3 - 0.01779 * z1**3.3 * near
+        return 0.2113 * z1**2 - 0.07661 * z1**2.3 * root - 0.1347 * x**2
+    far = 0.04696 * z1**3 - 0.01779 * z1**3.3 * root
     if x < 3.0:
-        return 0.6340 + far - 0.1347 * x**2 - 0.2905 * near
+        return 0.6340 + far - 0.1347 * x**2 - 0.2905 * root
     return far - 0.02916 * x**3
 
 
 @njit(cache=True)
 def _inoue_damped_near(x, z1):
     """The same for x < 1: eq. 28 and 29 with their lower limit at redshift 0."""
-    near = x**-0.3
+    root = x**-0.3
     if z1 < 3.0:
-        tau = 0.2113 * (z1**2 - 1.0) - 0.07661 * (z1**2.3 - 1.0) * near
+        tau = 0.2113 * (z1**2 - 1.0) - 0.07661 * (z1**2.3 - 1.0) * root
     else:
-        far = 0.04696 * z1**3 - 0.01779 * z1**3.3 * near
-        tau = 0.6340 - 0.2113 + far - (0.2905 - 0.07661) * near
+        far = 0.04696 * z1**3 - 0.01779 * z1**3.3 * root
+        tau = 0.6340 - 0.2113 + far - (0.2905 - 0.07661) * root
     # the form holds where damped systems are opaque: not in the far ultraviolet
     return max(tau, 0.0)

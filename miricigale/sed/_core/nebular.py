@@ -47,10 +47,13 @@ def line_operator(wave, line_wave, width):
     """
     places = line_wave[:, None] * (1.0 + width * OFFSETS)
     nodes = merge_nodes([wave, *places])
-    rows, columns, data = [], [], []
+    rows = []
+    columns = []
+    data = []
     for k, place in enumerate(places):
         low, high = np.searchsorted(nodes, [place[0], place[-1]])
-        low, high = max(low - 1, 0), min(high + 2, nodes.size)
+        low = max(low - 1, 0)
+        high = min(high + 2, nodes.size)
         profile = np.interp(nodes[low:high], place, HEIGHTS, left=0.0, right=0.0)
         rows.append(np.arange(low, high))
         columns.append(np.full(high - low, k))

@@ -45,7 +45,8 @@ def hat_matrix(nodes, wave):
     cell, t = cells(nodes, wave)
     inside = (t >= 0) & (t <= 1)
     row = np.flatnonzero(inside)
-    cell, t = cell[inside], t[inside]
+    cell = cell[inside]
+    t = t[inside]
     data = np.concatenate([1 - t, t])
     index = (np.concatenate([row, row]), np.concatenate([cell, cell + 1]))
     return csr_matrix((data, index), shape=(wave.size, nodes.size))

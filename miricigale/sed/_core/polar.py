@@ -80,10 +80,17 @@ def add_polar(grid, face_on, disk, dust, ebv, temperature, beta, share, dims_dis
     directions, and torus and polar emission on the given scale: where that is not positive,
     nothing is scaled.
     """
-    absorption, front, exponent, thick, weight = grid[0], grid[1], grid[2], grid[3], grid[4]
+    absorption = grid[0]
+    front = grid[1]
+    exponent = grid[2]
+    thick = grid[3]
+    weight = grid[4]
     n = face_on.size
     parts = np.zeros((3, n))
-    power, total, lost, body = 0.0, 0.0, 0.0, 0.0
+    power = 0.0
+    total = 0.0
+    lost = 0.0
+    body = 0.0
     dusty = ebv > 0.0
     for i in range(n):
         power += weight[i] * face_on[i]

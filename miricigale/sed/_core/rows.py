@@ -24,17 +24,26 @@ def weighted_sums(weights, spectra):
         last = min(first + _TILE, n_wave)
         for i in range(weights.shape[0]):
             total = out[i, first:last]
-            some = np.flatnonzero(weights[i])
-            four = some.size - some.size % 4
+            used = np.flatnonzero(weights[i])
+            four = used.size - used.size % 4
             for k in range(0, four, 4):  # added one after the other, whatever their number
-                a, b, c, d = some[k], some[k + 1], some[k + 2], some[k + 3]
-                w, x, y, z = weights[i, a], weights[i, b], weights[i, c], weights[i, d]
-                p, q = spectra[a, first:last], spectra[b, first:last]
-                r, s = spectra[c, first:last], spectra[d, first:last]
+                a = used[k]
+                b = used[k + 1]
+                c = used[k + 2]
+                d = used[k + 3]
+                w = weights[i, a]
+                x = weights[i, b]
+                y = weights[i, c]
+                z = weights[i, d]
+                p = spectra[a, first:last]
+                q = spectra[b, first:last]
+                r = spectra[c, first:last]
+                s = spectra[d, first:last]
                 for j in range(last - first):
                     total[j] = (((total[j] + w * p[j]) + x * q[j]) + y * r[j]) + z * s[j]
-            for k in range(four, some.size):
-                w, p = weights[i, some[k]], spectra[some[k], first:last]
+            for k in range(four, used.size):
+                w = weights[i, used[k]]
+                p = spectra[used[k], first:last]
                 for j in range(last - first):
                     total[j] += w * p[j]
     return out
@@ -42,7 +51,20 @@ def weighted_sums(weights, spectra):
 
 @njit(cache=True)
 def mix_light(
-    weight, young, old, gas, star, dim_young, dim_old, dim_gas, dim, extra, dust, dusty, out, taken
+    weight,
+    young,
+    old,
+    gas,
+    star,
+    dim_young,
+    dim_old,
+    dim_gas,
+    dim,
+    extra,
+    dust,
+    dusty,
+    out,
+    absorbed,
 ):
     """
     Galaxies of one solar mass: attenuated starlight plus the dust that it heats.
@@ -68,7 +90,9 @@ def mix_light(
     """
     own_gas = gas.shape[0] > 0
     for i in range(star.size):
-        s, a, d = star[i], dim[i], dusty[i]
+        s = star[i]
+        a = dim[i]
+        d = dusty[i]
         lost = 0.0
         for j in range(weight.size):
             light = young[s, j] * dim_young[a, j] + old[s, j] * dim_old[a, j]
@@ -79,14 +103,14 @@ def mix_light(
             lost += weight[j] * (before - light)
             out[i, j] = light
         lost += extra[s]
-        taken[i] = lost
+        absorbed[i] = lost
         for j in range(weight.size):
             out[i, j] += lost * dust[d, j]
 
 
 @njit(cache=True)
 def block_fluxes(
-    wave, log_wave, to_lnu, light, agn, which, power, dim, sky, z, scale,
+    wave, log_wave, to_lnu, light, agn, model_of_row, power, dim, sky, z, scale,
     start, band, moments, bucket, tolerance, out,
 ):  # fmt: skip
     """
@@ -109,11 +133,15 @@ def block_fluxes(
     out : shape (n, n_band)
         Filled with the fluxes; NaN in bands that the spectrum does not cover.
     """
-    observed, log_observed = np.empty(wave.size), np.empty(wave.size)
+    observed = np.empty(wave.size)
+    log_observed = np.empty(wave.size)
     fnu = np.empty(wave.size)
-    low, high = band.min(), band.max()
+    low = band.min()
+    high = band.max()
     for i in range(z.size):
-        k, p, s = which[i], power[i], sky[i]
+        k = model_of_row[i]
+        p = power[i]
+        s = sky[i]
         stretch = 1.0 + z[i]
         log_stretch = math.log(stretch)
         for j in range(wave.size):

@@ -22,15 +22,16 @@ def stern2015_6um(l_2_10kev):
     l_2_10kev = np.asarray(l_2_10kev, dtype=float)
     none = l_2_10kev == 0.0
     c, b, a = _STERN
-    rest = c - np.log10(np.where(none, 1.0, l_2_10kev) / _ERG)
+    offset = c - np.log10(np.where(none, 1.0, l_2_10kev) / _ERG)
     with np.errstate(invalid="ignore"):
-        x = (-b + np.sqrt(b**2 - 4.0 * a * rest)) / (2.0 * a)
+        x = (-b + np.sqrt(b**2 - 4.0 * a * offset)) / (2.0 * a)
     return np.where(none, 0.0, 10.0**x * _UNIT_6UM)
 
 
 def power_law_energy(low, high, photon_index):
     """Integral of E^(1 - Gamma) over energies from ``low`` to ``high``; ln(high/low) at Gamma = 2."""
-    slope, width = 2.0 - np.asarray(photon_index, dtype=float), np.log(np.divide(high, low))
+    slope = 2.0 - np.asarray(photon_index, dtype=float)
+    width = np.log(np.divide(high, low))
     return np.asarray(low, dtype=float) ** slope * width * exprel(slope * width)
 
 
