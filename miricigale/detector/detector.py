@@ -32,7 +32,7 @@ from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, miri_detector
 from miricigale.instrument.figures import table
 from miricigale.utils.exceptions import DetectorWarning, argument_error, warn
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_kind, check_names, check_that
 from miricigale.utils.parallel import check_memory
@@ -48,7 +48,6 @@ _STANDARD = [kind for kind in ORDER if kind not in _OPTIONAL]
 _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Detector(Interactive):
     """

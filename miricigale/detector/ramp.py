@@ -12,7 +12,7 @@ from miricigale.detector import level1b, ramp_reader
 from miricigale.detector.effects.order import checked_effects
 from miricigale.instrument import DQ, STEPS, DetectorProperties, ExposureHistory
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.units import DN
 
@@ -32,7 +32,6 @@ def _flags(values, name, shape, dtype):
     return _read_only(values)
 
 
-@checked_calls
 class Ramp(Interactive, NDData):
     """
     Counts of one exposure: every group of every integration.

@@ -16,7 +16,7 @@ from miricigale.filters.spectra import check_wave, spectrum_arrays
 from miricigale.utils.caching import cached, cached_property
 from miricigale.utils.exceptions import argument_error, data_error, unknown_name
 from miricigale.utils.files import reading
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import write_table
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_array, frozen_quantity, to_array
@@ -47,7 +47,6 @@ def _padded(wave, throughput):
     return wave, throughput
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Filter(Frozen, Interactive):
     """

@@ -13,11 +13,10 @@ from miricigale.filters.filter import UNCOVERED, Filter
 from miricigale.filters.given import as_filter
 from miricigale.filters.spectra import check_wave, spectrum_arrays
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.units import FNU, WAVE
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, repr=False)
 class FilterSet(Interactive):
     """

@@ -33,7 +33,7 @@ from miricigale.fitting.settings import GridSettings, SamplerSettings
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.sed.presets import grid_name
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
@@ -73,7 +73,6 @@ _OF_SAMPLE = (
 _OF_BANDS = ("backend", "bands", "grid", "model_errors", "priors", "zero_points")
 
 
-@checked_calls
 class BayesFitter(Interactive):
     """
     Fit photometry and sum up the posterior: with every model of a grid, or by a nested sampler.

@@ -19,7 +19,6 @@ from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.fitting.result_tables import OUTLIER
 from miricigale.fitting.rows import FitRows
 from miricigale.fitting.sample_flags import worst_bands
-from miricigale.utils.interactive import checked_calls
 from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names
 from miricigale.utils.unified import read_write
@@ -30,7 +29,6 @@ CIGALE_LEAST_STD = 0.05
 _SHOWN = 20
 
 
-@checked_calls
 @dataclass(frozen=True, eq=False, repr=False)
 class FitResults(FitRows):
     """
@@ -296,6 +294,9 @@ class FitResults(FitRows):
         if "axes" in self.__dict__ and name in self.parameters:
             return self.median(name)
         return None
+
+    def _value_names(self):
+        return self.parameters
 
     def plot(self, ax=None, **kwargs):
         """Draw a single object (`plot_sed`), or the masses of several over 1 + z; returns the axes."""

@@ -15,7 +15,7 @@ from miricigale.instrument.photometric import electron_rate
 from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3, v2v3_to_sky
 from miricigale.instrument.wcs import imager_wcs, tangent_offset
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import check_count, to_array
@@ -80,7 +80,6 @@ def _counts_of(filter, time, frame, n_integrations, max_fill=0.6, max_groups=100
     return min(counts, key=lambda pair: abs(math.prod(pair) - frames))
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, init=False, repr=False)
 class Exposure(Interactive):
     """

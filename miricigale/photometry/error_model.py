@@ -23,7 +23,7 @@ from miricigale.photometry.error_curves import (
 )
 from miricigale.photometry.surveys import YANG2021_DEPTHS, fractional_error
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 from miricigale.utils.random import check_seed, stream
@@ -37,7 +37,6 @@ def _band(name):
     return find_filter(str(name)) or str(name)
 
 
-@checked_calls
 def add_noise(photometry, name, sigma, seed):
     """Add noise of known errors, shape (n,), to the fluxes of a band in place; draws belong to ``id`` or row."""
     keys = photometry["id"] if "id" in photometry.colnames else np.arange(len(photometry))

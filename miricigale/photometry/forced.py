@@ -25,13 +25,12 @@ from miricigale.photometry.sources import SourceTemplates
 from miricigale.photometry.stars import with_stars
 from miricigale.psf import KernelField, MatchingKernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, is_number, positive, to_array
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ForcedPhotometer(Interactive):
     """

@@ -21,7 +21,7 @@ from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.offsets import OffsetMap
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.interactive import Tabular, checked_calls
+from miricigale.utils.interactive import Tabular
 from miricigale.utils.missing import floats
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_table
@@ -83,7 +83,6 @@ def crowded(sky, flux, *, radius=2 * u.arcsec):
     return found
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ForcedPhotometryResult(Tabular):
     """

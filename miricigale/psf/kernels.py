@@ -15,13 +15,12 @@ from miricigale.psf.model import instrument_psf
 from miricigale.psf.pairs import named_psf, psf_pair, ready_arrays
 from miricigale.psf.wiener import checked_square, choose, energy_error, energy_radii, wiener
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class MatchingKernel(Interactive):
     """

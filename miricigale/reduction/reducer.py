@@ -30,7 +30,7 @@ from miricigale.reduction.sky_flat import flattened
 from miricigale.reduction.slopes import fit_slopes
 from miricigale.reduction.stripes import remove_stripes
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import (
     check_choice,
     check_kind,
@@ -46,7 +46,6 @@ from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 _SCALE = 0.11 * ANGLE
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reducer(Interactive):
     """

@@ -15,12 +15,11 @@ from miricigale.reduction.files import ImageFile
 from miricigale.reduction.image_writer import write_image
 from miricigale.reduction.images import exposure_values, flagged_image
 from miricigale.reduction.slopes import shares_charge
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import RATE
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ReductionResult(Interactive):
     """

@@ -22,7 +22,7 @@ from miricigale.scene.render import Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing import plain_floats
 from miricigale.utils.options import check_kind, check_that
@@ -54,7 +54,6 @@ class SceneFlags(Flags):
     DRAWN_AS_POINT = 16  # a Sersic profile whose parameters cannot be used
 
 
-@checked_calls
 class Scene(Interactive):
     """
     A catalog of sources as an instrument would see it without noise.

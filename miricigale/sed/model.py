@@ -15,7 +15,7 @@ from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
 from miricigale.utils.units import WAVE
@@ -37,7 +37,6 @@ for _name, _parameter in _MODEL_PARAMETERS.items():
     _parameter.name = _name
 
 
-@checked_calls
 class SEDModel(Interactive):
     """
     A model of spectra: a chain of components.
@@ -308,6 +307,13 @@ class SEDModel(Interactive):
         if component is None:
             raise unknown_name("component", name, [c.name for c in self.components])
         return component
+
+    def _ipython_key_completions_(self):
+        """Return what a session offers in brackets: names of the components and their roles."""
+        names = []
+        for component in self.components:
+            names += [component.name, component.role]
+        return list(dict.fromkeys(names))
 
     @property
     def has_agn(self):

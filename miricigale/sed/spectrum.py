@@ -11,7 +11,7 @@ from astropy.table import QTable
 from miricigale.filters import FilterSet, as_filter
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import reading
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import full_meta
 from miricigale.utils.missing import floats
 from miricigale.utils.optional import require
@@ -52,7 +52,6 @@ class _Flux(u.Quantity):
         raise TypeError(msg)
 
 
-@checked_calls
 @dataclass(frozen=True, eq=False, repr=False)
 class SED(Frozen, Interactive):
     """
@@ -108,13 +107,14 @@ class SED(Frozen, Interactive):
 
     def _value(self, name):
         # half-made copies have no meta yet
-        if "meta" in self.__dict__:
-            quantities = self.derived | self.parameters
-        else:
-            quantities = {}
+        if "meta" not in self.__dict__:
+            return None
         if name == "flux":
             return self.fnu.view(_Flux)
-        return quantities.get(name)
+        return (self.derived | self.parameters).get(name)
+
+    def _value_names(self):
+        return ("flux", *self.derived, *self.parameters)
 
     def __post_init__(self):
         if not hasattr(self.fnu, "unit"):

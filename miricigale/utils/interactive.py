@@ -1,10 +1,6 @@
-"""What objects share in interactive sessions: other names of attributes, and a table in notebooks."""
+"""What objects share in interactive sessions: other names of attributes, completion, a table in notebooks."""
 
-import abc
-import difflib
-import functools
 import html
-import inspect
 import operator
 
 from miricigale.utils.declared import declared
@@ -12,69 +8,12 @@ from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.positions import sky_as_angles
 
 
-def _no_attribute(owner, label, name, names):
-    """The error of an attribute that is not there, with the nearest names or all of them."""
-    known = [attribute for attribute in dir(owner) if not attribute.startswith("_")]
-    near = difflib.get_close_matches(name, [*known, *names], n=3, cutoff=0.5)
-    msg = f"{label} has no {name!r}; it has {', '.join(near or known)}"
-    return AttributeError(msg, name=name, obj=owner)
-
-
-class _Named(abc.ABCMeta):
-    """Metaclass of `Interactive`: names that a class does not have end in the same sentence as an object's."""
-
-    def __getattr__(cls, name):
-        if name.startswith("_"):
-            raise AttributeError(name)
-        raise _no_attribute(cls, cls.__name__, name, ())
-
-
-def checked_calls(cls):
-    """
-    Let calls of a class and its public methods with wrong arguments end in a sentence with the right ones.
-
-    Python names one argument at a time, and not those that there are. A decorator of classes, above the one of
-    dataclasses; errors from within a method stay as they are.
-    """
-    for name, member in list(vars(cls).items()):
-        if name.startswith("_") and name not in ("__init__", "__call__"):
-            continue
-        if isinstance(member, classmethod):
-            setattr(cls, name, classmethod(_checked(cls, member.__func__)))
-        elif inspect.isfunction(member):
-            setattr(cls, name, _checked(cls, member))
-    return cls
-
-
-def _checked(cls, method):
-    @functools.wraps(method)
-    def call(*args, **kwargs):
-        try:
-            return method(*args, **kwargs)
-        except TypeError as err:
-            # only this frame: the arguments did not fit, and the method was not entered
-            if err.__traceback__.tb_next is not None:
-                raise
-            signature = inspect.signature(method)
-            plain = [one.replace(annotation=one.empty) for one in signature.parameters.values()][1:]
-            wanted = signature.replace(parameters=plain, return_annotation=signature.empty)
-            kinds = (type(one).__name__ for one in args[1:])
-            given = ", ".join([*kinds, *map("{}=".format, kwargs)])
-            # functions of other modules are methods too
-            name = f"{cls.__qualname__}.{method.__name__}"
-            name = name.removesuffix(".__init__").removesuffix(".__call__")
-            msg = f"{name} takes {wanted}, got ({given})"
-            raise TypeError(msg) from None
-
-    return call
-
-
-class Interactive(metaclass=_Named):
+class Interactive:
     """
     Base of classes that are used in sessions.
 
-    An attribute that a user of other packages knows by another name is found by it; any other name ends in a
-    sentence that lists the nearest ones. In notebooks an object is shown as a table of what it holds.
+    An attribute that a user of other packages knows by another name is found by it. The quantities that an object
+    holds are attributes, which sessions complete. In notebooks an object is shown as a table of what it holds.
     """
 
     @property
@@ -90,10 +29,19 @@ class Interactive(metaclass=_Named):
             return operator.attrgetter(self._other_names[name])(self)
         if (value := self._value(name)) is not None:
             return value
-        raise _no_attribute(self, type(self).__name__, name, self._other_names)
+        msg = f"{type(self).__name__!r} object has no attribute {name!r}"
+        # Python suggests the nearest name of `__dir__`
+        raise AttributeError(msg, name=name, obj=self)
+
+    def __dir__(self):
+        return sorted({*super().__dir__(), *self._value_names()})
 
     def _value(self, name):
-        """A quantity that the object holds by this name; None without one."""
+        """Return a quantity that the object holds by this name; None without one."""
+
+    def _value_names(self):
+        """Return the names that `_value` knows."""
+        return ()
 
     def _facts(self):
         """What a notebook shows: dict of label to value."""
@@ -127,7 +75,7 @@ class Tabular(Interactive):
         return table[key]
 
     def _ipython_key_completions_(self):
-        """What a session offers in brackets: names of the columns."""
+        """Return what a session offers in brackets: names of the columns."""
         return self.to_table().colnames
 
     @property

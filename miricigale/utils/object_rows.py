@@ -229,6 +229,10 @@ class ByID:
             return self._rows[[self._rows.row(id_) for id_ in key]]
         return self._rows._take(self._rows.row(key))
 
+    def _ipython_key_completions_(self):
+        """Return what a session offers in brackets: the ids."""
+        return np.atleast_1d(self._rows.ids).tolist()
+
 
 def _rows(array, rows):
     """Rows of an array, read-only."""

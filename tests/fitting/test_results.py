@@ -168,8 +168,10 @@ def test_rows_ids_and_columns(results, tmp_path):
     results.write(tmp_path / "a.csv")
     back = QTable.read(tmp_path / "a.csv")
     assert_allclose(back["mass_p50"], table["mass_p50"].value)
-    with pytest.raises(AttributeError, match="FitResults has no 'medain'; it has median"):
+    with pytest.raises(AttributeError, match="'FitResults' object has no attribute 'medain'"):
         results.medain  # noqa: B018
+    assert {"redshift", "mass", "median"} <= set(dir(results))
+    assert results.loc._ipython_key_completions_() == results.ids.tolist()
 
 
 def test_the_picture_of_several_objects_is_masses_over_redshifts(results):
