@@ -36,7 +36,7 @@ def scrambled(fitter, scramble, effective):
     between, given = backend.between, replace(backend.given, interpolate=effective)
     if "scramble" in {field.name for field in fields(Continuation)}:
         between = replace(between, scramble=scramble)
-    new = fitter.changed()
+    new = fitter.replace()
     new.backend = replace(backend, between=between, given=given)
     return new
 
@@ -73,7 +73,7 @@ def main():
     table = table[np.concatenate(rows)]
     calibration, axes = SurveyCalibration.survey(), SEDModel.survey_axes()
     fitter = BayesFitter(SEDModel.survey(), bands, axes=axes, calibration=calibration)
-    nodes = fitter.changed(settings=replace(fitter.backend.given, interpolate=0))
+    nodes = fitter.replace(settings=replace(fitter.backend.given, interpolate=0))
     for one in (nodes, fitter):
         one.fit(table[:2])
     print(f"nodes alone {percentiles(nodes, table, 0)[2]:.1f} ms an object")

@@ -86,7 +86,7 @@ def simulate(name, depth, residual, seed, limit, cosmic_rays=True):
     psf = miri_psf(name)
     detector = Detector.miri_imager()
     if residual:
-        detector = detector.replaced(Residual(residual))
+        detector = detector.replace(Residual(residual))
     if not cosmic_rays:
         detector = detector.without(CosmicRays)
     ramps = (

@@ -110,7 +110,7 @@ def pattern(exposure, level, seed):
 def average(setup, exposure, level, seed):
     """The mean of all exposures, residual in the detector."""
     detector = Detector.miri_imager()
-    detector = detector.replaced(Residual("etc", pattern=seed))
+    detector = detector.replace(Residual("etc", pattern=seed))
     scene = flat_scene(exposure, level)
     total, number = 0.0, 0
     for k in range(setup.n_exposures):

@@ -145,7 +145,7 @@ def agn(grid, data, folder):
             return weights if kind == "flat" else agn_fraction_prior(nodes)
 
         def fit(fitter, some, name, prior=prior):
-            return fitter.changed(priors={"frac_agn": prior(fitter)}).fit(some, redshift=name)
+            return fitter.replace(priors={"frac_agn": prior(fitter)}).fit(some, redshift=name)
 
         found = fit(cosmos, far, "z")
         agn_line(f"COSMOS, far-infrared, {kind}", found, prior(cosmos))

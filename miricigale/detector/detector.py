@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from astropy.utils.decorators import deprecated
 
 from miricigale.depth.saturation import SKY_FRACTION, SaturationForecast, saturation_forecast
 from miricigale.detector import level1b
@@ -98,7 +99,7 @@ class Detector(Interactive):
         Parameters
         ----------
         *effects : `~miricigale.detector.Effect` or str
-            Effects with settings of their own, or beyond the standard ones; see `replaced`. ``"flight"``
+            Effects with settings of their own, or beyond the standard ones; see `replace`. ``"flight"``
             stands for all optional ones but `Residual` at the amplitudes of flight, as far as these are
             published; what follows replaces them.
         properties : `~miricigale.instrument.DetectorProperties`, optional
@@ -127,11 +128,16 @@ class Detector(Interactive):
         sets = table("effects")
         check_names([e for e in effects if isinstance(e, str)], "set of effects", sets)
         parts = (map(effect_from_record, sets[e]) if isinstance(e, str) else [e] for e in effects)
-        return cls(properties=properties).replaced(*itertools.chain.from_iterable(parts))
+        return cls(properties=properties).replace(*itertools.chain.from_iterable(parts))
 
+    @deprecated("1.0", alternative="replace")
     def replaced(self, *effects):
+        """Return `replace` with the same effects."""
+        return self.replace(*effects)
+
+    def replace(self, *effects):
         """
-        Detector with other effects: each takes the place of those of its kind.
+        Return a detector with other effects: each takes the place of those of its kind.
 
         Parameters
         ----------

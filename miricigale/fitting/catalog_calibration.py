@@ -240,12 +240,12 @@ def calibrate_bands(
     >>> from miricigale.fitting import calibrate_bands
     >>> calibration = calibrate_bands(fitter, photometry)  # doctest: +SKIP
     >>> print(calibration.summary())  # doctest: +SKIP
-    >>> results = fitter.changed(calibration=calibration).fit(photometry)  # doctest: +SKIP
+    >>> results = fitter.replace(calibration=calibration).fit(photometry)  # doctest: +SKIP
     """
     check_that(fitter.grid is not None, "fitter", "one with a grid", fitter.engine)
     with without_warnings():
         # the fit of the catalog warns of it
-        table = fitter.table_of(photometry)
+        table = fitter._table_of(photometry)
     sample = sample_of(fitter, table.colnames, check_seed(seed))
     density = None
     nodes = None
@@ -272,7 +272,7 @@ def calibrate_sample(fitter, sample, *, name, density_nodes=None, executor=None)
     options = {"redshift": sample.redshift, "executor": executor}
     if density_nodes is not None:
         options["redshift_prior"] = (density_nodes, sample.density)
-    predicting = on_nodes(fitter).changed(filters=sample.predicting, outliers=None)
+    predicting = on_nodes(fitter).replace(filters=sample.predicting, outliers=None)
     data = sample.photometry()
     for _ in range(_TURNS):
         with without_warnings():
@@ -284,7 +284,7 @@ def calibrate_sample(fitter, sample, *, name, density_nodes=None, executor=None)
 
 def with_errors_of(fitter, calibration):
     """Return a fitter with the errors of a calibration in place of its own."""
-    return fitter.changed(calibration=calibration, model_error=None, template_error=None)
+    return fitter.replace(calibration=calibration, model_error=None, template_error=None)
 
 
 def _calibration_of(fitter):

@@ -296,7 +296,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     fitter = fitter.for_photometry(photometry)
     check_that(len(set(bands)) == len(bands), "bands", "different names", list(bands))
     check_names(bands, "filter of the models", fitter.bands)
-    data = fitter.read_bands(photometry, bands)
+    data = fitter._read_bands(photometry, bands)
     groups = [(name,) for name in bands] if separately else [bands]
     fitted = [f for f in fitter.filters or fitter.bands if f in photometry.colnames]
     for group in groups:

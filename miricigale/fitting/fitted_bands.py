@@ -54,7 +54,7 @@ def bands_with_errors(names, argument):
     return bands
 
 
-def table_of(fitter, photometry, unit=None):
+def _table_of(fitter, photometry, unit=None):
     """
     The catalog by our names, fluxes without a unit in ``unit``, with what there is to warn of.
 
@@ -70,17 +70,17 @@ def table_of(fitter, photometry, unit=None):
             table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
     warn_of_duplicates(read_ids(table), "photometry")
     warn_of_codes([codes_of(table, fitter._reader.fitted(table))], "photometry")
-    fitter.warn_of_bands(table)
+    fitter._warn_of_bands(table)
     return table
 
 
-def read_bands(fitter, photometry, bands):
+def _read_bands(fitter, photometry, bands):
     """Photometry (`~miricigale.fitting.likelihood.FitData`) of bands, with zero points and its own errors."""
     zero = dict.fromkeys(bands, 0.0)
     return PhotometryReader(bands, bands, zero, zero, 1, fitter.zero_points).read(photometry)
 
 
-def warn_of_bands(fitter, photometry):
+def _warn_of_bands(fitter, photometry):
     """Warn of bands that are not fitted, if the fitter does not name those that are."""
     unused = unused_bands(photometry, fitter._reader.fitted(photometry))
     if unused and fitter.filters is None:

@@ -4,6 +4,7 @@ import logging
 from dataclasses import replace
 
 import numpy as np
+from astropy.utils.decorators import deprecated
 
 from miricigale.filters.band_names import known_filter
 from miricigale.fitting import fitted_bands
@@ -353,8 +354,13 @@ class BayesFitter(Interactive):
         fitted_bands.warn_of_unfitted(unused)
         return self.for_bands(bands)
 
+    @deprecated("1.0", alternative="replace")
     def changed(self, **options):
-        """Fitter of the same models with other options, named as for `BayesFitter`."""
+        """Return `replace` with the same options."""
+        return self.replace(**options)
+
+    def replace(self, **options):
+        """Return a fitter of the same models with other options, named as for `BayesFitter`."""
         given = self._given | options
         if self.waits:
             return type(self)(**given)
@@ -487,16 +493,17 @@ class BayesFitter(Interactive):
         known = {"redshift": redshift, "redshift_prior": redshift_prior}
         parallel = {"executor": executor, "progress_bar": progress_bar}
         options = {"pairs": pairs, "seed": seed, "chunk_size": chunk_size, "parallel": parallel}
-        results = self.fit_part(self.table_of(photometry, unit), **known, **options)
+        results = self._fit_part(self._table_of(photometry, unit), **known, **options)
         warn_of_pulls(results)
         sample = results.reduced_chi2[:: chi2_step(len(results))]
         return with_high_chi2(results, chi2_limit(sample))
 
     __call__ = fit
-    table_of, read_bands = fitted_bands.table_of, fitted_bands.read_bands
-    warn_of_bands = fitted_bands.warn_of_bands
+    _table_of = fitted_bands._table_of
+    _read_bands = fitted_bands._read_bands
+    _warn_of_bands = fitted_bands._warn_of_bands
 
-    def fit_part(
+    def _fit_part(
         self, photometry, *, pairs, seed, parallel, chunk_size=None, repeated=None, **known
     ):
         """Do what `fit` does, without warnings; earlier parts of the catalog had the ``repeated`` rows."""
@@ -587,7 +594,7 @@ class BayesFitter(Interactive):
             raise ValueError(msg)
         n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
         data, known, settings = self._prepare(
-            self.table_of(photometry, unit), redshift, redshift_prior
+            self._table_of(photometry, unit), redshift, redshift_prior
         )
         parallel = {"executor": executor, "progress_bar": progress_bar}
         samples = self.backend.sample(data, known, n_draws, seed, **parallel)

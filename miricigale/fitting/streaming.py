@@ -232,8 +232,8 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
                 else:
                     if not n_new:
                         # which holds for all pieces: to the caller of fit_file
-                        fitter.warn_of_bands(table)
-                    results = fitter.fit_part(table, **options, parallel={"executor": executor})
+                        fitter._warn_of_bands(table)
+                    results = fitter._fit_part(table, **options, parallel={"executor": executor})
                     if not n_new:
                         warn_of_pulls(results)
                     finish(i, _save_part(folder, name, results))
@@ -261,7 +261,7 @@ def _workers(fitter, folder, n_chunks, executor):
 
 def _make_part(fitter, folder, name, table, options):
     """Fit a piece and write it, on a worker."""
-    return _save_part(folder, name, fitter.fit_part(table, **options, parallel={}))
+    return _save_part(folder, name, fitter._fit_part(table, **options, parallel={}))
 
 
 def _save_part(folder, name, results):

@@ -328,7 +328,7 @@ def calibrate(
     >>> calibration.write("calibration.ecsv")  # doctest: +SKIP
     """
     check_that(fitter.grid is not None, "fitter", "one with a grid", fitter.engine)
-    table = fitter.table_of(photometry)
+    table = fitter._table_of(photometry)
     z = known_redshifts(table, redshift)
     # none of NaN
     rows = np.flatnonzero((z >= fitter.grid.redshift[0]) & (z <= fitter.grid.redshift[-1]))
@@ -373,7 +373,7 @@ def _score(fits, true):
 def on_nodes(fitter):
     """Return a fitter of the nodes of the grid alone: errors and priors are of what these leave."""
     settings = dataclasses.replace(fitter.backend.given, interpolate=0, finer=None, agn_error=0.0)
-    return fitter.changed(settings=settings)
+    return fitter.replace(settings=settings)
 
 
 def _measure(fitter, table, z, name, reference, priors, options):
@@ -383,7 +383,7 @@ def _measure(fitter, table, z, name, reference, priors, options):
     bands = _fitted(fitter, table)
     long = [band for group in long_instruments(bands) for band in group]
     predicting = [band for band in bands if band not in long]
-    data = fitter.changed(calibration=None).read_bands(table, bands)
+    data = fitter.replace(calibration=None)._read_bands(table, bands)
     errors = {band: prior_errors(band) for band in bands}
     weights = {}
 
@@ -393,7 +393,7 @@ def _measure(fitter, table, z, name, reference, priors, options):
         table = described_rows(rows, _COLUMNS)
         return SurveyCalibration(name, table, template_error, known, MassFunction())
 
-    now = fitter.changed(model_error=_FIRST, template_error=None, calibration=None)
+    now = fitter.replace(model_error=_FIRST, template_error=None, calibration=None)
     for turn in range(_TURNS):
         fit = now.fit(table, **options)
         part = {band: 0.0 if turn == 0 else errors[band].part for band in bands}
@@ -401,7 +401,7 @@ def _measure(fitter, table, z, name, reference, priors, options):
         weights = _longer(weights, measure_priors(fit), 1.0 if turn == 0 else _LONGER) | priors
         if turn > 0:
             if long:
-                fit = now.changed(filters=predicting).fit(table, **options)
+                fit = now.replace(filters=predicting).fit(table, **options)
             errors = measure_bands(fit, data, bands, error)
             if reference is not None:
                 errors = relative_zero_points(errors, reference)
@@ -412,7 +412,7 @@ def _measure(fitter, table, z, name, reference, priors, options):
 def with_calibration(fitter, calibration):
     """Return a fitter with a calibration in place of its own priors and errors."""
     none = dict.fromkeys(("priors", "template_error", "model_error"))
-    return fitter.changed(calibration=calibration, **none)
+    return fitter.replace(calibration=calibration, **none)
 
 
 def _longer(before, now, power):

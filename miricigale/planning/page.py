@@ -109,7 +109,7 @@ def _notices(page, planner):
     models = "models_ceers" if config.sed.infrared == "ceers" else "models"
     page.notice(models, model_error=100 * config.fit.model_error)
     page.notice("hours")
-    if planner.given is None:
+    if planner._caller_sources is None:
         mix = ", ".join(f"{value:g}" for value in agn.frac_agn)
         page.notice(planner.sources.meta["agn"], mix=mix)
     page.notice("background", background=background_text(**background_options(config)))

@@ -122,7 +122,7 @@ class Planner:
         self.config = PlanConfig() if config is None else config
         self.executor = executor
         #: Sources of the caller, if there are any.
-        self.given = sources
+        self._caller_sources = sources
         if sources is not None:
             wanted = ("id", "redshift", "frac_agn", *self.bands)
             require_columns(sources, wanted, "sources", units=dict.fromkeys(self.bands, u.uJy))
@@ -135,8 +135,8 @@ class Planner:
     @functools.cached_property
     def sources(self):
         """The sample with its true fluxes, `~astropy.table.QTable`."""
-        if self.given is not None:
-            return self.given
+        if self._caller_sources is not None:
+            return self._caller_sources
         return make_sample(self.config, self.bands, executor=self.executor)
 
     @property

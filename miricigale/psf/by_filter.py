@@ -230,4 +230,4 @@ def _scaled(psf, expected, filter_, argument):
         warn(msg, PSFWarning)
     else:
         _log.info(msg)
-    return psf.replaced(psf.data * (taken / held), total_known=True)
+    return psf.replace(psf.data * (taken / held), total_known=True)

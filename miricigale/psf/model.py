@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.nddata import NDData
+from astropy.utils.decorators import deprecated
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
@@ -113,9 +114,14 @@ class InstrumentPSF(ImagePSF):
         self.position = None if position is None else tuple(float(v) for v in position)
         self.subarray = subarray
 
+    @deprecated("1.0", alternative="replace")
     def replaced(self, data=None, *, meta=None, **changes):
+        """Return `replace` with the same changes."""
+        return self.replace(data, meta=meta, **changes)
+
+    def replace(self, data=None, *, meta=None, **changes):
         """
-        The same PSF with some of its parameters changed.
+        Return the same PSF with some of its parameters changed.
 
         Parameters
         ----------

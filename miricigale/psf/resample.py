@@ -96,7 +96,7 @@ def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
         x = (np.arange(nx) - psf.origin[0]) * psf.cell
         y = ((np.arange(ny) - psf.origin[1]) * psf.cell)[:, None]
         data = sampled(psf, x, y, turn)
-    return psf.replaced(data, frame="sky", angle=grid * u.deg)
+    return psf.replace(data, frame="sky", angle=grid * u.deg)
 
 
 def average_psf(psfs):
@@ -131,7 +131,7 @@ def average_psf(psfs):
     psfs = alike(psfs, ("pixel_scale", "oversampling", "frame", "angle", "includes", "origin"))
     weights = np.full(len(psfs), 1 / len(psfs))
     data = np.tensordot(weights, np.stack([psf.data for psf in psfs]), axes=1)
-    return psfs[0].replaced(data, meta={"n_averaged": len(psfs)})
+    return psfs[0].replace(data, meta={"n_averaged": len(psfs)})
 
 
 def alike(psfs, names):
@@ -283,7 +283,7 @@ def psf_mosaic(
     if resampling == "drizzle":
         data = detector_response(data, oversampling=oversampling, pixel=True)
         includes = (*includes, "drizzle")
-    return psf.replaced(
+    return psf.replace(
         data,
         pixel_scale=scale * ANGLE,
         oversampling=oversampling,
@@ -315,4 +315,4 @@ def centered_psf(psf, tolerance, argument="psf"):
         return psf, (0.0, 0.0)
     text = "'%s': the core stood (%.4f, %.4f) arcsec off the center and was brought there"
     _log.info(text, argument, *offset)
-    return psf.replaced(origin=(x, y)), offset
+    return psf.replace(origin=(x, y)), offset

@@ -98,7 +98,7 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
     fit = StarPSF(psf.data / cells**2, found)
     meta = {"n_images": len(images), "n_stamps": len(found), "n_left_out": wanted - len(found)}
     meta |= {"source": "stars", "correction": fit.kind, "flux_err": float(fit.error)}
-    return psf.replaced(
+    return psf.replace(
         fit.at() * cells**2, meta=meta | dict(zip(TERMS, fit.terms.tolist(), strict=True))
     )
 

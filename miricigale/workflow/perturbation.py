@@ -70,7 +70,7 @@ class Perturbation:
         # its values at offsets that are smaller by the factor, with the same light
         cell = own.pixel_scale / own.n_cells
         data = psf.psf_image(own, pixel_scale=cell / factor, shape=own.data.shape)
-        return own.replaced(data * own.n_cells**2, meta={"width_factor": factor})
+        return own.replace(data * own.n_cells**2, meta={"width_factor": factor})
 
     def fluxes(self, name, table, bands):
         """

@@ -238,7 +238,7 @@ def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures)
     exposure = exposure_of(name, n_groups=n_groups)
     detector = Detector.miri_imager().without(CosmicRays, BadPixels)
     if residual:
-        detector = detector.replaced(Residual(residual))
+        detector = detector.replace(Residual(residual))
     level = background_level(name).value
     meta = {"psf_includes": ["pixel", "ipc"]}
     sky = CCDData(np.full(exposure.shape, level), unit="MJy/sr", meta=meta)

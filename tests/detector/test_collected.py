@@ -103,7 +103,7 @@ def test_hits_of_the_detector_do_not_depend_on_its_blocks(collect, monkeypatch):
 
 def test_residual_pattern_is_that_of_the_ramp(collect):
     smooth = Detector.miri_imager().without(BadPixels, ReferencePixels)
-    uneven = smooth.replaced(Residual(0.01))
+    uneven = smooth.replace(Residual(0.01))
     plain, rough, again = collect(smooth), collect(uneven), collect(uneven, seed=7)
     share = (rough.mean - 0.2) / (plain.mean - 0.2) - 1
     assert share.std() == pytest.approx(0.01, rel=0.2)

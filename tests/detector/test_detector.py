@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
+from astropy.utils.exceptions import AstropyDeprecationWarning
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
@@ -232,15 +233,17 @@ def test_effects_of_other_kinds_act_where_they_are_put(make_exposure, make_sky):
 
 def test_effects_take_the_place_of_their_kind():
     detector = Detector.miri_imager()
-    other = detector.replaced(Dark(current=2.0), Residual(0.01), Persistence(), LastFrame())
+    other = detector.replace(Dark(current=2.0), Residual(0.01), Persistence(), LastFrame())
     assert other.effects[:2] == (Residual(0.01), Photons())
     assert other.effects[other.effects.index(Dark(current=2.0)) - 1] == Photons()
     assert other.effects[other.effects.index(Persistence()) - 1] == CosmicRays()
     assert other.effects[other.effects.index(LastFrame()) + 1] == Bias()
     assert len(other.effects) == len(detector.effects) + 3
-    back = other.without(Residual, Persistence, LastFrame).replaced(Dark())
+    back = other.without(Residual, Persistence, LastFrame).replace(Dark())
     assert back.effects == detector.effects
-    assert Detector.miri_imager(Dark(current=2.0)).effects == detector.replaced(Dark(2.0)).effects
+    assert Detector.miri_imager(Dark(current=2.0)).effects == detector.replace(Dark(2.0)).effects
+    with pytest.warns(AstropyDeprecationWarning, match="Use replace instead"):
+        assert detector.replaced(Dark(2.0)).effects == detector.replace(Dark(2.0)).effects
     # settings of the detector stay
     properties = miri_detector().replace(gain=2.0)
     assert Detector.miri_imager(properties=properties).without(Dark).properties is properties

@@ -101,7 +101,7 @@ def test_the_well_is_that_of_the_effects(make_exposure, make_sky, plain):
     step = exposure.group_time.to_value("s")
     sky = make_sky(exposure, brightness(1000 / step))
     assert plain.forecast(sky, exposure).sky_fraction == pytest.approx(1e4 / 210e3)
-    small = plain.replaced(Saturation(full_well=2e4))
+    small = plain.replace(Saturation(full_well=2e4))
     assert small.forecast(sky, exposure).sky_fraction == pytest.approx(0.5)
     # a converter that ends before the well: 65535.5 DN less the bias, made linear
     properties = miri_detector().replace(bias=45_000.0)

@@ -95,7 +95,7 @@ def test_the_decay_is_told_and_gone_with_the_first_groups(make_exposure, make_sk
     detector = Detector.miri_imager().without(CosmicRays, BadPixels)
     sky = make_sky(exposure, 4e3)
     plain = detector.expose(sky, exposure, seed=1)
-    spoilt = detector.replaced(ResetDecay(groups=1.0)).expose(sky, exposure, seed=1)
+    spoilt = detector.replace(ResetDecay(groups=1.0)).expose(sky, exposure, seed=1)
     left = warned("shows a decay after the resets", Reducer(jump_threshold=None).fit_groups, spoilt)
     reducer = Reducer(skip_first=8, jump_threshold=None)
     clean, fit = reducer.fit_groups(plain), reducer.fit_groups(spoilt)
@@ -103,7 +103,7 @@ def test_the_decay_is_told_and_gone_with_the_first_groups(make_exposure, make_sk
     assert np.nanmean(fit.rate) == pytest.approx(np.mean(clean.rate[good]), rel=1e-4)
     assert np.nanmean(left.rate) > 1.001 * np.mean(clean.rate[good])
     with pytest.raises(ValueError, match="brighter-fatter effect and decay after resets"):
-        detector.replaced(ResetDecay()).collect(sky, exposure, seed=1)
+        detector.replace(ResetDecay()).collect(sky, exposure, seed=1)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_the_rate_does_not_know_of_them(make_exposure, make_sky, band, n_groups,
     exposure = make_exposure(band, subarray="SUB256", **mode)
     sky = make_sky(exposure, background_level(band).value, includes=())
     plain = Detector.miri_imager().without(CosmicRays, BadPixels)
-    spoilt = plain.replaced(ResetAnomaly(), FirstFrame(), LastFrame())
+    spoilt = plain.replace(ResetAnomaly(), FirstFrame(), LastFrame())
     reducer = Reducer(reset_anomaly=ResetAnomaly())
     clean = Reducer(skip_first=1, skip_last=1).fit_groups(plain.expose(sky, exposure, seed=1))
     fit = reducer.fit_groups(spoilt.expose(sky, exposure, seed=1))

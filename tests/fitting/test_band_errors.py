@@ -184,7 +184,7 @@ def test_a_catalog_says_what_was_done_to_it(model_fluxes, fitter, known):
     assert all(outlier[band] == rows[band]["wrong"] for band in MIRI)
     # the errors of models are the fitter's
     assert found.template_error([0.5] * u.um) == pytest.approx(0.02)
-    calibrated = fitter.changed(calibration=found, model_error=None, template_error=None)
+    calibrated = fitter.replace(calibration=found, model_error=None, template_error=None)
     fit = calibrated.fit(table[:4])
     flux = table["nircam.f277w"][:4].to_value(u.uJy)
     assert_allclose(fit.flux[:, 4], rows["nircam.f277w"]["zero_point"] * flux, rtol=1e-12)
@@ -204,7 +204,7 @@ def test_errors_that_are_right_stay(model_fluxes, fitter):
 def test_scores_of_other_sources_are_not_those_of_a_catalog(model_fluxes, fitter):
     base = SurveyCalibration.survey().without_priors()
     assert base.scores is not None
-    some = fitter.changed(calibration=base, model_error=None, template_error=None)
+    some = fitter.replace(calibration=base, model_error=None, template_error=None)
     found = calibrate_bands(some, catalog(model_fluxes)[:5])
     assert found.scores is None
     assert found.template_error is base.template_error
@@ -225,10 +225,10 @@ def test_few_sources_have_the_prior(model_fluxes, fitter, n):
 def test_catalogs_without_miri_and_with_too_few_other_bands(model_fluxes, fitter):
     table = catalog(model_fluxes, zero_point=1.1)
     without = table[[name for name in table.colnames if not name.startswith("miri")]]
-    rows = rows_of(calibrate_bands(fitter.changed(filters=BANDS[:6]), without))
+    rows = rows_of(calibrate_bands(fitter.replace(filters=BANDS[:6]), without))
     assert list(rows) == BANDS[:6]
     assert rows["nircam.f277w"]["zero_point"] == pytest.approx(1.1, abs=0.02)
-    few = rows_of(calibrate_bands(fitter.changed(filters=[*BANDS[:2], MIRI[0]]), table))
+    few = rows_of(calibrate_bands(fitter.replace(filters=[*BANDS[:2], MIRI[0]]), table))
     assert few[MIRI[0]]["error_factor"] == 3.3
     assert all(row["n"] == 0 for row in few.values())
 
@@ -266,7 +266,7 @@ def test_the_choice_of_sources_does_not_depend_on_pieces(model_fluxes):
 
 def test_fitters_that_cannot_be_calibrated(model_fluxes, fitter):
     table = catalog(model_fluxes)
-    mixed = fitter.changed(model_error={"acs.f606w": 0.1, "miri.f770w": 0.2}, template_error=None)
+    mixed = fitter.replace(model_error={"acs.f606w": 0.1, "miri.f770w": 0.2}, template_error=None)
     refuses(
         "with a calibration, a template error or one model error", calibrate_bands, mixed, table
     )
@@ -312,7 +312,7 @@ def test_what_is_known_of_redshifts_is_used(model_fluxes, fitter):
     """A density that is narrow about the known redshift gives what the redshift gives."""
     table = catalog(model_fluxes, factor=2.5, part=0.1)
     table = table[[name for name in table.colnames if not name.startswith("acs.")]]
-    some = fitter.changed(filters=BANDS[2:])
+    some = fitter.replace(filters=BANDS[2:])
     nodes = np.linspace(0.4, 3.1, 271)
     density = np.exp(-0.5 * ((nodes - table["z_spec"][:, None]) / 0.02) ** 2)
     by_density = calibrate_bands(some, table, redshift_prior=(nodes, density)).bands
@@ -363,8 +363,8 @@ def test_fitters_of_real_galaxies_have_the_prior_of_bands_that_were_not_measured
     assert fitter.settings()["error_factor"]["miri.f770w"] == 3.3
     outlier = fitter.calibration.of_bands("outlier", fitter.bands, 0.0)
     assert outlier == {"acs.f814w": 0.0, "wfc3.f160w": 0.0, "miri.f770w": pytest.approx(2 / 42)}
-    changed = fitter.changed(n_bands_min=3)
+    changed = fitter.replace(n_bands_min=3)
     assert changed.model_errors == fitter.model_errors
-    as_published = fitter.changed(calibration=SurveyCalibration.survey())
+    as_published = fitter.replace(calibration=SurveyCalibration.survey())
     assert set(as_published.model_errors.values()) == {0.0}
-    assert set(fitter.changed(model_error=0.1).model_errors.values()) == {0.1}
+    assert set(fitter.replace(model_error=0.1).model_errors.values()) == {0.1}

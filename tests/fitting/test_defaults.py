@@ -104,9 +104,9 @@ def test_models_bands_and_calibration_by_default():
         fitter = BayesFitter(model, BANDS, **named | options)
         assert fitter.calibration is None
     assert set(BayesFitter(BANDS, calibration=None).model_errors.values()) == {0.1}
-    changed = fitters[0].changed(model_error=0.2)
+    changed = fitters[0].replace(model_error=0.2)
     assert changed.calibration is None
-    back = changed.changed(model_error=None).calibration
+    back = changed.replace(model_error=None).calibration
     assert_array_equal(back.bands, fitters[0].calibration.bands)
     assert changed.model is fitters[0].model
 
@@ -124,7 +124,7 @@ def test_a_fitter_says_what_it_fits():
     assert errors.endswith("mass and redshift")
     assert errors.removeprefix("errors and priors: ") in fitter.summary()
     weights = np.arange(1.0, 1.0 + fitter.priors.axes["age"].values.size)
-    own = fitter.changed(model_error={BANDS[0]: 0.2}, outliers=0.05, priors={"age": weights})
+    own = fitter.replace(model_error={BANDS[0]: 0.2}, outliers=0.05, priors={"age": weights})
     text = "0 to 20 % of the flux added to errors; 5 % of fluxes wrong; priors of age"
     assert statement(own)[2] == f"errors and priors: {text}"
     assert "bands: of the photometry" in BayesFitter().summary()

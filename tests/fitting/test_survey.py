@@ -112,7 +112,7 @@ def test_calibration_finds_what_was_done_to_a_catalog(survey, tmp_path):
     assert again.mass_function == found.mass_function
     assert_allclose(again.template_error.error, found.template_error.error)
     fits = [
-        fitter.changed(calibration=one, model_error=None).fit(table[:5]) for one in (found, again)
+        fitter.replace(calibration=one, model_error=None).fit(table[:5]) for one in (found, again)
     ]
     assert_allclose(fits[0].pdf["redshift"], fits[1].pdf["redshift"])
     assert fits[1].meta["fit"]["calibration"] == "test"
@@ -127,7 +127,7 @@ def test_calibration_finds_what_was_done_to_a_catalog(survey, tmp_path):
     text = "other.ecsv is no calibration.*or a damaged one"
     refuses(text, SurveyCalibration.read, tmp_path / "other.ecsv", error=DataError)
     mock = mock_analysis(
-        fitter.changed(calibration=found, model_error=None), fits[0], table[:5], seed=1
+        fitter.replace(calibration=found, model_error=None), fits[0], table[:5], seed=1
     )
     ratio = mock.recovered.flux[:, 4] / fits[0].best_flux[:, 4]
     assert np.median(ratio) == pytest.approx(1, abs=0.06)

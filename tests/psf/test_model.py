@@ -45,7 +45,7 @@ def test_copies_pickles_and_files_keep_all(psf, tmp_path):
     psf.write(tmp_path / "psf.fits")
     for one in (
         copy.copy(psf), copy.deepcopy(psf), psf.copy(), psf.deepcopy(),
-        pickle.loads(pickle.dumps(psf)), InstrumentPSF.read(tmp_path / "psf.fits"), psf.replaced(),
+        pickle.loads(pickle.dumps(psf)), InstrumentPSF.read(tmp_path / "psf.fits"), psf.replace(),
     ):  # fmt: skip
         same(one, psf)
         assert one(0.3, 0.4) == psf(0.3, 0.4)

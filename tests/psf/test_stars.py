@@ -64,7 +64,7 @@ def model(truth):
     """A model that is 6 % too narrow and has too little light in its wings."""
     y, x = (np.indices(truth.data.shape) - len(truth.data) // 2) / 1.0
     narrow = interpolate(truth.data, x * 1.06 + len(x) // 2, y * 1.06 + len(x) // 2) * 1.06**2
-    return truth.replaced(narrow * truth.data.sum() / narrow.sum())
+    return truth.replace(narrow * truth.data.sum() / narrow.sum())
 
 
 @pytest.fixture(scope="module")
@@ -139,5 +139,5 @@ def test_refuses(truth, field):
         ((bare, tables[0][:0]), "'stars' must be at least one with its stamp on an image"),
     ):
         refuses(match, psf_from_stars, *given, truth)
-    even = truth.replaced(truth.data[:-1, :-1])
+    even = truth.replace(truth.data[:-1, :-1])
     refuses("'psf' must be square and odd", psf_from_stars, bare, tables[0], even)

@@ -72,7 +72,7 @@ def imager_of(config, properties=None):
     """The detector that a configuration describes."""
     imager = detector.Detector.miri_imager(properties=properties)
     if config.detector.residual:
-        imager = imager.replaced(detector.Residual(config.detector.residual))
+        imager = imager.replace(detector.Residual(config.detector.residual))
     if not config.detector.cosmic_rays:
         imager = imager.without(detector.CosmicRays)
     return imager

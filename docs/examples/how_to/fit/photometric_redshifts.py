@@ -80,7 +80,7 @@ scores
 z_spec = photometry["z_spec"][150:]
 fits = {
     "as given": fitter.fit(photometry[150:]),
-    "calibrated": fitter.changed(calibration=found).fit(photometry[150:]),
+    "calibrated": fitter.replace(calibration=found).fit(photometry[150:]),
 }
 rows = []
 for label, fit in fits.items():

@@ -47,7 +47,7 @@ flat = BayesFitter(bands, calibration=None)
 fits = {
     "flat": flat.fit(photometry),
     "redshift given magnitude": flat.fit(photometry, redshift_prior=by_magnitude),
-    "weak AGN and little dust": flat.changed(priors=rare_agn).fit(photometry),
+    "weak AGN and little dust": flat.replace(priors=rare_agn).fit(photometry),
     "of real galaxies": BayesFitter(bands).fit(photometry),
 }
 table = QTable({"prior": list(fits)})

@@ -21,7 +21,7 @@ from miricigale.psf import miri_psf, psf_from_stars, psf_table
 
 model = miri_psf("F770W", fov=12 * u.arcsec)
 scale = 1.05 * model.pixel_scale
-truth = model.replaced(pixel_scale=scale)
+truth = model.replace(pixel_scale=scale)
 rng = np.random.default_rng(3)
 images, stars = [], []
 yy, xx = np.mgrid[:165, :165]

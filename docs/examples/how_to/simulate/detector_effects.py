@@ -65,7 +65,7 @@ added = [
 ]
 fig, axes = plt.subplots(2, 4, figsize=(10, 5), layout="constrained")
 for ax, effect in zip(axes.flat, added, strict=True):
-    counts = plain.replaced(effect).expose(sky, exposure, seed=1).data[0]
+    counts = plain.replace(effect).expose(sky, exposure, seed=1).data[0]
     change = counts[-1] - reference[-1]
     scale = np.percentile(np.abs(change), 98) + 1
     limits = {"vmin": -scale, "vmax": scale}
@@ -82,7 +82,7 @@ plt.show()
 
 fig, ax = plt.subplots(figsize=(7, 3.5), layout="constrained")
 for effect in (ResetAnomaly(), FirstFrame(), LastFrame()):
-    counts = plain.replaced(effect).expose(sky, exposure, seed=1).data[0]
+    counts = plain.replace(effect).expose(sky, exposure, seed=1).data[0]
     change = (counts - reference).mean(axis=(1, 2))
     ax.plot(np.arange(1, 21), change, "o-", label=type(effect).__name__)
 ax.set(xlabel="group", ylabel="mean change (DN)")
