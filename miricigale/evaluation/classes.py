@@ -81,11 +81,12 @@ def confusion(true, found):
     """
     true, found = one_by_one(str, true=true, found=found)
     is_class = np.array(CLASS_NAMES)[:, None] == true
-    as_named = (np.sum(is_class & (found == name), axis=1) for name in (*CLASS_NAMES, "unknown"))
-    shares = quality_columns(selection_quality(true == n, found == n) for n in CLASS_NAMES)
-    columns = CLASS_NAMES, is_class.sum(axis=1), *as_named, *shares.values()
+    columns = {"class": np.array(CLASS_NAMES), "n": is_class.sum(axis=1)}
+    for name in (*CLASS_NAMES, "unknown"):
+        columns[name] = np.sum(is_class & (found == name), axis=1)
+    columns |= quality_columns(selection_quality(true == n, found == n) for n in CLASS_NAMES)
     texts = declared("miricigale.evaluation", "columns.toml")["confusion"]
-    return described_columns(map(np.array, columns), texts)
+    return described_columns(columns, texts)
 
 
 @dataclasses.dataclass(frozen=True)

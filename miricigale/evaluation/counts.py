@@ -282,7 +282,12 @@ def _dusty_galaxies(table):
 
 
 def _dust_table(ids, quiescent, dust, excess):
-    columns = ids, quiescent, dust * excess * LUMINOSITY, excess
+    columns = {
+        "id": ids,
+        "quiescent": quiescent,
+        "dust_luminosity": dust * excess * LUMINOSITY,
+        "dust_excess": excess,
+    }
     return described_columns(columns, declared("miricigale.evaluation", "columns.toml")["dust"])
 
 

@@ -142,6 +142,17 @@ def coverage_table(ranks, *, levels=(0.68, 0.95)):
             mean = np.nan
         for level in levels:
             inside = np.count_nonzero(np.abs(values - 0.5) <= 0.5 * level)
-            share = fraction_interval(inside, values.size)
-            rows.append((name, values.size, level, *share, mean, p_uniform))
+            share, low, high = fraction_interval(inside, values.size)
+            rows.append(
+                {
+                    "name": name,
+                    "n": values.size,
+                    "level": level,
+                    "share": share,
+                    "share_low": low,
+                    "share_high": high,
+                    "mean_rank": mean,
+                    "p_uniform": p_uniform,
+                }
+            )
     return described_rows(rows, declared("miricigale.evaluation", "columns.toml")["coverage"])

@@ -69,9 +69,21 @@ def study_numbers(study, *, seed, n_draws=500):
                     key = stream(seed, "numbers", sky.name, band_set, quantity, str(option))
                     row = {"truth": sky, "band_set": band_set, "option": option}
                     got = measure(study, quantity, **row, seed=key, n_draws=n_draws)
-                    span = option or (0.0, np.inf)
-                    values = (got.value, got.low, got.high, got.n, got.completeness)
-                    rows.append((sky.name, band_set, quantity, *span, *values))
+                    z_low, z_high = option or (0.0, np.inf)
+                    rows.append(
+                        {
+                            "truth": sky.name,
+                            "band_set": band_set,
+                            "quantity": quantity,
+                            "z_low": z_low,
+                            "z_high": z_high,
+                            "value": got.value,
+                            "low": got.low,
+                            "high": got.high,
+                            "n": got.n,
+                            "completeness": got.completeness,
+                        }
+                    )
     return described_rows(rows, declared("miricigale.evaluation", "columns.toml")["numbers"])
 
 
@@ -161,19 +173,18 @@ def selection_table(sky, *, limits=CLASS_LIMITS):
          all   0.1        0          1    0.0
     """
     true = floats(sky.truth["frac_agn"])[sky.field]
-    pairs = [(band_set, limit) for band_set in sky.fits for limit in limits]
+    columns = {"band_set": [], "limit": []}
     qualities = []
-    for band_set, limit in pairs:
+    for band_set in sky.fits:
         mean = sky.of_catalog(sky.fitted(band_set, "frac_agn_mean"))[sky.field]
-        # NaN is below every limit
-        qualities.append(selection_quality(true >= limit, mean >= limit))
-    wanted, selected = ([getattr(f, k).n for f in qualities] for k in ("completeness", "purity"))
-    columns = (
-        *map(list, zip(*pairs, strict=True)),
-        wanted,
-        selected,
-        *quality_columns(qualities).values(),
-    )
+        for limit in limits:
+            columns["band_set"].append(band_set)
+            columns["limit"].append(limit)
+            # NaN is below every limit
+            qualities.append(selection_quality(true >= limit, mean >= limit))
+    columns["n_wanted"] = [quality.completeness.n for quality in qualities]
+    columns["n_selected"] = [quality.purity.n for quality in qualities]
+    columns |= quality_columns(qualities)
     return described_columns(
         columns, declared("miricigale.evaluation", "columns.toml")["selection"]
     )

@@ -161,18 +161,31 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None, same_exposure
             verdict = _verdict(published, ours, sigma, why)
         else:
             verdict = OTHER_EXPOSURES
-        text = QUANTITIES.get(published.quantity)
-        right = published.quantity == "class_share"
+        description = published.text
+        if QUANTITIES.get(published.quantity):
+            description = f"{QUANTITIES[published.quantity]}: {description}"
+        of_all = np.nan
+        if published.quantity == "class_share":
+            of_all = ours.value * ours.completeness
         rows.append(
-            (
-                published.key,
-                published.section,
-                f"{text}: {published.text}" if text else published.text,
-            )
-            + (published.relation, published.value, published.error)
-            + (ours.value, ours.low, ours.high, ours.n, ours.completeness)
-            + (ours.value * ours.completeness if right else np.nan, sigma)
-            + (verdict, published.definition, published.source)
+            {
+                "key": published.key,
+                "section": published.section,
+                "description": description,
+                "relation": published.relation,
+                "paper": published.value,
+                "paper_err": published.error,
+                "ours": ours.value,
+                "low": ours.low,
+                "high": ours.high,
+                "n": ours.n,
+                "completeness": ours.completeness,
+                "of_all": of_all,
+                "sigma": sigma,
+                "verdict": verdict,
+                "definition": published.definition,
+                "source": published.source,
+            }
         )
     return described_rows(rows, _TABLE["columns"])
 

@@ -334,8 +334,15 @@ class AGNPopulation:
         thick = self.compton_thick * psi / (1.0 + self.compton_thick * psi)
         hidden = thick + psi / (1.0 + self.compton_thick * psi)
         l_x = np.where(has_agn, 10.0 ** np.where(has_agn, log_l, 0.0), 0.0) * u.erg / u.s
-        absorbed = (has_agn & (drawn[:, 1] < share) for share in (hidden, thick))
-        columns = ids, probability, has_agn, l_x.to(LUMINOSITY), stern2015_6um(l_x), *absorbed
+        columns = {
+            "id": ids,
+            "probability": probability,
+            "has_agn": has_agn,
+            "l_2_10kev": l_x.to(LUMINOSITY),
+            "l_6um": stern2015_6um(l_x),
+            "obscured": has_agn & (drawn[:, 1] < hidden),
+            "compton_thick": has_agn & (drawn[:, 1] < thick),
+        }
         return described_columns(columns, declared("miricigale.evaluation", "columns.toml")["agn"])
 
 

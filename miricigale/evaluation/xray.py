@@ -164,7 +164,15 @@ def completeness(values, found, edges):
     n, _ = np.histogram(values, edges)
     n_found, _ = np.histogram(values[found], edges)
     shares = np.array([fraction_interval(*pair) for pair in zip(n_found, n, strict=True)])
-    columns = edges[:-1], edges[1:], n, n_found, *shares.T
+    columns = {
+        "low": edges[:-1],
+        "high": edges[1:],
+        "n": n,
+        "n_found": n_found,
+        "share": shares[:, 0],
+        "share_low": shares[:, 1],
+        "share_high": shares[:, 2],
+    }
     return described_columns(
         columns, declared("miricigale.evaluation", "columns.toml")["completeness"]
     )

@@ -330,8 +330,13 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
         # standard error of a median
         scatter[i] = np.sqrt(np.pi / (2.0 * n[i])) * np.median(np.abs(ratio - middle)) / _MEDIAN
     factor[known] /= factor[bands.index(reference)]
-    values = np.array(bands), n, factor, factor * scatter
-    return described_columns(values, _COLUMNS, {"reference": reference})
+    columns = {
+        "band": np.array(bands),
+        "n": n,
+        "factor": factor,
+        "factor_err": factor * scatter,
+    }
+    return described_columns(columns, _COLUMNS, {"reference": reference})
 
 
 def apply_zero_points(photometry, zero_points):

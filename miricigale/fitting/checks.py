@@ -197,7 +197,7 @@ class MockResult:
             ranks.
         """
         names = self.parameters if parameters is None else parameters
-        rows = [(name, *self._metric(name)) for name in names]
+        rows = [self._metric(name) for name in names]
         table = described_rows(rows, _COLUMNS["mock"])
         table.meta["mock"] = dict(self.meta)
         return table
@@ -209,9 +209,14 @@ class MockResult:
         if self.truth.extensive(name):
             both = good & (true > 0) & (mean > 0)
             unit, difference = "dex", np.log10(mean[both] / true[both])
-        coverage = _statistic(np.mean, self._inside(name, good))
-        spread = (_statistic(function, difference) for function in (np.median, mad_std))
-        return unit, int(np.count_nonzero(good)), *spread, coverage
+        return {
+            "parameter": name,
+            "unit": unit,
+            "n": int(np.count_nonzero(good)),
+            "offset": _statistic(np.median, difference),
+            "scatter": _statistic(mad_std, difference),
+            "coverage": _statistic(np.mean, self._inside(name, good)),
+        }
 
     def _inside(self, name, good):
         """Whether the truth of good objects lies in the 16-84 % interval."""
@@ -418,15 +423,21 @@ class LeaveOutResult:
             absolute deviation of the pulls; ``within``, the part of pulls within 1 (0.68 if
             errors and models are right).
         """
-        rows = [(name, *self._metric(i)) for i, name in enumerate(self.bands)]
+        rows = [self._metric(i) for i in range(len(self.bands))]
         return described_rows(rows, _COLUMNS["left_out"])
 
     def _metric(self, i):
         good = np.isfinite(self.pull[:, i])
         pull, flux, model = self.pull[good, i], self.flux[good, i], self.predicted[good, i]
         offset = _statistic(np.median, flux[model > 0] / model[model > 0]) - 1.0
-        spread = (_statistic(function, pull) for function in (np.median, mad_std))
-        return int(pull.size), offset, *spread, _statistic(np.mean, np.abs(pull) <= 1.0)
+        return {
+            "band": self.bands[i],
+            "n": int(pull.size),
+            "offset": offset,
+            "pull": _statistic(np.median, pull),
+            "pull_scatter": _statistic(mad_std, pull),
+            "within": _statistic(np.mean, np.abs(pull) <= 1.0),
+        }
 
     def plot(self, band=None, ax=None, **kwargs):
         """Draw the distribution of the pulls of one band, or of all; returns the axes."""

@@ -250,8 +250,8 @@ def _read_bands(table):
 
 
 def _band_row(band, errors):
-    """Row of the table of bands, in the order of its columns, from `BandErrors`."""
-    row = {
+    """Row of the table of bands from `BandErrors`: dict by column."""
+    return {
         "band": band,
         "n": errors.n,
         "zero_point": errors.zero_point,
@@ -261,7 +261,6 @@ def _band_row(band, errors):
         "outlier": errors.wrong if prior_of_band(band).allows_wrong else 0.0,
         "wrong": errors.wrong,
     }
-    return [row[name] for name in _COLUMNS]
 
 
 def calibrate(
@@ -350,8 +349,11 @@ def calibrate(
             before.append(fitter.fit(some, **options))
             after.append(with_calibration(fitter, other).fit(some, **options))
     true = np.concatenate([half[1] for half in halves])
-    lines = [(label, *_score(fits, true)) for label, fits in (("before", before), ("after", after))]
-    return dataclasses.replace(_mean(found), scores=described_rows(lines, _SCORES))
+    scores = [
+        {"fit": "before"} | _score(before, true),
+        {"fit": "after"} | _score(after, true),
+    ]
+    return dataclasses.replace(_mean(found), scores=described_rows(scores, _SCORES))
 
 
 def _fitted(fitter, table):
@@ -360,14 +362,20 @@ def _fitted(fitter, table):
 
 
 def _score(fits, true):
-    """Sources, bias, sigma_MAD, outliers, and part within the 68 % interval."""
+    """Sources, bias, sigma_MAD, outliers, and part within the 68 % interval: dict by column."""
     low, z, high = np.concatenate(
         [one.percentile("redshift", (0.16, 0.5, 0.84)).value for one in fits]
     ).T
     good = np.isfinite(z)
     metrics = photoz_metrics(true[good], z[good])
     inside = np.mean((low <= true)[good] & (true <= high)[good])
-    return int(good.sum()), metrics.bias, metrics.sigma_mad, metrics.outlier_fraction, inside
+    return {
+        "n": int(good.sum()),
+        "bias": metrics.bias,
+        "sigma_mad": metrics.sigma_mad,
+        "outliers": metrics.outlier_fraction,
+        "inside": inside,
+    }
 
 
 def on_nodes(fitter):

@@ -307,8 +307,17 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
         purity_above = np.where(above[0] > 0, 1 - above[1] / above[0], np.nan)
     texts = declared("miricigale.photometry", "columns.toml")["purity"]
     meta = provenance(n_positive=len(positive), n_negative=len(negative))
-    values = edges[:-1], edges[1:], *counts, purity, low, high, purity_above
-    return described_columns(values, texts, {**meta, **dataclasses.asdict(settings)})
+    columns = {
+        "snr_low": edges[:-1],
+        "snr_high": edges[1:],
+        "n_positive": n_positive,
+        "n_negative": n_negative,
+        "purity": purity,
+        "purity_low": low,
+        "purity_high": high,
+        "purity_above": purity_above,
+    }
+    return described_columns(columns, texts, {**meta, **dataclasses.asdict(settings)})
 
 
 def _prepared(
@@ -425,9 +434,21 @@ def _catalog(objects, found, labels, arrays, meta):
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = total / noise
     flags = objects["flag"].astype(int) & sum(int(flag) for flag in DetectionFlags)
-    axes = [objects[one] * scale * ANGLE for one in "ab"]
-    values = [index, index, sky.icrs, x, y, total * FNU, noise * FNU, *axes]
-    sizes = (np.bincount(one.ravel(), minlength=n + 1)[1:] for one in (labels, found))
-    values += [np.degrees(objects["theta"]) * u.deg, *sizes, snr, flags]
+    columns = {
+        "id": index,
+        "label": index,
+        "sky": sky.icrs,
+        "x_centroid": x,
+        "y_centroid": y,
+        "flux": total * FNU,
+        "flux_err": noise * FNU,
+        "semimajor_axis": objects["a"] * scale * ANGLE,
+        "semiminor_axis": objects["b"] * scale * ANGLE,
+        "orientation": np.degrees(objects["theta"]) * u.deg,
+        "n_pixels": np.bincount(labels.ravel(), minlength=n + 1)[1:],
+        "n_detected": np.bincount(found.ravel(), minlength=n + 1)[1:],
+        "snr": snr,
+        "flags": flags,
+    }
     texts = declared("miricigale.photometry", "columns.toml")["detections"]
-    return described_columns(values, texts | {"flags": DetectionFlags.describe()}, meta)
+    return described_columns(columns, texts | {"flags": DetectionFlags.describe()}, meta)

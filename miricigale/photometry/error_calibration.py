@@ -192,6 +192,17 @@ def _row(snr, pull, ratio, member):
     bias = np.median(ratio) if len(ratio) else np.nan
     # of a percentile: root of p (1 - p) / n over the density of |x| there, 0.484
     factor_err = factor * 0.4655 / 0.4839 / np.sqrt(len(member))
-    snr, spreads = snr[member], (np.std(pull), mad_std(pull))
-    limits = snr.min(), snr.max(), np.median(snr)
-    return *limits, len(member), *spreads, np.mean(pull), np.median(pull), bias, factor, factor_err
+    snr = snr[member]
+    return {
+        "low": snr.min(),
+        "high": snr.max(),
+        "snr": np.median(snr),
+        "n": len(member),
+        "std": np.std(pull),
+        "mad": mad_std(pull),
+        "mean": np.mean(pull),
+        "median": np.median(pull),
+        "bias": bias,
+        "factor": factor,
+        "factor_err": factor_err,
+    }

@@ -186,10 +186,18 @@ def curves_to_table(curves, meta):
     rows = [np.stack(curve.rows()) for curve in curves.values()]
     counts = [values.shape[1] for values in rows]
     values = np.concatenate([np.empty((6, 0)), *rows], axis=1)
-    units = [FNU] * 4 + [u.dimensionless_unscaled, FNU]
-    columns = [np.repeat(np.array(list(curves), str), counts)]
-    columns += [np.repeat(np.array([one.kind for one in curves.values()], str), counts)]
-    columns += [one * unit for one, unit in zip(values, units, strict=True)]
+    flux, sigma, low, high, fraction, photon = values
+    kinds = np.array([curve.kind for curve in curves.values()], str)
+    columns = {
+        "filter": np.repeat(np.array(list(curves), str), counts),
+        "kind": np.repeat(kinds, counts),
+        "flux": flux * FNU,
+        "sigma": sigma * FNU,
+        "low": low * FNU,
+        "high": high * FNU,
+        "fraction": fraction * u.dimensionless_unscaled,
+        "photon": photon * FNU,
+    }
     texts = declared("miricigale.photometry", "columns.toml")["curves"]
     return described_columns(columns, texts, dict(meta))
 

@@ -180,15 +180,25 @@ def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.
         at = tuple(at[rng.permutation(len(at))[:_EMPTY]].T)
         pulls = fftconvolve(flux, weight[::-1, ::-1], "same")[at] / (factor * stated[at])
         limit, scatter = n_sigma * error, mad_std(pulls) if pulls.size > 1 else np.nan
-        magnitude = limit.to_value(u.ABmag)
         rows.append(
-            (name, error, error / factor, factor, limit, magnitude, inside, scatter, pulls.size)
+            {
+                "aperture": name,
+                "error": error,
+                "stated": error / factor,
+                "factor": factor,
+                "limit": limit,
+                "limit_mag": limit.to_value(u.ABmag),
+                "enclosed": inside,
+                "scatter": scatter,
+                "n_empty": pulls.size,
+            }
         )
     over = float(np.sqrt(correlation[m, m]))
     kept = {k: image.meta[k] for k in ("filter", "source", "noise") if k in image.meta}
     meta = provenance(n_sigma=n_sigma, noise_over_stated=round(over, 4), **kept)
     texts = declared("miricigale.photometry", "columns.toml")["errors"]
-    table = described_columns(map(list, zip(*rows, strict=True)), texts, meta)
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
+    table = described_columns(columns, texts, meta)
     noise = np.where(usable, arrays.sigma / arrays.area * over, np.nan)
     noise = Image(noise, unit=SURFACE_BRIGHTNESS, wcs=arrays.wcs, meta=kept)
     return ImageErrors(noise, correlation, table, limits, int(np.count_nonzero(free)))

@@ -198,16 +198,21 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
     """
     psfs = [instrument_psf(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
     names = [psf.filter or "" for psf in psfs]
-    flight = [psf_fwhm(n).value if n in imager_filters() else np.nan for n in names] * ANGLE
-    angles = [psf.angle.value if psf.frame == "sky" else np.nan for psf in psfs] * u.deg
-    frames = [psf.frame for psf in psfs]
-    includes = [" ".join(psf.includes) for psf in psfs]
-    widths = u.Quantity([psf.fwhm for psf in psfs])
-    gaussian = u.Quantity([fwhm(psf, method="gaussian") for psf in psfs])
-    r80, enclosed = [_r80(psf) for psf in psfs] * ANGLE, [psf.enclosed for psf in psfs]
-    columns = [names, frames, angles, includes, widths, gaussian, flight, r80, enclosed]
+    columns = {
+        "filter": names,
+        "frame": [psf.frame for psf in psfs],
+        "angle": [psf.angle.value if psf.frame == "sky" else np.nan for psf in psfs] * u.deg,
+        "includes": [" ".join(psf.includes) for psf in psfs],
+        "fwhm": u.Quantity([psf.fwhm for psf in psfs]),
+        "fwhm_gaussian": u.Quantity([fwhm(psf, method="gaussian") for psf in psfs]),
+        "fwhm_flight": [psf_fwhm(n).value if n in imager_filters() else np.nan for n in names]
+        * ANGLE,
+        "r80": [_r80(psf) for psf in psfs] * ANGLE,
+        "enclosed": [psf.enclosed for psf in psfs],
+    }
     texts = dict(declared("miricigale.psf", "columns.toml"))
     for radius in radii:
-        columns.append([encircled_energy(psf, radius) for psf in psfs])
-        texts[f"eef_{radius.to_value(ANGLE):g}"] = f"fraction of all light within {radius}"
+        name = f"eef_{radius.to_value(ANGLE):g}"
+        columns[name] = [encircled_energy(psf, radius) for psf in psfs]
+        texts[name] = f"fraction of all light within {radius}"
     return described_columns(columns, texts)

@@ -341,8 +341,17 @@ class Scene(Interactive):
         flags[inside & valid & dim] |= SceneFlags.NEAR_EDGE
         painted_as = np.where(sersic, "sersic", "point").astype("U6")
         painted_as[list(self._cutouts)] = "cutout"
-        columns = [catalog["id"], catalog["sky"], x, y, painted_as]
-        columns += [*(light * FNU for light in (flux, agn, in_image)), flags]
+        columns = {
+            "id": catalog["id"],
+            "sky": catalog["sky"],
+            "x": x,
+            "y": y,
+            "profile": painted_as,
+            "flux_total": flux * FNU,
+            "flux_agn": agn * FNU,
+            "flux_in_image": in_image * FNU,
+            "flags": flags,
+        }
         texts = declared("miricigale.scene", "columns.toml")["truth"] | {
             "flags": SceneFlags.describe()
         }

@@ -139,25 +139,32 @@ def described_table(columns, meta=None):
     return table
 
 
-def described_columns(values, texts, meta=None):
+def described_columns(columns, texts, meta=None):
     """
-    Make a table of columns whose names and descriptions are declared.
+    Make a table of columns whose descriptions are declared.
 
     Parameters
     ----------
-    values : iterable
-        Values of the columns, in the order of ``texts``.
+    columns : dict of str to array-like
+        Values by name, in the order of the table.
     texts : dict of str to str
-        Description of each column by name; empty for none.
+        Description of each of these columns by name, in any order; empty for none.
     meta : dict, optional
         Provenance.
 
     Returns
     -------
     table : `~astropy.table.QTable`
+
+    Raises
+    ------
+    ValueError
+        If a column has no description, or a description no column.
     """
-    pairs = zip(texts.items(), values, strict=True)
-    return described_table({name: (column, text or None) for (name, text), column in pairs}, meta)
+    different = sorted(columns.keys() ^ texts.keys())
+    check_that(not different, "texts", f"descriptions of {list(columns)}", f"others: {different}")
+    described = {name: (values, texts[name] or None) for name, values in columns.items()}
+    return described_table(described, meta)
 
 
 def described_rows(rows, texts):
@@ -166,21 +173,24 @@ def described_rows(rows, texts):
 
     Parameters
     ----------
-    rows : iterable of sequence
-        Values of one row each; there may be none.
+    rows : iterable of dict
+        Values of one row each by name, all with the same names; there may be none.
     texts : dict of str to str
-        Description of each column by name, in the order of the values.
+        Description of each column by name; the order of the columns is that of the rows.
 
     Returns
     -------
     table : `~astropy.table.QTable`
+
+    Raises
+    ------
+    ValueError
+        If a column has no description, or a description no column.
     """
     rows = list(rows)
-    if rows:
-        columns = zip(*rows, strict=True)
-    else:
-        columns = [[]] * len(texts)
-    return described_columns(map(np.array, columns), texts)
+    names = list(rows[0]) if rows else list(texts)
+    columns = {name: np.array([row[name] for row in rows]) for name in names}
+    return described_columns(columns, texts)
 
 
 def error_column(name):

@@ -32,8 +32,17 @@ def test_flags_explain_themselves():
 
 
 def test_rows_make_a_table_whose_columns_say_what_they_are():
-    table = described_rows([(1, "a"), (2, "b")], {"id": "number", "name": "text"})
+    rows = [{"id": 1, "name": "a"}, {"id": 2, "name": "b"}]
+    # the order is that of the values, not of the texts
+    table = described_rows(rows, {"name": "text", "id": "number"})
+    assert table.colnames == ["id", "name"]
     assert table["id"].tolist() == [1, 2]
+    refuses(
+        r"'texts' must be .*others: \['name', 'title'\]",
+        described_rows,
+        rows,
+        {"id": "", "title": ""},
+    )
     assert table["name"].info.description == "text"
     empty = described_rows([], {"id": "number", "name": "text"})
     assert empty.colnames == ["id", "name"]

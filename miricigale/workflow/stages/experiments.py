@@ -182,10 +182,11 @@ def write_experiments(page, every):
                 fits.append(("study", rows_of(own, table["id"])))
             fits.append((name, table))
         for name, table in fits:
-            rows.append((of, name, len(table), experiment_numbers(study.sample, table)))
-    texts = {"truth": "Sky", "experiment": "Fit", "n_sources": "Sources"}
-    texts |= {key: key.replace("_", " ") for key in rows[0][3]}
-    numbers = described_rows([(*row, *values.values()) for *row, values in rows], texts)
+            row = {"truth": of, "experiment": name, "n_sources": len(table)}
+            rows.append(row | experiment_numbers(study.sample, table))
+    texts = {key: key.replace("_", " ") for key in rows[0]}
+    texts |= {"truth": "Sky", "experiment": "Fit", "n_sources": "Sources"}
+    numbers = described_rows(rows, texts)
     declared = texts_of("experiments")
     sentences = " ".join(declared["sentences"][name] for name in names)
     sentences = sentence(sentences, {"n_free": N_FREE, "agn_error": AGN_ERROR})

@@ -146,9 +146,21 @@ def rival_numbers(tables):
                 ratio = recovery_metrics(true, flux, relative=True)
                 with np.errstate(invalid="ignore", divide="ignore"):
                     pulls = recovery_metrics(np.zeros(true.size), (flux - true) / error)
-                numbers = ratio.median, ratio.median_err, ratio.sigma_mad
-                numbers += pulls.median, pulls.sigma_mad
-                found.append((band, kind, group, method, true.size, ratio.n, *numbers))
+                found.append(
+                    {
+                        "band": band,
+                        "kind": kind,
+                        "group": group,
+                        "method": method,
+                        "n_group": true.size,
+                        "n": ratio.n,
+                        "median": ratio.median,
+                        "median_err": ratio.median_err,
+                        "scatter": ratio.sigma_mad,
+                        "pull_median": pulls.median,
+                        "pull_scatter": pulls.sigma_mad,
+                    }
+                )
     return described_rows(found, texts_of("rivals")["numbers"])
 
 

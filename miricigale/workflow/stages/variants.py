@@ -135,13 +135,17 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
                 seen = flux > 5 * curves[0].sigma(flux)
             if name == other:
                 change[:] = np.nan
-            numbers = []
-            for k in range(2):
-                numbers += [found[name][0, k], _half_width(found[name][1:, k])]
-                numbers += [change[0, k], _half_width(change[1:, k])]
+            row = {"band": band, "images": name, "n": len(samples[0]), "calculator": limit}
+            for k, measure in enumerate(("limit", "scatter")):
+                row[measure] = found[name][0, k]
+                row[f"{measure}_err"] = _half_width(found[name][1:, k])
+                row[f"{measure}_change"] = change[0, k]
+                row[f"{measure}_change_err"] = _half_width(change[1:, k])
             complete = Estimate.of_fraction(np.count_nonzero(seen & bright), bright.sum())
-            numbers += [int(np.count_nonzero(seen & field)), complete.value, complete.error]
-            rows.append((band, name, len(samples[0]), limit, *numbers))
+            row["detected"] = int(np.count_nonzero(seen & field))
+            row["completeness"] = complete.value
+            row["completeness_err"] = complete.error
+            rows.append(row)
     return described_rows(rows, texts_of("variants")["numbers"])
 
 
