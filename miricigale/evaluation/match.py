@@ -33,16 +33,17 @@ class AssociationFlags(Flags):
     8
     """
 
-    #: More than one row of the second catalog is within the radius of the row of the first.
-    SEVERAL_SECOND = 1
-    #: More than one row of the first catalog is within the radius of the row of the second.
-    SEVERAL_FIRST = 2
-    #: The nearest row of the other catalog is nearer to another one.
-    NOT_MUTUAL = 4
-    #: No row of the other catalog is within the radius.
-    NONE_NEAR = 8
-    #: The position is not finite.
-    NO_POSITION = 16
+    SEVERAL_SECOND = (
+        1,
+        "More than one row of the second catalog is within the radius of the row of the first.",
+    )
+    SEVERAL_FIRST = (
+        2,
+        "More than one row of the first catalog is within the radius of the row of the second.",
+    )
+    NOT_MUTUAL = 4, "The nearest row of the other catalog is nearer to another one."
+    NONE_NEAR = 8, "No row of the other catalog is within the radius."
+    NO_POSITION = 16, "The position is not finite."
 
 
 #: What the flags come to.

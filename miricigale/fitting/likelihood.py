@@ -43,59 +43,109 @@ class FitFlags(Flags):
     <FitFlags.ALL_LIMITS: 4096>
     """
 
-    #: No usable band.
-    NO_BAND = 1
-    #: Fewer usable bands, upper limits among them, than asked for.
-    FEW_BANDS = 2
-    #: A flux whose error is zero, negative, not finite or beyond 1e-60 to 1e60 uJy; the band is left out.
-    BAD_ERROR = 4
-    #: A fixed redshift was asked for and is missing, not finite or not positive; or the density of
-    #: ``redshift_prior`` is missing, not finite or 0 throughout.
-    NO_REDSHIFT = 8
-    #: The fixed redshift has no redshift of the grid within the tolerance.
-    REDSHIFT_OUTSIDE = 16
-    #: The id occurred before; only its first row is fitted.
-    DUPLICATE_ID = 32
-    #: No model fits: the reduced chi2 of the best is above that of nearly all of the sample (by three standard
-    #: deviations of its logarithm; above 10 without 50 others), and larger than errors make it.
-    HIGH_CHI2 = 64
-    #: No model has a positive scale, the fluxes being zero or negative: the posterior is the prior.
-    NO_SIGNAL = 128
-    #: More than one per cent of the posterior lies on the first or last redshift.
-    REDSHIFT_EDGE = 256
-    #: No model is left by the age of the universe and the priors.
-    NO_MODEL = 512
-    #: A flux that is infinite or beyond 1e60 uJy; the band is left out.
-    BAD_FLUX = 1024
-    #: Fewer than three fluxes of 2 sigma or more (two if the redshift is known), or than free parameters if these
-    #: are fewer: but for mass, redshift and a color the posterior is the prior. Limits are not counted.
-    FEW_FOR_PARAMETERS = 2048
-    #: Upper limits and no flux: any model that is faint enough fits.
-    ALL_LIMITS = 4096
-    #: With ``compat="cigale"``: the best chi2 is so high that every likelihood vanishes.
-    NO_LIKELIHOOD = 8192
-    #: The best model has S/N below 3 over all bands: take masses and luminosities from samples.
-    LOW_SIGNAL = 16384
-    #: Of nodes alone (``interpolate=0``): more than 95 % of the posterior lies on one galaxy model at one
-    #: redshift.
-    ONE_NODE = 32768
-    #: Less than 1 % of the posterior keeps ``max_dev_alpha_ox`` of CIGALE's module xray: the result is
-    #: without it.
-    OFF_RELATION = 65536
-    #: The median stellar mass is below 3e6 solar masses at a redshift that was fitted, as of few sources that a
-    #: survey detects: rather another redshift, a star, or a little red dot.
-    LOW_MASS = 131072
-    #: The posterior between nodes is not converged: the effective number of models that ``interpolate`` asks for
-    #: was not reached, in all or in a redshift peak or kind of model with more than 2 % of the weight.
-    NOT_CONVERGED = 262144
-    #: One band is off, that of the column ``band_off``: its residual to the best model is above 4 errors and makes
-    #: 40 % of chi2 or more. Look at that flux before you trust the fit, or fit without it.
-    BAND_OFF = 524288
-    #: In a table of classes: the class is not the first one, that of galaxies. The redshift is that of the class;
-    #: masses and all else that is of galaxies are of the fit as one, at its redshift, ``redshift_p50_galaxy``.
-    OTHER_CLASS = 1048576
-    #: Bits with which a row has no result.
-    UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
+    NO_BAND = 1, "No usable band."
+    FEW_BANDS = 2, "Fewer usable bands, upper limits among them, than asked for."
+    BAD_ERROR = (
+        4,
+        (
+            "A flux whose error is zero, negative, not finite or beyond 1e-60 to 1e60 uJy; the "
+            "band is left out."
+        ),
+    )
+    NO_REDSHIFT = (
+        8,
+        (
+            "A fixed redshift was asked for and is missing, not finite or not positive; or the "
+            "density of ``redshift_prior`` is missing, not finite or 0 throughout."
+        ),
+    )
+    REDSHIFT_OUTSIDE = 16, "The fixed redshift has no redshift of the grid within the tolerance."
+    DUPLICATE_ID = 32, "The id occurred before; only its first row is fitted."
+    HIGH_CHI2 = (
+        64,
+        (
+            "No model fits: the reduced chi2 of the best is above that of nearly all of the "
+            "sample (by three standard deviations of its logarithm; above 10 without 50 others), "
+            "and larger than errors make it."
+        ),
+    )
+    NO_SIGNAL = (
+        128,
+        (
+            "No model has a positive scale, the fluxes being zero or negative: the posterior is "
+            "the prior."
+        ),
+    )
+    REDSHIFT_EDGE = (
+        256,
+        "More than one per cent of the posterior lies on the first or last redshift.",
+    )
+    NO_MODEL = 512, "No model is left by the age of the universe and the priors."
+    BAD_FLUX = 1024, "A flux that is infinite or beyond 1e60 uJy; the band is left out."
+    FEW_FOR_PARAMETERS = (
+        2048,
+        (
+            "Fewer than three fluxes of 2 sigma or more (two if the redshift is known), or than "
+            "free parameters if these are fewer: but for mass, redshift and a color the posterior "
+            "is the prior. Limits are not counted."
+        ),
+    )
+    ALL_LIMITS = 4096, "Upper limits and no flux: any model that is faint enough fits."
+    NO_LIKELIHOOD = (
+        8192,
+        'With ``compat="cigale"``: the best chi2 is so high that every likelihood vanishes.',
+    )
+    LOW_SIGNAL = (
+        16384,
+        "The best model has S/N below 3 over all bands: take masses and luminosities from samples.",
+    )
+    ONE_NODE = (
+        32768,
+        (
+            "Of nodes alone (``interpolate=0``): more than 95 % of the posterior lies on one "
+            "galaxy model at one redshift."
+        ),
+    )
+    OFF_RELATION = (
+        65536,
+        (
+            "Less than 1 % of the posterior keeps ``max_dev_alpha_ox`` of CIGALE's module xray: "
+            "the result is without it."
+        ),
+    )
+    LOW_MASS = (
+        131072,
+        (
+            "The median stellar mass is below 3e6 solar masses at a redshift that was fitted, as "
+            "of few sources that a survey detects: rather another redshift, a star, or a little "
+            "red dot."
+        ),
+    )
+    NOT_CONVERGED = (
+        262144,
+        (
+            "The posterior between nodes is not converged: the effective number of models that "
+            "``interpolate`` asks for was not reached, in all or in a redshift peak or kind of "
+            "model with more than 2 % of the weight."
+        ),
+    )
+    BAND_OFF = (
+        524288,
+        (
+            "One band is off, that of the column ``band_off``: its residual to the best model is "
+            "above 4 errors and makes 40 % of chi2 or more. Look at that flux before you trust "
+            "the fit, or fit without it."
+        ),
+    )
+    OTHER_CLASS = (
+        1048576,
+        (
+            "In a table of classes: the class is not the first one, that of galaxies. The "
+            "redshift is that of the class; masses and all else that is of galaxies are of the "
+            "fit as one, at its redshift, ``redshift_p50_galaxy``."
+        ),
+    )
+    UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192, "Bits with which a row has no result."
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,48 +33,44 @@ class DQ(Flags):
     """
 
     GOOD = 0
-    DO_NOT_USE = 2**0  # Must not be used.
-    #: Groups from the first saturated one on are left out.
-    SATURATED = 2**1
-    #: A ramp that is split at one or more jumps.
-    JUMP_DET = 2**2
-    DROPOUT = 2**3  # Data lost in transmission.
-    #: Disagrees with the other dithers.
-    OUTLIER = 2**4
-    PERSISTENCE = 2**5  # High persistence.
-    AD_FLOOR = 2**6  # At or below the floor of the A/D converter.
-    CHARGELOSS = 2**7  # Charge has migrated to neighbors.
-    UNRELIABLE_ERROR = 2**8  # The error may be larger than stated.
-    #: Sees no sky: reference pixels, those behind the coronagraph masks, mosaics without data.
-    NON_SCIENCE = 2**9
-    DEAD = 2**10  # Dead pixel.
-    HOT = 2**11  # Hot pixel.
-    WARM = 2**12  # Warm pixel.
-    LOW_QE = 2**13  # Low quantum efficiency.
-    RC = 2**14  # RC pixel: the signal decays between reads.
-    TELEGRAPH = 2**15  # Telegraph pixel: the signal jumps between two levels.
-    NONLINEAR = 2**16  # Highly non-linear pixel.
-    BAD_REF_PIXEL = 2**17  # Reference pixel that cannot be used.
-    NO_FLAT_FIELD = 2**18  # Flat field is not known.
-    NO_GAIN_VALUE = 2**19  # Gain is not known.
-    NO_LIN_CORR = 2**20  # Linearity correction is not available.
-    NO_SAT_CHECK = 2**21  # Saturation level is not known.
-    UNRELIABLE_BIAS = 2**22  # Large variance of the bias.
-    UNRELIABLE_DARK = 2**23  # Large variance of the dark current.
-    UNRELIABLE_SLOPE = 2**24  # Large variance of the slope.
-    UNRELIABLE_FLAT = 2**25  # Large variance of the flat field.
-    OPEN = 2**26  # Open pixel: its charge goes to its neighbors.
-    ADJ_OPEN = 2**27  # Next to an open pixel.
-    FLUX_ESTIMATED = 2**28  # Flux estimated because data are missing or bad.
-    MSA_FAILED_OPEN = 2**29  # Light from a shutter of NIRSpec that failed open.
-    OTHER_BAD_PIXEL = 2**30  # Any other bad pixel.
-    REFERENCE_PIXEL = 2**31  # Reference pixel.
-    #: Split where a neighbor had a large jump.
-    JUMP_NEIGHBOR = 2**32
-    #: No slope: saturated from the start, or not fitted.
-    NO_SLOPE = 2**33
-    #: Far below the background.
-    NEGATIVE = 2**35
+    DO_NOT_USE = 2**0, "Must not be used."
+    SATURATED = 2**1, "Groups from the first saturated one on are left out."
+    JUMP_DET = 2**2, "A ramp that is split at one or more jumps."
+    DROPOUT = 2**3, "Data lost in transmission."
+    OUTLIER = 2**4, "Disagrees with the other dithers."
+    PERSISTENCE = 2**5, "High persistence."
+    AD_FLOOR = 2**6, "At or below the floor of the A/D converter."
+    CHARGELOSS = 2**7, "Charge has migrated to neighbors."
+    UNRELIABLE_ERROR = 2**8, "The error may be larger than stated."
+    NON_SCIENCE = (
+        2**9,
+        "Sees no sky: reference pixels, those behind the coronagraph masks, mosaics without data.",
+    )
+    DEAD = 2**10, "Dead pixel."
+    HOT = 2**11, "Hot pixel."
+    WARM = 2**12, "Warm pixel."
+    LOW_QE = 2**13, "Low quantum efficiency."
+    RC = 2**14, "RC pixel: the signal decays between reads."
+    TELEGRAPH = 2**15, "Telegraph pixel: the signal jumps between two levels."
+    NONLINEAR = 2**16, "Highly non-linear pixel."
+    BAD_REF_PIXEL = 2**17, "Reference pixel that cannot be used."
+    NO_FLAT_FIELD = 2**18, "Flat field is not known."
+    NO_GAIN_VALUE = 2**19, "Gain is not known."
+    NO_LIN_CORR = 2**20, "Linearity correction is not available."
+    NO_SAT_CHECK = 2**21, "Saturation level is not known."
+    UNRELIABLE_BIAS = 2**22, "Large variance of the bias."
+    UNRELIABLE_DARK = 2**23, "Large variance of the dark current."
+    UNRELIABLE_SLOPE = 2**24, "Large variance of the slope."
+    UNRELIABLE_FLAT = 2**25, "Large variance of the flat field."
+    OPEN = 2**26, "Open pixel: its charge goes to its neighbors."
+    ADJ_OPEN = 2**27, "Next to an open pixel."
+    FLUX_ESTIMATED = 2**28, "Flux estimated because data are missing or bad."
+    MSA_FAILED_OPEN = 2**29, "Light from a shutter of NIRSpec that failed open."
+    OTHER_BAD_PIXEL = 2**30, "Any other bad pixel."
+    REFERENCE_PIXEL = 2**31, "Reference pixel."
+    JUMP_NEIGHBOR = 2**32, "Split where a neighbor had a large jump."
+    NO_SLOPE = 2**33, "No slope: saturated from the start, or not fitted."
+    NEGATIVE = 2**35, "Far below the background."
 
 
 def dq_legend():

@@ -34,12 +34,9 @@ class DetectionFlags(Flags):
     ['merged', 'truncated']
     """
 
-    #: Deblended from a neighbor, or blended with one.
-    MERGED = 1
-    #: Cut by the edge of the image.
-    TRUNCATED = 2
-    #: Too few levels to tell its shape.
-    SINGULAR = 8
+    MERGED = 1, "Deblended from a neighbor, or blended with one."
+    TRUNCATED = 2, "Cut by the edge of the image."
+    SINGULAR = 8, "Too few levels to tell its shape."
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,33 +24,51 @@ class ForcedFlags(Flags):
     256 ('edge', "More than a tenth of the template's light falls off the image or its footprint.")
     """
 
-    #: More than a tenth of the template's light falls off the image or its footprint.
-    EDGE = 1
-    #: More than a tenth of the template's light falls on masked pixels.
-    MASKED = 2
-    #: Too little of the template's light falls on usable pixels: not measured.
-    NO_DATA = 4
-    #: Blending makes the error more than twice that of the source alone.
-    BLENDED = 8
-    #: The template is the same as another one's: not measured, the other has the light.
-    DEGENERATE = 16
-    #: The template is a point source because the catalog position has no segment.
-    NO_SEGMENT = 32
-    #: The template is a point source because the segment is too noisy.
-    NOISY_SEGMENT = 64
-    #: The template is a point source because another source owns the segment.
-    SHARED_SEGMENT = 128
-    #: Residuals below the template are more than noise (chi2 above 2, and above twice the measured noise),
-    #: or the template had to change by far more than the high-resolution image leaves open.
-    POOR_FIT = 256
-    #: Light that no template explains (5 sigma, a tenth of the flux) is within two widths of the PSF.
-    UNEXPLAINED_NEIGHBOR = 512
-    #: The point on the template cannot be distinguished from it, or the template was not measured: one flux only.
-    ONE_COMPONENT = 1024
-    #: Not in the catalog: found on the residual of a first fit.
-    NOT_IN_CATALOG = 2048
-    #: The core is saturated on the high-resolution image (a hole without data, or a flat top): it is masked there,
-    #: and the template follows from what is around it.
-    SATURATED = 4096
-    #: The segment reaches beyond the patch of a large mosaic: what it has there is not in the template.
-    CUT = 8192
+    EDGE = 1, "More than a tenth of the template's light falls off the image or its footprint."
+    MASKED = 2, "More than a tenth of the template's light falls on masked pixels."
+    NO_DATA = 4, "Too little of the template's light falls on usable pixels: not measured."
+    BLENDED = 8, "Blending makes the error more than twice that of the source alone."
+    DEGENERATE = (
+        16,
+        "The template is the same as another one's: not measured, the other has the light.",
+    )
+    NO_SEGMENT = 32, "The template is a point source because the catalog position has no segment."
+    NOISY_SEGMENT = 64, "The template is a point source because the segment is too noisy."
+    SHARED_SEGMENT = 128, "The template is a point source because another source owns the segment."
+    POOR_FIT = (
+        256,
+        (
+            "Residuals below the template are more than noise (chi2 above 2, and above twice the "
+            "measured noise), or the template had to change by far more than the high-resolution "
+            "image leaves open."
+        ),
+    )
+    UNEXPLAINED_NEIGHBOR = (
+        512,
+        (
+            "Light that no template explains (5 sigma, a tenth of the flux) is within two widths "
+            "of the PSF."
+        ),
+    )
+    ONE_COMPONENT = (
+        1024,
+        (
+            "The point on the template cannot be distinguished from it, or the template was not "
+            "measured: one flux only."
+        ),
+    )
+    NOT_IN_CATALOG = 2048, "Not in the catalog: found on the residual of a first fit."
+    SATURATED = (
+        4096,
+        (
+            "The core is saturated on the high-resolution image (a hole without data, or a flat "
+            "top): it is masked there, and the template follows from what is around it."
+        ),
+    )
+    CUT = (
+        8192,
+        (
+            "The segment reaches beyond the patch of a large mosaic: what it has there is not in "
+            "the template."
+        ),
+    )

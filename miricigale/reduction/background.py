@@ -38,14 +38,21 @@ class BackgroundFlags(Flags):
     """
 
     GOOD = 0
-    FEW_SKY = 1
-    """Sources leave less than a twentieth of the pixels: all were taken for sky."""
-    CONFUSED = 2
-    """Light of sources that is not masked leaves the level open by more than half of the noise of a pixel:
-    what is faint, blends, or is wide. The error says by how much."""
-    UNKNOWN = 4
-    """The level is open by more than a third of itself, and by more than three times the noise of a pixel:
-    `~miricigale.reduction.Reducer` leaves the sky in the image."""
+    FEW_SKY = 1, "Sources leave less than a twentieth of the pixels: all were taken for sky."
+    CONFUSED = (
+        2,
+        (
+            "Light of sources that is not masked leaves the level open by more than half of the "
+            "noise of a pixel: what is faint, blends, or is wide. The error says by how much."
+        ),
+    )
+    UNKNOWN = (
+        4,
+        (
+            "The level is open by more than a third of itself, and by more than three times the "
+            "noise of a pixel: `~miricigale.reduction.Reducer` leaves the sky in the image."
+        ),
+    )
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -47,13 +47,13 @@ class CatalogFlags(Flags):
     ['no_redshift']
     """
 
-    BAD_RADIUS = 1  # a Sersic profile without a positive radius: drawn as a point
-    BAD_INDEX = 2  # index outside the range that profiles are made for: drawn as a point
-    BAD_AXIS_RATIO = 4  # not in (0, 1]: drawn as a point
-    BAD_ANGLE = 8  # not finite: drawn as a point unless it is round
-    NO_REDSHIFT = 16  # not finite or not positive (stars)
-    NO_FLUX = 32  # no band has a positive flux (with a positive error, where it has errors)
-    MISSING_CODE = 64  # a flux or error was a number that stands for no value, such as -99
+    BAD_RADIUS = 1, "a Sersic profile without a positive radius: drawn as a point"
+    BAD_INDEX = 2, "index outside the range that profiles are made for: drawn as a point"
+    BAD_AXIS_RATIO = 4, "not in (0, 1]: drawn as a point"
+    BAD_ANGLE = 8, "not finite: drawn as a point unless it is round"
+    NO_REDSHIFT = 16, "not finite or not positive (stars)"
+    NO_FLUX = 32, "no band has a positive flux (with a positive error, where it has errors)"
+    MISSING_CODE = 64, "a flux or error was a number that stands for no value, such as -99"
 
     @classmethod
     def unusable_profile(cls):

@@ -47,11 +47,11 @@ class SceneFlags(Flags):
     ['cut_profile']
     """
 
-    OUTSIDE_IMAGE = 1  # its center is on no pixel
-    NEAR_EDGE = 2  # its center is on the image, but less than 95 % of its painted light
-    CUT_PROFILE = 4  # more than 1 % of its light lies beyond the isophote where it was cut
-    NO_FLUX = 8  # its flux is not finite or negative: not painted
-    DRAWN_AS_POINT = 16  # a Sersic profile whose parameters cannot be used
+    OUTSIDE_IMAGE = 1, "its center is on no pixel"
+    NEAR_EDGE = 2, "its center is on the image, but less than 95 % of its painted light"
+    CUT_PROFILE = 4, "more than 1 % of its light lies beyond the isophote where it was cut"
+    NO_FLUX = 8, "its flux is not finite or negative: not painted"
+    DRAWN_AS_POINT = 16, "a Sersic profile whose parameters cannot be used"
 
 
 class Scene(Interactive):

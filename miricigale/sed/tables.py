@@ -33,14 +33,15 @@ class ModelFlags(Flags):
     ['older_than_universe', 'not_covered']
     """
 
-    NOT_FINITE = 1  # A parameter is NaN or infinite.
-    OUT_OF_BOUNDS = 2  # A parameter is outside its declared bounds.
-    OLDER_THAN_UNIVERSE = 4  # The stars are older than the universe at this redshift.
-    NOT_IN_LIBRARY = 8  # The library of spectra has no entry for these parameters.
-    NOT_COVERED = 16
-    """A band reaches beyond the spectrum; it alone is NaN."""
-    NO_AGN_POWER = 32
-    """An AGN fraction was asked for, and there is no dust luminosity that it could refer to."""
+    NOT_FINITE = 1, "A parameter is NaN or infinite."
+    OUT_OF_BOUNDS = 2, "A parameter is outside its declared bounds."
+    OLDER_THAN_UNIVERSE = 4, "The stars are older than the universe at this redshift."
+    NOT_IN_LIBRARY = 8, "The library of spectra has no entry for these parameters."
+    NOT_COVERED = 16, "A band reaches beyond the spectrum; it alone is NaN."
+    NO_AGN_POWER = (
+        32,
+        "An AGN fraction was asked for, and there is no dust luminosity that it could refer to.",
+    )
 
 
 def dilution(redshift, far):

@@ -1,9 +1,7 @@
 """Checks and joins of tables, and integer flags that explain themselves."""
 
 import enum
-import inspect
 import os
-import re
 from collections.abc import Mapping
 
 import astropy.units as u
@@ -18,7 +16,17 @@ from miricigale.utils.units import ANGLE, flux_unit, to_array
 
 
 class Flags(enum.IntFlag):
-    """Base of the flag sets: an IntFlag whose members' docs `describe` lists."""
+    """
+    Base of the flag sets: an IntFlag whose members have a meaning.
+
+    A member is declared with its bit and a sentence, ``EDGE = 1, "The source is at an edge."``
+    """
+
+    def __new__(cls, value, meaning=""):
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.meaning = meaning
+        return member
 
     @classmethod
     def describe(cls):
@@ -34,25 +42,17 @@ class Flags(enum.IntFlag):
     @classmethod
     def meanings(cls):
         """
-        What each bit means, by what is written beside its member.
+        Return what each bit means.
 
         Returns
         -------
         meanings : dict of int to tuple of str
             By value: its name in words, and a sentence.
         """
-        source = inspect.getsource(cls)
         meanings = {}
         for member in cls:
-            before = re.search(rf"((?: *#: .*\n)+) *{member.name} = ", source)
-            after = re.search(rf'\b{member.name} = [^\n]*\n *"""(.*?)"""', source, flags=re.DOTALL)
-            same_line = re.search(rf"\b{member.name} = [^\n#]*# (.*)", source)
-            text = next((match[1] for match in (before, after, same_line) if match), "")
-            meaning = text.replace("#:", "").replace("``", "")
-            meanings[member.value] = (
-                member.name.lower().replace("_", " "),
-                " ".join(meaning.split()),
-            )
+            name = member.name.lower().replace("_", " ")
+            meanings[member.value] = (name, member.meaning.replace("``", ""))
         return meanings
 
 

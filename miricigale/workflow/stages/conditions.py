@@ -11,16 +11,11 @@ from miricigale.workflow.stages.sample import SampleFlags
 class ConditionFlags(Flags):
     """Conditions of a source, or a detection, in a band; those of Yang et al. 2021 and doubtful matches."""
 
-    #: More than a tenth of its light falls off the image or its footprint.
-    EDGE = 1
-    #: A neighbor within 2 arcsec is brighter than its magnitude plus one.
-    CROWDED = 2
-    #: More than one candidate is within the radius of the match, or it is not mutual.
-    AMBIGUOUS = 4
-    #: A detection that belongs to no source of the catalog.
-    SPURIOUS = 8
-    #: It has no flux: not detected on the high-resolution image, or no data.
-    NOT_MEASURED = 16
+    EDGE = 1, "More than a tenth of its light falls off the image or its footprint."
+    CROWDED = 2, "A neighbor within 2 arcsec is brighter than its magnitude plus one."
+    AMBIGUOUS = 4, "More than one candidate is within the radius of the match, or it is not mutual."
+    SPURIOUS = 8, "A detection that belongs to no source of the catalog."
+    NOT_MEASURED = 16, "It has no flux: not detected on the high-resolution image, or no data."
 
 
 #: Groups that are compared: the bits that are set, of those in question. Those of the first have none.

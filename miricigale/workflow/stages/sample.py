@@ -19,28 +19,17 @@ from miricigale.workflow.options import of_option, require
 class SampleFlags(Flags):
     """Why a source of the catalog is not in the fitted sample."""
 
-    #: Outside the pixels that all bands share.
-    OUTSIDE_FIELD = 1
-    #: A star.
-    STAR = 2
-    #: No model SED could be made, and so no flux: it is on no image.
-    NO_MODEL = 4
-    #: Not found on the high-resolution image, or another source is nearer.
-    NOT_MATCHED = 8
-    #: Detected in too few MIRI bands.
-    FEW_BANDS = 16
-    #: Its redshift is outside of the grid of the fit.
-    OUTSIDE_GRID = 32
-    #: A galaxy without a positive redshift, and so without a model.
-    NO_REDSHIFT = 64
-    #: Its redshift is below [fit] min_redshift.
-    MIN_REDSHIFT = 128
-    #: Its stellar mass is below [fit] min_mass.
-    MIN_MASS = 256
-    #: The reduced chi2 of its input fit is above [fit] max_chi2.
-    MAX_CHI2 = 512
-    #: Its redshift is not as [fit] redshift_quality says.
-    REDSHIFT_QUALITY = 1024
+    OUTSIDE_FIELD = 1, "Outside the pixels that all bands share."
+    STAR = 2, "A star."
+    NO_MODEL = 4, "No model SED could be made, and so no flux: it is on no image."
+    NOT_MATCHED = 8, "Not found on the high-resolution image, or another source is nearer."
+    FEW_BANDS = 16, "Detected in too few MIRI bands."
+    OUTSIDE_GRID = 32, "Its redshift is outside of the grid of the fit."
+    NO_REDSHIFT = 64, "A galaxy without a positive redshift, and so without a model."
+    MIN_REDSHIFT = 128, "Its redshift is below [fit] min_redshift."
+    MIN_MASS = 256, "Its stellar mass is below [fit] min_mass."
+    MAX_CHI2 = 512, "The reduced chi2 of its input fit is above [fit] max_chi2."
+    REDSHIFT_QUALITY = 1024, "Its redshift is not as [fit] redshift_quality says."
 
 
 #: Keys of the cuts of [fit]: the last flags.
