@@ -90,7 +90,14 @@ def parse_values(value, name):
 
 
 def _arange(*args):
-    start, stop, step = {1: (0.0, *args, 1.0), 2: (*args, 1.0)}.get(len(args), args)
+    start = 0.0
+    step = 1.0
+    if len(args) == 1:
+        (stop,) = args
+    elif len(args) == 2:
+        start, stop = args
+    else:
+        start, stop, step = args
     # one too many would come from rounding, where (stop - start) / step is whole
     number = math.ceil((stop - start) / step - 1e-9)
     return start + step * np.arange(_count(max(number, 0)))

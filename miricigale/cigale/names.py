@@ -26,11 +26,15 @@ def cigale_names(modules=None):
         names[ours] = (theirs, u.Unit(unit), our_unit.to(unit))
     for module in (modules or {}).values():
         for ours, theirs in DECLARED["modules"].get(module, {}).items():
-            names[ours] = (theirs, *names[ours][1:])
+            _, unit, factor = names[ours]
+            names[ours] = (theirs, unit, factor)
     return names
 
 
 def unit_of(name):
     """Unit of a quantity of CIGALE's name; None if it is not known."""
-    tables = (cigale_names({"": module}).values() for module in ("", *DECLARED["modules"]))
-    return next((unit for names in tables for theirs, unit, _ in names if theirs == name), None)
+    for module in ["", *DECLARED["modules"]]:
+        for theirs, unit, _ in cigale_names({"": module}).values():
+            if theirs == name:
+                return unit
+    return None

@@ -129,7 +129,8 @@ def _columns(results, names, variables):
         mean = best
         std = zero
         if ours in results.parameters:
-            mean, std = (x.value * factor for x in (results.mean(ours), results.std(ours)))
+            mean = results.mean(ours).value * factor
+            std = results.std(ours).value * factor
         columns[theirs] = (mean, std, best, unit)
     if variables is None:
         wanted = columns
@@ -137,7 +138,8 @@ def _columns(results, names, variables):
         wanted = variables
     check_names(wanted, "quantity of the results", columns)
     for name in columns.keys() - set(wanted):
-        columns[name] = (None, None, *columns[name][2:])
+        _, _, best, unit = columns[name]
+        columns[name] = (None, None, best, unit)
     return dict(sorted(columns.items()))
 
 

@@ -98,13 +98,15 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     if unknown:
         # the last one says what to do
         unknown[-1] += f" (no filter here: {GIVE_FILTER})"
-    chain.left_out[:] = [
-        *(f"module {x}" if "." not in x and " " not in x else x for x in chain.left_out),
-        *(f"band {name} (no module xray)" for name in sorted(dark)),
-        *unknown,
-        *(f"variable {x}" for x in variables if x not in computed),
-        *(f"property {x}" for x in config["properties"] if not x.endswith("_err")),
-    ]
+    left_out = []
+    for entry in chain.left_out:
+        is_module = "." not in entry and " " not in entry
+        left_out.append(f"module {entry}" if is_module else entry)
+    left_out += [f"band {name} (no module xray)" for name in sorted(dark)]
+    left_out += unknown
+    left_out += [f"variable {name}" for name in variables if name not in computed]
+    left_out += [f"property {x}" for x in config["properties"] if not x.endswith("_err")]
+    chain.left_out[:] = left_out
     extended = [x for x in {**bands, **predicted}.values() if x.endswith("_ext") and x not in names]
     if extended:
         chain.differs.append(f"bands {', '.join(extended)}: curves of point sources")

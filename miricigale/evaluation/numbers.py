@@ -65,7 +65,11 @@ def study_numbers(study, *, seed, n_draws=500):
                 of_power = quantity.startswith("power")
                 if of_power and "accretion_power" not in sky.truth.colnames:
                     continue
-                for option in (None,) if of_power else (None, *REDSHIFT_BINS):
+                # bins of redshift after the whole sample; powers are of few sources
+                options = [None]
+                if not of_power:
+                    options += REDSHIFT_BINS
+                for option in options:
                     key = stream(seed, "numbers", sky.name, band_set, quantity, str(option))
                     row = {"truth": sky, "band_set": band_set, "option": option}
                     got = measure(study, quantity, **row, seed=key, n_draws=n_draws)
@@ -125,12 +129,16 @@ def study_confusion(study, band_set="all"):
     composite   0      0         0   0
           agn   0      0         0   0
     """
-    truths = [sky for sky in study.truths if sky.frac_agn is not None and band_set in sky.fits]
-    true = [classify(floats(sky.truth["frac_agn"]))[sky.field] for sky in truths]
-    # "unknown" of those not in the sample
-    means = [sky.of_catalog(sky.fitted(band_set, "frac_agn_mean"))[sky.field] for sky in truths]
-    classes = [classify(np.clip(mean, 0, 1)) for mean in means]
-    return confusion(np.concatenate([[], *true]), np.concatenate([[], *classes]))
+    true = [np.empty(0, str)]
+    inferred = [np.empty(0, str)]
+    for sky in study.truths:
+        if sky.frac_agn is None or band_set not in sky.fits:
+            continue
+        true.append(classify(floats(sky.truth["frac_agn"]))[sky.field])
+        # "unknown" of those not in the sample
+        mean = sky.of_catalog(sky.fitted(band_set, "frac_agn_mean"))[sky.field]
+        inferred.append(classify(np.clip(mean, 0, 1)))
+    return confusion(np.concatenate(true), np.concatenate(inferred))
 
 
 def selection_table(sky, *, limits=CLASS_LIMITS):

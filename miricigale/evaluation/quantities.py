@@ -312,11 +312,9 @@ SHARES = tuple(name for name in QUANTITIES if name.endswith("_share")) + ("z_out
 _OF_ALL = ("power_offset", "power_scatter", "xray_half", "xray_luminosity")
 _TRENDS = ("z_scatter_trend", "power_scatter_trend")
 #: Those of a fit, and those of a band.
-OF_FITS = (
-    *("z_outliers", "z_bias", "z_scatter", "z_outlier_ratio", "z_scatter_ratio"),
-    *("frac_offset", "frac_offset_ratio", "frac_scatter", "frac_scatter_ratio"),
-    *("width", "width_ratio", "power_offset", "power_scatter", "class_share"),
-)
+OF_FITS = ("z_outliers", "z_bias", "z_scatter", "z_outlier_ratio", "z_scatter_ratio")
+OF_FITS += ("frac_offset", "frac_offset_ratio", "frac_scatter", "frac_scatter_ratio")
+OF_FITS += ("width", "width_ratio", "power_offset", "power_scatter", "class_share")
 _OF_BANDS = ("etc_limit", "bright_error", "signal_to_noise")
 
 

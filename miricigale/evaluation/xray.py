@@ -59,12 +59,8 @@ class XRayLimit:
 #: Luo et al. 2017 (1.9e-17 in the central square arcmin) and of Nandra et al. 2015 have none: that of the
 #: paper calls MIRI (50 % at about 1e-16) "slightly more sensitive" than the deepest survey, and Nandra et
 #: al. call theirs a factor 2-3 shallower than the deep fields.
-XRAY_LIMITS = tuple(
-    XRayLimit(survey, flux * _CGS, *source)
-    for survey, flux, *source in declared("miricigale.evaluation", "population.toml")["xray"][
-        "rows"
-    ]
-)
+_XRAY_ROWS = declared("miricigale.evaluation", "population.toml")["xray"]["rows"]
+XRAY_LIMITS = tuple(XRayLimit(survey, flux * _CGS, *source) for survey, flux, *source in _XRAY_ROWS)
 
 
 def yang2021_xray_flux(l_6um, redshift):

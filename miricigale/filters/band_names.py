@@ -142,13 +142,11 @@ def filter_of_band(band):
     bare_name = _BETWEEN.sub(".", _ENDING.sub("", band.strip()))
     for rule, ours in patterns:
         match = rule.fullmatch(bare_name)
-        if match:
-            part = "".join(match.groups())
-            written = (part.lower(), part.upper(), part.capitalize())
-        else:
-            part = ""
-            written = ()
-        for name in map(ours.format, written):
+        if match is None:
+            continue
+        part = "".join(match.groups())
+        for written in (part.lower(), part.upper(), part.capitalize()):
+            name = ours.format(written)
             if _is_here(name):
                 return name
     return None
@@ -159,10 +157,9 @@ def _by_rule(band):
     for rule, ours, *_ in _tables()[1]:
         match = rule.fullmatch(band)
         if match is None:
-            name = None
-        else:
-            name = ours.format(match[1], match[1].lower())
-        if name is not None and _is_here(name):
+            continue
+        name = ours.format(match[1], match[1].lower())
+        if _is_here(name):
             return name
     return None
 

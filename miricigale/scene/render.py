@@ -126,8 +126,10 @@ class Painter:
         shape = self._phases.shape
         sums = np.zeros((*shape[:3], shape[3] + 1, shape[4] + 1))
         sums[..., 1:, 1:] = self._phases.cumsum(axis=3).cumsum(axis=4)
-        axes = zip(self.shape, self._axes(), strict=True)
-        y, x = ((*self._ranges(n), *axis.weights()) for n, axis in axes)
+        n_y, n_x = self.shape
+        axis_y, axis_x = self._axes()
+        y = self._ranges(n_y) + axis_y.weights()
+        x = self._ranges(n_x) + axis_x.weights()
         return _core.Landing(sums, self._oversampling, self._order, *y, *x)
 
     def _ranges(self, n):
