@@ -115,9 +115,15 @@ def label_outer(axes, xlabel=None, ylabel=None):
     axes = list(axes.values())
     columns = panel_columns(len(axes))
     for k, ax in enumerate(axes):
-        last = k + columns >= len(axes)
-        ax.set_xlabel((ax.get_xlabel() if xlabel is None else xlabel) if last else "")
-        ax.set_ylabel("" if k % columns else ax.get_ylabel() if ylabel is None else ylabel)
+        # labels stand below the last row and left of the first column
+        if k + columns < len(axes):
+            ax.set_xlabel("")
+        elif xlabel is not None:
+            ax.set_xlabel(xlabel)
+        if k % columns:
+            ax.set_ylabel("")
+        elif ylabel is not None:
+            ax.set_ylabel(ylabel)
         ax.tick_params(labelbottom=True)
         if k and ax.get_legend():
             ax.get_legend().remove()

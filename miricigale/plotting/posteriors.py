@@ -320,8 +320,11 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
     if n % 2:
         ax.plot(x, rows[n // 2], color=color, linewidth=1, label=label)
     top = max(float(np.max(row)) for row in rows)
-    ax.set(xscale="log", xlabel=f"{'rest' if rest else 'observed'} wavelength (µm)")
-    ax.set(yscale="log", ylabel=r"$\nu L_\nu$ (W)" if rest else "flux density (µJy)")
+    if rest:
+        labels = {"xlabel": "rest wavelength (µm)", "ylabel": r"$\nu L_\nu$ (W)"}
+    else:
+        labels = {"xlabel": "observed wavelength (µm)", "ylabel": "flux density (µJy)"}
+    ax.set(xscale="log", yscale="log", **labels)
     if top > 0:
         ax.set_ylim(1e-5 * top, 3.0 * top)
     return ax
@@ -360,7 +363,9 @@ def plot_recovery(true, mean, std, *, ax=None, name=None, unit="", log=False, **
         ax.plot(ends, ends, color="0.4", linewidth=1)
     if log:
         ax.set(xscale="log", yscale="log")
-    text = f"{name or ''}{f' ({unit})' if unit else ''}"
+    text = name or ""
+    if unit:
+        text += f" ({unit})"
     ax.set(xlabel=f"true {text}", ylabel=f"recovered {text}")
     return ax
 
