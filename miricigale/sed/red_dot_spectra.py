@@ -29,9 +29,11 @@ _OIII = (0.50082, 0.49603)
 _DECREMENT = 9.0
 #: Equivalent width of both [O III] lines over the galaxy alone (Endsley et al. 2023: 780 A of [O III] and H beta
 #: at z = 6.5-8), of which 0.75 are the line at 5008 A.
-_OIII_WIDTH, _OIII_SHARES = 0.08, (0.75, 0.25)  # um
+_OIII_WIDTH = 0.08  # um
+_OIII_SHARES = (0.75, 0.25)
 #: Full widths of the lines at half maximum: those of the envelope, and of the galaxy.
-_BROAD, _NARROW = 2000.0, 500.0  # km / s
+_BROAD = 2000.0  # km / s
+_NARROW = 500.0  # km / s
 _KM_S = 299792.458  # speed of light
 #: Of hot dust.
 _HOT = 1200.0  # K

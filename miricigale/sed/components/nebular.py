@@ -251,7 +251,8 @@ class Nebular(Component):
         emission = self._emission(age, weights, ionizing, values)
         n = self.table.wave.size
         continuum, lines = np.zeros((2, emission.size))
-        continuum[:n], lines[n:] = emission[:n], emission[n:]
+        continuum[:n] = emission[:n]
+        lines[n:] = emission[n:]
         return self._drawn[1] @ continuum, self._drawn[1] @ lines
 
     def lines(self, age, weights, ionizing, values):
