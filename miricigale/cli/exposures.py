@@ -1,28 +1,37 @@
 """The command that reduces exposures."""
 
-from miricigale.cli.options import chosen
+from miricigale.cli.options import chosen, filled
 
 _FILES = "mask saturation bias reset linearity dark gain read_noise flat photom"
 
 
 def reduce(args):
     """Reduce exposures."""
-    from miricigale.reduction import BackgroundSettings, Reducer
+    from miricigale.reduction import (
+        BackgroundSettings,
+        MosaicSettings,
+        RampSettings,
+        Reducer,
+    )
     from miricigale.reduction.from_files import reduce_files
     from miricigale.utils.options import check_data
 
     for path in args.files:
         check_data(path.is_file(), "no file", path)
-    settings = chosen(args, "backend skip_first skip_last")
-    background = BackgroundSettings(args.background, **chosen(args, "stripes sky_flat"))
-    settings |= {"background": background}
-    settings |= {"n_threads": args.threads, "jump_threshold": args.jump_threshold or None}
+    # options go where they are parameters; the others are put in place here
+    settings = filled(args, Reducer)
+    settings["background"] = BackgroundSettings(args.background, **filled(args, BackgroundSettings))
+    settings["ramps"] = RampSettings(**filled(args, RampSettings))
+    settings["mosaics"] = MosaicSettings(**filled(args, MosaicSettings))
+    settings["references"] = _references(args)
+    settings["n_threads"] = args.threads
+    settings["jump_threshold"] = args.jump_threshold or None
     table = reduce_files(
         args.files,
         args.output,
-        reducer=Reducer(references=_references(args), **settings),
+        reducer=Reducer(**settings),
         integrations=args.rateints,
-        **chosen(args, "pixel_scale align resume overwrite"),
+        **filled(args, reduce_files),
         progress_bar=not args.no_progress,
     )
     failed = table[table["status"] == "failed"]

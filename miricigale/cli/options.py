@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import difflib
+import inspect
 import re
 import sys
 import tomllib
@@ -68,6 +69,12 @@ TYPES = {
 def chosen(args, names):
     """Options by the names of the arguments that they become."""
     return {name: getattr(args, name) for name in names.split()}
+
+
+def filled(args, function):
+    """Return the options that are named like parameters of a function, or like fields of settings."""
+    names = inspect.signature(function).parameters
+    return {name: value for name, value in vars(args).items() if name in names}
 
 
 def declarations():
