@@ -7,29 +7,15 @@ _FILES = "mask saturation bias reset linearity dark gain read_noise flat photom"
 
 def reduce(args):
     """Reduce exposures."""
-    from miricigale.reduction import (
-        BackgroundSettings,
-        MosaicSettings,
-        RampSettings,
-        Reducer,
-    )
     from miricigale.reduction.from_files import reduce_files
     from miricigale.utils.options import check_data
 
     for path in args.files:
         check_data(path.is_file(), "no file", path)
-    # options go where they are parameters; the others are put in place here
-    settings = filled(args, Reducer)
-    settings["background"] = BackgroundSettings(args.background, **filled(args, BackgroundSettings))
-    settings["ramps"] = RampSettings(**filled(args, RampSettings))
-    settings["mosaics"] = MosaicSettings(**filled(args, MosaicSettings))
-    settings["references"] = _references(args)
-    settings["n_threads"] = args.threads
-    settings["jump_threshold"] = args.jump_threshold or None
     table = reduce_files(
         args.files,
         args.output,
-        reducer=Reducer(**settings),
+        reducer=reducer_of(args),
         integrations=args.rateints,
         **filled(args, reduce_files),
         progress_bar=not args.no_progress,
@@ -41,6 +27,26 @@ def reduce(args):
         f"{len(table) - len(failed)} of {len(table)} products; page: {args.output / 'index.html'}"
     )
     return 1 if len(failed) else 0
+
+
+def reducer_of(args):
+    """Return the `~miricigale.reduction.Reducer` of the options."""
+    from miricigale.reduction import (
+        BackgroundSettings,
+        MosaicSettings,
+        RampSettings,
+        Reducer,
+    )
+
+    # options go where they are parameters; the others are put in place here
+    settings = filled(args, Reducer)
+    settings["background"] = BackgroundSettings(args.background, **filled(args, BackgroundSettings))
+    settings["ramps"] = RampSettings(**filled(args, RampSettings))
+    settings["mosaics"] = MosaicSettings(**filled(args, MosaicSettings))
+    settings["references"] = _references(args)
+    settings["n_threads"] = args.threads
+    settings["jump_threshold"] = args.jump_threshold or None
+    return Reducer(**settings)
 
 
 def _references(args):

@@ -169,10 +169,7 @@ def aperture_noise(
     radius, edges = _radii(aperture, annulus, setup)
     amplitude = pattern_amplitude(residual, filter)
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
-    if n_groups is None:
-        groups = setup.n_groups
-    else:
-        groups = n_groups
+    groups = setup.n_groups if n_groups is None else n_groups
     step = frame_time(readout, subarray).to_value(TIME)
     check_positive(n_sigma, "n_sigma")
     check_least(n_dithers, "n_dithers", 1)
@@ -189,22 +186,18 @@ def aperture_noise(
         subarray=subarray,
     )
     _check_well(noise)
-    variance = noise.variance()
-    growth = noise.growth
-    sky = noise.sky
-    electrons = noise.electrons
+    variance, growth, sky, electrons = noise.variance(), noise.growth, noise.sky, noise.electrons
 
-    if psf is None:
-        psf = miri_psf(filter)
+    psf = miri_psf(filter) if psf is None else psf
     light, white, shot, pattern = _extraction(radius, edges, psf, correlation, filter)
     check_that(light > 0, "annulus", "such that light of the source is left", annulus)
     shot_noise = n_sigma**2 * growth * shot / (light**2 * electrons)
     white_noise = n_sigma**2 * variance * white / (light * electrons) ** 2
     residual_noise = (n_sigma * amplitude * sky / (light * electrons)) ** 2 * pattern / n_dithers
 
-    def limit(parameters):
+    def limit(known):
         # F^2 = n^2 (V + growth shot F), solved for F
-        return float((shot_noise + np.sqrt(shot_noise**2 + 4 * parameters)) / 2)
+        return float((shot_noise + np.sqrt(shot_noise**2 + 4 * known)) / 2)
 
     return {
         "flux": limit(white_noise + residual_noise),

@@ -173,13 +173,8 @@ class Ramp(Interactive, NDData):
     @property
     def group_time(self):
         """Time between groups in s: that of the header, or of the exposure."""
-        if self._header is None:
-            header_time = None
-        else:
-            header_time = self._header.get("TGROUP")
-        if header_time is None:
-            return self.exposure.group_time.to_value("s")
-        return float(header_time)
+        stated = None if self._header is None else self._header.get("TGROUP")
+        return self.exposure.group_time.to_value("s") if stated is None else float(stated)
 
     def integration(self, number):
         """

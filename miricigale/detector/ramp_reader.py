@@ -146,8 +146,7 @@ def _check_header(path, header, exposure):
         n_int = header["INTEND"] - header["INTSTART"] + 1
     elif "NINTS" in header:
         n_int = header["NINTS"]
-    part_name = f"of {part.name}"
-    pattern = f"of {exposure.readout}"
+    part_name, pattern = f"of {part.name}", f"of {exposure.readout}"
     wanted = {
         "NGROUPS": (header.get("NGROUPS"), exposure.n_groups, "in SCI"),
         "NINTS": (n_int, exposure.n_integrations, "in SCI"),
@@ -158,18 +157,16 @@ def _check_header(path, header, exposure):
         "SUBSTRT1": (header.get("SUBSTRT1"), part.origin[0] + 1, part_name),
         "SUBSTRT2": (header.get("SUBSTRT2"), part.origin[1] + 1, part_name),
     }
-    for name, (value, true, place) in wanted.items():
-        problem = f"{name} is {value} in the header and {true} {place}"
-        check_data(
-            not (value is not None and value != true), path, f"contradicts itself: {problem}"
-        )
+    for name, (stated, true, where) in wanted.items():
+        what = f"{name} is {stated} in the header and {true} {where}"
+        check_data(not (stated is not None and stated != true), path, f"contradicts itself: {what}")
     for name in ("TGROUP", "TFRAME"):
-        value = header.get(name)
+        stated = header.get(name)
         # the table of the read-out patterns is rounded to a millisecond or three digits
-        if value is not None and not abs(value - frame) < 5e-3 * frame:
+        if stated is not None and not abs(stated - frame) < 5e-3 * frame:
             truth = f"the frame of {exposure.readout} {exposure.subarray} takes {frame} s"
-            problem = f"{name} = {value} s, but {truth}, and is one group"
-            raise data_error(path, f"contradicts itself: {problem}")
+            what = f"{name} = {stated} s, but {truth}, and is one group"
+            raise data_error(path, f"contradicts itself: {what}")
 
 
 def _counts(hdu):

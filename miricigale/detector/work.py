@@ -106,23 +106,23 @@ class Work:
         shape = (*self.shape[:2], wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape[2:], np.uint32)
         group_dq = np.zeros(shape, np.uint8)
-        context = (self.exposure, self.properties, wide, pixel_dq, group_dq)
-        _, array, later_effects = self._lit(Block, context, self.keyed)
-        for effect, key in later_effects:
-            array = effect.apply(array, Block(*context, key, self.previous))
+        where = (self.exposure, self.properties, wide, pixel_dq, group_dq)
+        _, array, rest = self._lit(Block, where, self.keyed)
+        for effect, key in rest:
+            array = effect.apply(array, Block(*where, key, self.previous))
         return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
 
-    def _lit(self, kind, context, chain):
+    def _lit(self, kind, where, chain):
         """
         Draw the electrons of light and dark current together: a sum of Poisson numbers is one.
 
         Returns the mean rate, the ramp, and the effects of the chain that are left.
         """
-        light = self.light[context[2]]
+        light = self.light[where[2]]
         n = next(i for i, (effect, _) in enumerate(chain) if isinstance(effect, Photons))
         for effect, key in chain[:n]:
-            light = effect.apply(light, kind(*context, key))
-        block = kind(*context, chain[n][1])
+            light = effect.apply(light, kind(*where, key))
+        block = kind(*where, chain[n][1])
         mean = chain[n][0].expected(light, block)
         if type(chain[n][0]).apply is not Photons.apply:
             # a kind of its own, that may draw otherwise
@@ -130,7 +130,7 @@ class Work:
         for effect, key in chain[n + 1 :]:
             if type(effect).apply is not Dark.apply:
                 break
-            mean = effect.expected(mean, kind(*context, key))
+            mean = effect.expected(mean, kind(*where, key))
             n += 1
         ramp = np.zeros(block.ramp_shape, np.float32)
         electrons = np.ascontiguousarray(mean * block.group_time, float)

@@ -73,9 +73,9 @@ def _counts_of(filter, time, frame, n_integrations, max_fill=0.6, max_groups=100
         longest = min(
             max(2, math.floor(max_fill * fills)), check_count(max_groups, "max_groups", 2)
         )
-        fewest = math.ceil(frames / longest)
+        least = math.ceil(frames / longest)
         # one more, or up to a tenth, if they come nearer
-        choices = range(fewest, fewest + max(2, fewest // 10 + 1))
+        choices = range(least, least + max(2, least // 10 + 1))
     counts = [(max(2, round(frames / n)), n) for n in choices]
     return min(counts, key=lambda pair: abs(math.prod(pair) - frames))
 

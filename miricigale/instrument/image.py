@@ -63,17 +63,14 @@ class Image(Interactive, CCDData):
 
     def _facts(self):
         ny, nx = self.shape
-        if self.mask is None:
-            facts = {}
-        else:
-            facts = {"masked": f"{100 * np.mean(self.mask):.3g} %"}
+        known = {} if self.mask is None else {"masked": f"{100 * np.mean(self.mask):.3g} %"}
         if self.wcs is not None and self.wcs.has_celestial:
-            facts["center"] = self.wcs.pixel_to_world(nx / 2 - 0.5, ny / 2 - 0.5).to_string(
+            known["center"] = self.wcs.pixel_to_world(nx / 2 - 0.5, ny / 2 - 0.5).to_string(
                 "hmsdms"
             )
         shown = ("filter", "subarray", "n_exposures", "exposure_time", "background", "steps")
-        facts |= {name.replace("_", " "): self.meta[name] for name in shown if name in self.meta}
-        return {"pixels": f"{ny} x {nx}", "unit": self.unit, **facts}
+        known |= {name.replace("_", " "): self.meta[name] for name in shown if name in self.meta}
+        return {"pixels": f"{ny} x {nx}", "unit": self.unit, **known}
 
     def plot(self, ax=None, **kwargs):
         """

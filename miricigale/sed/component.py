@@ -216,17 +216,15 @@ class Component:
 def in_order(components):
     """Components of a model in the order of their roles: what is lacking or there twice is refused."""
     components = tuple(components)
-    for component in components:
-        check_that(
-            isinstance(component, Component), "components", "Component instances", repr(component)
-        )
-    components = tuple(sorted(components, key=lambda component: ROLES.index(component.role)))
-    roles = [component.role for component in components]
+    for one in components:
+        check_that(isinstance(one, Component), "components", "Component instances", repr(one))
+    components = tuple(sorted(components, key=lambda one: ROLES.index(one.role)))
+    roles = [one.role for one in components]
     for role, name in (("sfh", "age"), ("stellar", "metallicity")):
         check_that(role in roles, "components", f"with a component of role {role!r}", roles)
-        component = components[roles.index(role)]
+        one = components[roles.index(role)]
         wanted = f"with a parameter {name!r} in the {role!r} component"
-        check_that(name in component.parameters, "components", wanted, component)
+        check_that(name in one.parameters, "components", wanted, one)
     check_that(len(set(roles)) == len(roles), "components", "at most one of each role", roles)
     for role, other in (("dust", "attenuation"), ("xray", "agn")):
         good = role not in roles or other in roles
