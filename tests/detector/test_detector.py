@@ -213,7 +213,7 @@ def test_refuses_wrong_effects():
     refuses("'properties' must be", Detector, PLAIN, properties={"gain": 4})
     refuses("'effects' must be a tuple with one Photons", Detector.miri_imager().without, Photons)
     refuses("'kinds' must be classes of effects", Detector.miri_imager().without, Dark())
-    refuses("'effects' must be of the package's kinds", Detector.miri_imager().replaced, Dark)
+    refuses("'effects' must be of the package's kinds", Detector.miri_imager().replace, Dark)
 
 
 def test_effects_of_other_kinds_act_where_they_are_put(make_exposure, make_sky):
