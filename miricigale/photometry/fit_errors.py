@@ -10,7 +10,8 @@ from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
 #: Size of the covariance's blocks and of the margin around them, arcsec.
-_CORE, _HALO = 18.0, 6.0
+BLOCK_CORE = 18.0
+BLOCK_HALO = 6.0
 
 
 def fit_covariances(fit, correlation):
@@ -40,7 +41,7 @@ def fit_covariances(fit, correlation):
     coo = plain.matrix.tocoo()
     pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=solution.matrix.shape)
     found, blending = solution.covariances(
-        xy, fillings, core=_CORE / fit.scale, halo=_HALO / fit.scale, pattern=pattern
+        xy, fillings, core=BLOCK_CORE / fit.scale, halo=BLOCK_HALO / fit.scale, pattern=pattern
     )
     noise, common = found[0]
     noise, blending = noise[:n][:, :n], blending[:n]
@@ -58,21 +59,21 @@ def fit_covariances(fit, correlation):
         variance = noise.diagonal()
         blending[first] = np.sqrt(variance[first] + variance[second] + 2 * both) / alone[first]
         blending[second] = blending[first]
-    coo, error = noise.tocoo(), _psf_errors(fit)[fit.rows]
+    parts = fit.bank.parts(np.arange(len(fit.flux)))
+    image = np.array([one is not None and one.kind == "cutout" for one in parts], bool)
+    coo, error = noise.tocoo(), psf_errors(fit, image)[fit.rows]
     data = error[coo.row] * error[coo.col]
     psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
     return noise, template, psf, common, blending
 
 
-def _psf_errors(fit):
-    """Errors of the fluxes of all rows by that of the PSF."""
+def psf_errors(fit, image):
+    """Errors of the fluxes of all rows by that of the PSF; ``image``, (n,), says whose template is one."""
     settings, kernel = fit.settings.errors, fit.settings.mean_kernel
     fraction = settings.psf_error
     if fraction is None:
         if settings.size_scatter is None:
             return np.zeros(len(fit.flux))
-        parts = fit.bank.parts(np.arange(len(fit.flux)))
-        image = np.array([one is not None and one.kind == "cutout" for one in parts], float)
         fraction = image * np.max(np.abs(kernel.encircled_energy_error()))
     point = np.sum(kernel.target**2) * (fit.scale / kernel.pixel_scale.to_value(ANGLE)) ** 2
     return fraction * np.minimum(fit.power / point, 1.0) * np.abs(fit.flux)

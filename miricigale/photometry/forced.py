@@ -12,6 +12,7 @@ from photutils.segmentation import SegmentationImage
 from miricigale.instrument import epoch_of
 from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.arrays import fit_arrays, image_arrays, pixel_scale
+from miricigale.photometry.exposure_kernels import ExposureKernels
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.mosaics import as_mosaic
 from miricigale.photometry.packaging import CatalogRows, package
@@ -173,11 +174,13 @@ class ForcedPhotometer(Interactive):
             template = "psf" if template == "auto" else template
         elif kernel is None:
             kernel = MatchingKernel.from_psfs(highres_psf, psf)
-        if not isinstance(kernel, (MatchingKernel, KernelField)):
-            wanted = "a MatchingKernel or a KernelField (or give 'psf')"
+        if isinstance(kernel, (list, tuple)):
+            kernel = ExposureKernels(kernel)
+        if not isinstance(kernel, (MatchingKernel, KernelField, ExposureKernels)):
+            wanted = "a MatchingKernel, a KernelField or a list of them (or give 'psf')"
             raise argument_error("kernel", wanted, type(kernel).__name__)
         # the kernel that all have in common: the mean, with PSFs in any case
-        mean = kernel.mean if isinstance(kernel, KernelField) else kernel
+        mean = kernel if isinstance(kernel, MatchingKernel) else kernel.mean
         bare = mean.source is None or mean.target is None
         changed = {"kernel": kernel, "template": template, "bare": bare, "mean_kernel": mean}
         changed["n_threads"] = thread_count(self.n_threads)
@@ -255,6 +258,14 @@ class ForcedPhotometer(Interactive):
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
+        if isinstance(image, (list, tuple)):
+            from miricigale.photometry.exposure_photometry import measure_exposures
+
+            prior = (highres, segmentation, catalog)
+            return measure_exposures(self, image, *prior, templates=templates)
+        if isinstance(self.kernel, ExposureKernels):
+            wanted = f"{len(self.kernel)} exposures, one for each kernel"
+            raise argument_error("image", wanted, "one image")
         if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
             highres, catalog = None, highres
         image = own_pixels(as_mosaic(image, "image"))

@@ -12,7 +12,7 @@ from miricigale.utils.parallel import parallel_map
 
 #: Changes whose root of the sum of squares over the noise is below this are left out: they can move
 #: no flux by more of its errors.
-_LEAST = 0.3
+LEAST = 0.3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class FreeTemplates:
         inverse_sigma = fit.inverse_sigma
         own, more = sandwich_matrix(self.bank, inverse_sigma, correlation, images)
         cross = cross_matrix(fit.bank, self.bank, inverse_sigma, correlation).tocsr()[fit.rows]
-        return _joined(middle, cross, own, self.basis), _below(border, more, self.basis)
+        return joined_matrix(middle, cross, own, self.basis), _below(border, more, self.basis)
 
 
 def free_templates(fit, fitted):
@@ -128,11 +128,11 @@ def free_templates(fit, fitted):
     changes = TemplateChanges(kernel.source, kernel.target, size_scatter)
     snr = np.abs(plain.flux) * np.sqrt(plain.matrix.diagonal())
     known = np.isfinite(fitted["parameters"][:, 0])
-    wanted = np.flatnonzero(known & (snr > _LEAST) & (plain.flux > 0))
+    wanted = np.flatnonzero(known & (snr > LEAST) & (plain.flux > 0))
     parts = bank.parts(rows)
 
     def find(k):
-        return changes.of(parts[k], fitted[k], _LEAST / snr[k])
+        return changes.of(parts[k], fitted[k], LEAST / snr[k])
 
     found = parallel_map(find, wanted, executor=bank.executor)
     owner = np.array([k for k, (some, _) in zip(wanted, found, strict=True) for _ in some], int)
@@ -144,13 +144,13 @@ def free_templates(fit, fitted):
     other = bank.at_resolution(bank.order[rows[owner]], [one.cutout for one in every])
     owner = owner[other.order]
     fixed = np.array([one.fixed for one in every], bool)[other.order]
-    basis = _basis(len(rows), owner, np.array([one.light for one in every])[other.order], fixed)
+    basis = change_basis(len(rows), owner, np.array([one.light for one in every])[other.order], fixed)
     images = [fit.arrays.whitened(one) for one in (fit.arrays.flux, *fit.columns)]
     own, projection, _, _ = normal_matrix(other, fit.inverse_sigma, images)
     cross = cross_matrix(bank, other, fit.inverse_sigma).tocsr()[rows]
     owner = owner[~fixed]
     prior = np.concatenate([np.zeros(len(rows)), plain.flux[owner] ** -2.0])
-    matrix = _joined(plain.matrix, cross, own, basis) + scipy.sparse.diags_array(prior)
+    matrix = joined_matrix(plain.matrix, cross, own, basis) + scipy.sparse.diags_array(prior)
     free = LinearFit(
         matrix.tocsr(),
         _below(plain.rhs, projection[:, 0], basis),
@@ -161,7 +161,7 @@ def free_templates(fit, fitted):
     return FreeTemplates(free, other, len(rows), basis, owner, prior, noise)
 
 
-def _basis(n, owner, light, fixed):
+def change_basis(n, owner, light, fixed):
     """Templates with their fixed changes, and the other changes less their light in the template."""
     k = np.arange(len(owner))
     column = np.where(fixed, owner, n + np.cumsum(~fixed) - 1)
@@ -173,7 +173,7 @@ def _basis(n, owner, light, fixed):
     return scipy.sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
 
 
-def _joined(main, cross, own, basis):
+def joined_matrix(main, cross, own, basis):
     """Matrix of the columns of a basis."""
     whole = scipy.sparse.block_array([[main, cross], [cross.T, own]]).tocsr()
     return (basis.T @ whole @ basis).tocsr()

@@ -91,7 +91,7 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     if fit.settings.second_pass or len(new_xy):
         names = ("flux", "flux_err", "flags", "coverage", "chi2")
         rows = {name: columns[name][n:] for name in names}
-        new = _new_sources(catalog, new_xy, fit.arrays.wcs, rows)
+        new = new_source_table(catalog, new_xy, fit.arrays.wcs, rows)
     reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
     return ForcedPhotometryResult(
         id=np.array(catalog.id),
@@ -206,7 +206,8 @@ def new_ids(ids, n):
     return np.array(new) if n else ids[:0]
 
 
-def _new_sources(catalog, xy, wcs, columns):
+def new_source_table(catalog, xy, wcs, columns):
+    """Table of sources at pixels (x, y), (m, 2), that a catalog (`CatalogRows`) lacks, with their columns."""
     table = QTable({"id": new_ids(np.asarray(catalog.id), len(xy))})
     table["sky"] = wcs.pixel_to_world(*xy.T).transform_to(catalog.sky.frame)
     table["x_centroid"], table["y_centroid"] = xy.T

@@ -144,6 +144,10 @@ class ForcedPhotometryResult(Tabular):
         ``chi2``. None without a second pass.
     psf_stars : `~miricigale.photometry.stars.KernelStars` or None
         The stars that corrected the PSFs, and the corrected kernel; None where it was not asked for.
+    exposures : `~miricigale.photometry.exposure_result.ExposureResults` or None
+        Of a fit of exposures their sky levels, shifts and noise, and the model and the residual of each;
+        ``model_image`` and ``residual_image`` are then weighted means of nearest pixels, for pictures, on which
+        ``x`` and ``y`` are. None for one image.
     psf_fwhm : `~astropy.units.Quantity` or None
         Full width at half maximum of a Gaussian as peaked as the image's PSF, in arcsec.
     meta : dict
@@ -207,6 +211,7 @@ class ForcedPhotometryResult(Tabular):
     joint_covariance: scipy.sparse.csr_array | None = None
     new_sources: QTable | None = None
     psf_stars: object = None
+    exposures: object = None
     psf_fwhm: u.Quantity | None = None
     meta: dict = dataclasses.field(default_factory=dict)
 

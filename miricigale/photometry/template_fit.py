@@ -17,7 +17,7 @@ from miricigale.utils.units import ANGLE
 _SEPARABLE = 0.99
 
 #: Least part of a template's light on usable pixels: sources with less are not measured.
-_MIN_COVERAGE = 0.05
+MIN_COVERAGE = 0.05
 
 
 class TemplateFit:
@@ -117,12 +117,12 @@ class TemplateFit:
         matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
         self.light, self.power = light / bank.full_light()[:, None], power
         diagonal = matrix.diagonal()
-        rows = (self.light[:, 1] >= _MIN_COVERAGE) & (diagonal > 0)
+        rows = (self.light[:, 1] >= MIN_COVERAGE) & (diagonal > 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             excess = bank.noise_terms() / np.where(power > 0, power, np.inf)
         self.noisy = excess > 0.5
         correction = scipy.sparse.diags_array(np.minimum(excess, 0.5) * diagonal)
-        self.degenerate = _duplicates(matrix, rows, bank.order)
+        self.degenerate = duplicates(matrix, rows, bank.order)
         matrix = (matrix - correction).tocsr()
         self._find_pairs(matrix, rows & ~self.degenerate)
         self.rows = np.flatnonzero(rows & ~self.degenerate & ~self.inseparable)
@@ -276,7 +276,7 @@ def inner(one, other):
     return float(np.einsum("ij,ij->", one, other, dtype=float, casting="same_kind"))
 
 
-def _duplicates(matrix, rows, order):
+def duplicates(matrix, rows, order):
     """Templates that equal another one's; the first in the catalog is kept."""
     coo = matrix.tocoo()
     scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))

@@ -1,0 +1,369 @@
+"""From a fit of several exposures to its result: diagnostics, flags, errors, tables and images."""
+
+import dataclasses
+
+import numpy as np
+import scipy.sparse
+from astropy.nddata import StdDevUncertainty
+from astropy.stats import mad_std
+from astropy.table import QTable
+
+from miricigale.instrument import pixel_area_map
+from miricigale.instrument.image import Image
+from miricigale.photometry._core.stamps import residual_statistics
+from miricigale.photometry.fit_errors import BLOCK_CORE, BLOCK_HALO, psf_errors
+from miricigale.photometry.exposure_fit import gaussian_width
+from miricigale.photometry.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
+from miricigale.photometry.packaging import new_source_table
+from miricigale.photometry.residual_sources import residual_peaks, unexplained_neighbors
+from miricigale.photometry.results import ForcedPhotometryResult, crowded
+from miricigale.utils.exceptions import PhotometryWarning, warn
+from miricigale.utils.meta import provenance
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
+
+#: Largest light of the model, over the noise, of pixels that count as free of sources.
+_FREE = 0.3
+
+#: Fewest such pixels of which the noise is measured, and by how much it may be another than is stated.
+_FEWEST_PIXELS = 400
+_OTHER_NOISE = 0.1
+
+#: uJy per MJy.
+_MICRO = 1e12
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class ExposureResults:
+    """
+    What a joint fit leaves of each exposure.
+
+    Attributes
+    ----------
+    table : `~astropy.table.QTable`
+        A row for each exposure: ``exposure`` (its number from 0), ``source`` (its file), ``n_sources``,
+        ``sky`` and ``sky_err`` (its mean level, MJy/sr), ``shift_x``, ``shift_y`` and their error ``shift_err``
+        (arcsec along its axes; zero and NaN where none was fitted), ``noise`` (robust rms of the residual over the
+        stated error, in pixels without sources) and ``correlation`` (of neighboring pixels there).
+    model_images, residual_images : tuple of `~astropy.nddata.CCDData`
+        MJy/sr, on the pixels of each exposure; the model has its sky, the residual its errors and mask.
+    """
+
+    table: QTable
+    model_images: tuple = ()
+    residual_images: tuple = ()
+
+    def __len__(self):
+        return len(self.table)
+
+    def __repr__(self):
+        return f"<ExposureResults of {len(self)} exposures>"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _PlaneFit:
+    """What `residual_peaks` needs of a fit: the mean residual in the plane."""
+
+    inverse_sigma: np.ndarray
+    psf_width: float
+    bank: object  # With the executor.
+
+
+def plane_peaks(fit, plane, xy, sign=1.0):
+    """
+    Peaks of the mean residual of all exposures in their common plane, and the plane's usable pixels.
+
+    ``xy``, (n, 2), are all known sources; with ``sign`` -1 the peaks of the negative.
+    """
+    models, residuals, sigmas = _images(fit)
+    return _peaks(fit, plane, xy, models, residuals, sigmas, sign)
+
+
+def _images(fit):
+    """Model without sky, residual and inverse errors of each exposure, in MJy/sr."""
+    models, residuals, inverse = [], [], []
+    for k, part in enumerate(fit.parts):
+        area = part.arrays.areas()
+        model = fit.model(k)
+        residuals.append(fit.residual(k, model) / area)
+        models.append(model / area)
+        inverse.append(part.inverse_sigma * area)
+    return models, residuals, inverse
+
+
+def _peaks(fit, plane, xy, models, residuals, inverse, sign=1.0):
+    weights = [one.astype(float) ** 2 for one in inverse]
+    residual, weight = plane.mean(residuals, weights)
+    model, _ = plane.mean(models, weights)
+    area = pixel_area_map(plane.wcs, plane.shape) * _MICRO
+    width = gaussian_width(fit.settings.mean_kernel) / fit.scale
+    view = _PlaneFit(np.sqrt(weight) / area, width, fit.parts[0].bank)
+    return residual_peaks(view, sign * residual * area, model * area, xy), weight > 0
+
+
+def joint_result(fit, plane, images, catalog, new_xy, evidence, meta):
+    """
+    Make the `ForcedPhotometryResult` of a fit of exposures.
+
+    Parameters
+    ----------
+    fit : `~miricigale.photometry.exposure_fit.ExposureFit`
+        The fit, with the ``shifts`` (pixels) of the exposures and their ``shift_errors``.
+    plane : `~miricigale.photometry.coadd.Plane`
+        What exposures have in common.
+    images : list of `~astropy.nddata.CCDData`
+        The exposures.
+    catalog : `~miricigale.photometry.packaging.CatalogRows`
+        The catalog; ``near`` lists the fit's sources.
+    new_xy : `~numpy.ndarray`, shape (m, 2)
+        Positions of sources that it lacks, in the plane: the last of the fit's sources.
+    evidence : dict or None
+        Of a second pass.
+    meta : dict
+        The ``template``, and the ``filter`` if that is known.
+    """
+    n = len(catalog.id)
+    n_all = n + len(new_xy)
+    place = np.concatenate([catalog.near, np.arange(n, n_all)])
+    models, residuals, inverse = _images(fit)
+    chi2, left, poor, checks = _compared(fit, models, residuals)
+    terms, common, blending = _covariances(fit)
+    joint = scipy.sparse.csr_array((n_all, n_all))
+    errors = {name: np.full(n_all, np.nan) for name in ("", "_noise", "_template", "_psf")}
+    flux = np.full(n_all, np.nan)
+    measured = place[fit.rows]
+    flux[measured] = fit.flux[fit.rows]
+    if len(fit.rows):
+        k = np.arange(len(measured))
+        gather = scipy.sparse.coo_array((np.ones(len(k)), (measured, k)), shape=(n_all, len(k)))
+        spread = [(gather @ one @ gather.T).tocsr() for one in terms]
+        joint = (spread[0] + spread[1] + spread[2]).tocsr()
+        joint.sort_indices()
+        for name, one in zip(errors, (joint, *spread), strict=True):
+            errors[name][measured] = np.sqrt(np.maximum(one.diagonal()[measured], 0.0))
+    xy = np.concatenate([catalog.xy, new_xy])
+    peaks, _ = _peaks(fit, plane, xy, models, residuals, inverse)
+    flags, coverage = _flags(fit, place, n_all, flux, blending, poor)
+    flags[:n] |= catalog.flags
+    flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
+    near = unexplained_neighbors(peaks, xy, flux)
+    flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage}
+    columns["chi2"] = _spread_over(chi2, place, n_all)
+    columns["residual_fraction"] = _spread_over(left, place, n_all)
+    for name, one in errors.items():
+        columns[f"flux_err{name}"] = one * FNU
+    new = None
+    if fit.settings.second_pass or len(new_xy):
+        names = ("flux", "flux_err", "flags", "coverage", "chi2")
+        rows = {name: columns[name][n:] for name in names}
+        new = new_source_table(catalog, new_xy, plane.wcs, rows)
+    exposures = _exposures(fit, images, models, residuals, inverse, common, checks)
+    model, residual = _plane_images(plane, models, residuals, inverse, meta)
+    sky, weight = exposures.table["sky"], exposures.table["sky_err"] ** -2
+    reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
+    counted = {} if evidence is None else {"second_pass": evidence}
+    return ForcedPhotometryResult(
+        id=np.array(catalog.id),
+        sky=catalog.sky,
+        **{name: values[:n] for name, values in columns.items()},
+        covariance=joint[:n, :n],
+        template=catalog.template,
+        template_snr=catalog.template_snr,
+        crowded=crowded(catalog.sky, reference),
+        x=catalog.xy[:, 0].copy(),
+        y=catalog.xy[:, 1].copy(),
+        background=np.sum(sky * weight) / np.sum(weight) if len(fit.rows) else None,
+        background_err=np.sum(weight) ** -0.5 if len(fit.rows) else None,
+        new_sources=new,
+        psf_fwhm=np.sqrt(8 * np.log(2)) * gaussian_width(fit.settings.mean_kernel) * ANGLE,
+        model_image=model,
+        residual_image=residual,
+        exposures=exposures,
+        meta=provenance(
+            **meta,
+            pixel_scale=round(fit.scale, 6),
+            n_exposures=len(images),
+            correlated_noise=any(part.correlation is not None for part in fit.parts),
+            measured_noise=any(part.arrays.measured_noise for part in fit.parts),
+            **counted,
+        ),
+    )
+
+
+def _spread_over(values, place, n):
+    """Values of the fit's sources at their places among n; NaN elsewhere."""
+    found = np.full(n, np.nan)
+    found[place] = values
+    return found
+
+
+def _compared(fit, models, residuals):
+    """Chi-square of each source, light left, whether that is poor; noise and correlation of each exposure."""
+    n = len(fit.xy)
+    square, weight, left, core = np.zeros((4, n))
+    checks = []
+    for part, model, residual in zip(fit.parts, models, residuals, strict=True):
+        area = part.arrays.areas()
+        source, seen = part.row_source, np.zeros(len(part.source))
+        found = np.full((len(part.source), 3), np.nan)
+        own = np.asarray(residual * area, np.float32)
+        for block in part.bank.blocks():
+            rows = slice(block.first, block.last)
+            residual_statistics(*block.stamps, own, part.inverse_sigma, found[rows])
+            for row, (first, last) in enumerate(zip(block.start[:-1], block.start[1:], strict=True)):
+                seen[block.first + row] = block.values[first:last].sum()
+        good = np.isfinite(found[:, 0]) & (seen > 0)
+        np.add.at(square, source[good], (seen * found[:, 0])[good])
+        np.add.at(weight, source[good], seen[good])
+        np.add.at(left, source[good], found[good, 1])
+        np.add.at(core, source[good], found[good, 2])
+        checks.append(_noise_check(own * part.inverse_sigma, model * area * part.inverse_sigma, part))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        chi2 = square / weight
+        left = left / (fit.flux * core)
+    out = np.ones(n, bool)
+    out[fit.rows] = False
+    chi2[out] = np.nan
+    left[out] = np.nan
+    poor = chi2 > POOR_CHI2
+    if fit.free is not None:
+        poor[fit.rows] |= fit.free.strain > POOR_STRAIN
+    return chi2, left, poor, checks
+
+
+def _noise_check(white, model, part):
+    """Robust rms of a whitened residual where no source is, and the correlation of neighbors; NaN without sky."""
+    free = part.arrays.usable & (np.abs(model) < _FREE)
+    if np.count_nonzero(free) < _FEWEST_PIXELS:
+        return np.nan, np.nan
+    rms = float(mad_std(white[free]))
+    calm = free & (np.abs(white) < 5 * rms)
+    products = []
+    for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        both = calm[one] & calm[other]
+        products.append(np.mean(white[one][both] * white[other][both], dtype=float))
+    return rms, float(np.mean(products) / np.mean(white[calm] ** 2, dtype=float))
+
+
+def _covariances(fit):
+    """Covariances by noise, templates and PSF, that of the common parameters, and blending of all sources."""
+    blending = np.full(len(fit.xy), np.nan)
+    if not len(fit.rows):
+        return [], None, blending
+    n, plain, free = len(fit.rows), fit.fit, fit.free
+    solution, xy = plain, fit.xy[fit.rows]
+    noise_filling = fit.noise_filling()
+    fillings = [noise_filling]
+    if free is not None:
+        solution, xy = free.fit, np.concatenate([xy, free.xy])
+        if noise_filling is None:
+            # the priors are no noise
+            white = (solution.matrix - scipy.sparse.diags_array(free.prior)).tocsr()
+            fillings = [(white, solution.border, solution.corner)]
+        n_common = len(solution.corner_rhs)
+        nothing = np.zeros((len(solution.rhs), n_common)), np.zeros((n_common, n_common))
+        fillings.append((free.filling(plain.matrix), *nothing))
+    coo = plain.matrix.tocoo()
+    pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=solution.matrix.shape)
+    found, alone = solution.covariances(
+        xy, fillings, core=BLOCK_CORE / fit.scale, halo=BLOCK_HALO / fit.scale, pattern=pattern
+    )
+    noise, common = found[0]
+    noise = noise[:n][:, :n]
+    blending[fit.rows] = alone[:n]
+    template = scipy.sparse.csr_array((n, n))
+    if free is not None:
+        blending[fit.rows] *= np.sqrt(free.alone())
+        template, more = found[1]
+        template = template[:n][:, :n]
+        common = common + more
+    light = [light is not None and light.kind == "cutout" for light in fit.cutouts()]
+    error = psf_errors(fit, np.array(light, bool))[fit.rows]
+    coo = noise.tocoo()
+    data = error[coo.row] * error[coo.col]
+    psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
+    return [noise, template, psf], common, blending
+
+
+def _flags(fit, place, n_all, flux, blending, poor):
+    """Flags of all sources, and the fraction of each template on the exposure that shows most of it."""
+    flags = np.zeros(n_all, int)
+    inside = np.zeros(n_all)
+    coverage = np.zeros(n_all)
+    inside[place] = fit.light[:, 0]
+    coverage[place] = np.clip(fit.light[:, 1], 0.0, 1.0)
+    flags[inside < 0.9] |= int(ForcedFlags.EDGE)
+    flags[coverage < 0.9 * np.minimum(inside, 1.0)] |= int(ForcedFlags.MASKED)
+    for rows, flag in (
+        (fit.degenerate, ForcedFlags.DEGENERATE),
+        (fit.noisy, ForcedFlags.NOISY_SEGMENT),
+        (blending > 2, ForcedFlags.BLENDED),
+        (poor, ForcedFlags.POOR_FIT),
+    ):
+        flags[place[rows]] |= int(flag)
+    lost = np.isnan(flux) & (flags & int(ForcedFlags.DEGENERATE) == 0)
+    flags[lost] |= int(ForcedFlags.NO_DATA)
+    return flags, coverage
+
+
+def _exposures(fit, images, models, residuals, inverse, common, checks):
+    """The `ExposureResults` of a fit."""
+    table = QTable({"exposure": np.arange(len(images))})
+    table["source"] = [str(one.meta.get("source", k)) for k, one in enumerate(images)]
+    table["n_sources"] = [_n_seen(part) for part in fit.parts]
+    first = [places["sky"].start for places in fit.places]
+    errors = np.full(len(fit.common), np.nan) if common is None else np.sqrt(np.diag(common))
+    table["sky"] = fit.common[first] * SURFACE_BRIGHTNESS
+    table["sky_err"] = errors[first] * SURFACE_BRIGHTNESS
+    scales = np.array([part.scale for part in fit.parts])
+    table["shift_x"], table["shift_y"] = (fit.shifts * scales[:, None]).T * ANGLE
+    table["shift_err"] = fit.shift_errors.mean(axis=1) * scales * ANGLE
+    table["noise"], table["correlation"] = np.transpose(checks)
+    for row in table:
+        if abs(row["noise"] - 1) > _OTHER_NOISE:
+            msg = (
+                f"exposure {row['exposure']} ({row['source']}): noise between the sources is {row['noise']:.3g} "
+                "times its stated errors, and so are the errors of fluxes"
+            )
+            warn(msg, PhotometryWarning)
+    model_images, residual_images = [], []
+    for k, part in enumerate(fit.parts):
+        usable = part.arrays.usable
+        sky = fit.sky(k) / part.arrays.areas()
+        with np.errstate(divide="ignore"):
+            sigma = np.where(usable, 1 / inverse[k], np.nan)
+        options = {"unit": SURFACE_BRIGHTNESS, "wcs": part.arrays.wcs}
+        kept = {key: images[k].meta[key] for key in ("filter", "source") if key in images[k].meta}
+        model_images.append(Image(models[k] + sky, meta=dict(kept), **options))
+        residual = np.where(usable, residuals[k], np.nan)
+        noise = StdDevUncertainty(sigma)
+        residual_images.append(
+            Image(residual, mask=~usable, uncertainty=noise, meta=dict(kept), **options)
+        )
+    return ExposureResults(table, tuple(model_images), tuple(residual_images))
+
+
+def _n_seen(part):
+    """Number of sources that are on an exposure."""
+    ny, nx = part.arrays.flux.shape
+    x, y = part.bank.sources.xy.T
+    return int(np.count_nonzero((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)))
+
+
+def _plane_images(plane, models, residuals, inverse, meta):
+    """Mean model and residual in the plane, for pictures."""
+    weights = [one.astype(float) ** 2 for one in inverse]
+    model, weight = plane.mean(models, weights)
+    residual, _ = plane.mean(residuals, weights)
+    usable = weight > 0
+    sigma = np.full(plane.shape, np.nan)
+    sigma[usable] = weight[usable] ** -0.5
+    residual[~usable] = np.nan
+    kept = {key: meta[key] for key in ("filter",) if key in meta}
+    options = {"unit": SURFACE_BRIGHTNESS, "wcs": plane.wcs}
+    return (
+        Image(model, meta=dict(kept), **options),
+        Image(
+            residual, mask=~usable, uncertainty=StdDevUncertainty(sigma), meta=dict(kept), **options
+        ),
+    )
