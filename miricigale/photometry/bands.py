@@ -27,7 +27,7 @@ def measure_bands(images, kernels, templates, **options):
     Parameters
     ----------
     images : dict of str to `~astropy.nddata.CCDData`
-        The images by name of the filter.
+        The images by name of the filter; lists of exposures are fitted together.
     kernels : dict of str to `~miricigale.psf.MatchingKernel` or `ForcedPhotometer`
         From the high-resolution image to each of them, or what measures it.
     templates : `SourceTemplates`
@@ -102,7 +102,13 @@ def measure_prior(images, photometers, highres, segmentation, catalog):
         ``NOT_IN_CATALOG``, where a photometer found some. Of those within half the width of the PSF of one that
         another band has shown there is one.
     """
-    images = {name: own_pixels(as_mosaic(image)) for name, image in images.items()}
+    opened = {}
+    for name, image in images.items():
+        if isinstance(image, (list, tuple)):
+            opened[name] = [as_mosaic(one) for one in image]
+        else:
+            opened[name] = own_pixels(as_mosaic(image))
+    images = opened
     starred = {
         name: with_stars(one, images[name], catalog, highres)
         for name, one in photometers.items()
@@ -120,8 +126,9 @@ def _measure_prior(images, photometers, highres, segmentation, catalog):
     near = np.zeros(len(catalog), bool)
     for name, image in images.items():
         reach = len(photometers[name].mean_kernel.target)
-        xy = sky_pixels(catalog["sky"], image.wcs, image.shape, reach)
-        near |= np.isfinite(xy[:, 0])
+        for one in image if isinstance(image, list) else [image]:
+            xy = sky_pixels(catalog["sky"], one.wcs, one.shape, reach)
+            near |= np.isfinite(xy[:, 0])
     templates = first._templates(highres, segmentation, catalog[near])
     if not near.all():
         parts = [templates, SourceTemplates.from_catalog(catalog[~near])]

@@ -322,6 +322,11 @@ class LinearFit:
         # the class is frozen
         self.__dict__.update(found)
 
+    @property
+    def common_covariance(self):
+        """Covariance of the common parameters for white noise, shape (g, g)."""
+        return self._q
+
     def covariances(self, xy, fillings, *, core, halo, pattern=None):
         """
         Covariances of sources that overlap, and of the common parameters.

@@ -136,7 +136,8 @@ class ExposureFit:
     order : int
         Of the polynomial that is each exposure's sky.
     gradients : list of list of `~numpy.ndarray`, optional
-        For each exposure the derivatives of its model by a shift of it along x and y, which are fitted too.
+        For each exposure the derivatives of its model by a shift of it along x and y, which are fitted too;
+        empty for one without a shift.
 
     Attributes
     ----------
@@ -174,7 +175,7 @@ class ExposureFit:
         for k, part in enumerate(self.parts):
             columns = part.sky_columns(self.order)
             places = {"sky": slice(n_common, n_common + len(columns))}
-            if gradients is not None:
+            if gradients is not None and gradients[k]:
                 columns = columns + gradients[k]
                 places["shift"] = slice(places["sky"].stop, n_common + len(columns))
             n_common += len(columns)

@@ -3,8 +3,28 @@
 import dataclasses
 import functools
 
-from miricigale.psf import KernelField, MatchingKernel
+import astropy.units as u
+import numpy as np
+
+from miricigale.instrument import ImageFacts, aperture, subarrays
+from miricigale.instrument.sky_axes import grid_angle
+from miricigale.photometry.arrays import pixel_scale
+from miricigale.psf import (
+    KernelField,
+    MatchingKernel,
+    filter_psf,
+    imager_kernels,
+    instrument_psf,
+    rotate_psf,
+)
+from miricigale.psf.distorted import moved_kernels
+from miricigale.psf.miri import MIRI_FILTERS
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
+from miricigale.utils.units import ANGLE
+
+#: Difference of rolls (deg) below which exposures share their kernels.
+_SAME_ROLL = 0.05
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -38,6 +58,57 @@ class ExposureKernels:
             if mean.source is None or mean.target is None:
                 raise argument_error("kernel", "kernels with their PSFs", "one without")
 
+    @classmethod
+    def from_images(cls, images, highres, highres_psf=None, *, n_psfs=9):
+        """
+        Make the kernels of MIRI exposures from the model PSFs of their places and rolls.
+
+        Parameters
+        ----------
+        images : sequence of `~astropy.nddata.CCDData`
+            Exposures (``_cal``), whose meta has ``filter``, and if they are there ``pa_aper`` (deg; otherwise by
+            the coordinates, to 0.3 deg) and ``subarray`` (otherwise by the shape).
+        highres : `~astropy.nddata.CCDData`
+            The high-resolution image, on whose pixels the kernels are.
+        highres_psf : `~photutils.psf.ImagePSF`, optional
+            Its PSF, on the sky; by default the model of its filter.
+        n_psfs : int, optional
+            Places on the array (see `~miricigale.psf.imager_kernels`).
+
+        Returns
+        -------
+        kernels : `ExposureKernels`
+            Exposures whose rolls differ by less than 0.05 deg share their kernels.
+
+        Raises
+        ------
+        ValueError, KeyError
+            If an exposure states no filter or one without a model, or there is no such sub-array.
+        """
+        scale = pixel_scale(highres.wcs) * ANGLE
+        turn = grid_angle(highres.wcs, highres.shape)
+        sharp = _sharp_psf(highres, highres_psf, scale, turn)
+        made, kernels = [], []
+        for k, image in enumerate(images):
+            facts = ImageFacts.of(image)
+            wanted = "exposures of one of the imager's filters"
+            known = facts.filter in MIRI_FILTERS
+            check_that(known, f"images[{k}]", wanted, facts.filter)
+            pa = exposure_roll(image)
+            alike = {"filter": facts.filter, "subarray": _subarray(image, facts.subarray)}
+            for other, other_pa, wcs, field in made:
+                if other == alike and abs((other_pa - pa + 180) % 360 - 180) < _SAME_ROLL:
+                    kernels.append(moved_kernels(field, wcs, image.wcs))
+                    break
+            else:
+                field = imager_kernels(
+                    sharp, wcs=image.wcs, pa=pa * u.deg, pixel_scale=scale, grid_angle=turn,
+                    n_psfs=n_psfs, **alike,
+                )  # fmt: skip
+                made.append((alike, pa, image.wcs, field))
+                kernels.append(field)
+        return cls(kernels)
+
     def __len__(self):
         return len(self.kernels)
 
@@ -49,3 +120,38 @@ class ExposureKernels:
         """The mean `~miricigale.psf.MatchingKernel`."""
         means = [one.mean if isinstance(one, KernelField) else one for one in self.kernels]
         return MatchingKernel.blend(means)
+
+
+def exposure_roll(image):
+    """Position angle (deg) of the detector's +y: as stated (``pa_aper``), or that of the coordinates."""
+    stated = image.meta.get("pa_aper")
+    if stated is not None and np.size(stated) == 1:
+        return float(np.ravel(u.Quantity(stated, u.deg).value)[0])
+    return float(grid_angle(image.wcs, image.shape).to_value(u.deg))
+
+
+def _subarray(image, stated):
+    """Name of the sub-array: as stated, or that of the shape."""
+    if stated is not None:
+        return stated
+    for name in subarrays():
+        if aperture(name).shape == image.shape:
+            return name
+    shapes = {name: aperture(name).shape for name in subarrays()}
+    raise argument_error(
+        "images", f"of one of the shapes {shapes}, or with 'subarray'", image.shape
+    )
+
+
+def _sharp_psf(highres, psf, scale, turn):
+    """The PSF of the high-resolution image on its axes."""
+    if psf is not None:
+        psf = instrument_psf(psf, "highres_psf")
+        return rotate_psf(psf, grid_angle=turn)
+    stated = highres.meta.get("pa_aper")
+    pa = None if stated is None else u.Quantity(stated, u.deg)
+    name = ImageFacts.of(highres).filter
+    check_that(
+        name is not None, "highres", "one whose meta has its filter (or 'highres_psf')", None
+    )
+    return filter_psf(name, pixel_scale=scale, pa=pa, grid_angle=turn)

@@ -117,8 +117,8 @@ def measure_exposures(
     with threads(photometer.n_threads) as executor, single_threaded():
         joint = _Joint(photometer, plane, rows)
         joint.place(placed, templates, executor)
-        fit, new_xy, evidence = joint.fit_all()
-        return joint_result(fit, plane, images, rows, new_xy, evidence, meta)
+        fit, new_xy, evidence, offsets = joint.fit_all()
+        return joint_result(fit, plane, images, rows, new_xy, evidence, offsets, meta)
 
 
 def _opened(images):
@@ -246,13 +246,23 @@ class _Joint:
             self._parts.append(ExposurePart(place.arrays, place.settings, bank, rows))
         #: Pixels by which each exposure's templates are moved.
         self._shifts = np.zeros((len(placed), 2))
-        self._shift_errors = np.full((len(placed), 2), np.nan)
+        # what they are found to be, with errors, whether they are fitted or not
+        self._measured = np.full((len(placed), 2), np.nan)
+        self._errors = np.full((len(placed), 2), np.nan)
 
     def fit_all(self):
-        """The last fit, positions of new sources in the plane, and the evidence for them (or None)."""
+        """
+        The last fit, positions of new sources in the plane, the evidence for them, and offsets of exposures.
+
+        The offsets are east and north in arcsec, (n_exposures, 2), with their errors, (n_exposures,).
+        """
         fit = self._fit(self._parts)
-        if self._settings.max_shift is not None and len(fit.rows):
+        if not len(fit.rows):
+            pass
+        elif self._settings.max_shift is not None:
             fit = self._with_shifts(fit)
+        else:
+            self._measured, self._errors = self._steps(fit)
         new_xy = np.empty((0, 2))
         evidence = None
         if self._settings.second_pass is not False:
@@ -262,9 +272,8 @@ class _Joint:
         elif not self._settings.second_pass:
             fit = self._settled(fit)
         fit.free_templates(self._catalog.fitted)
-        fit.shifts = self._shifts
-        fit.shift_errors = self._shift_errors
-        return fit, new_xy, evidence
+        offsets = self._on_sky(self._measured), self._errors.mean(axis=1) * self._scale
+        return fit, new_xy, evidence, offsets
 
     def _fit(self, parts, new_xy=None, gradients=None):
         xy = self._catalog.xy[self._catalog.near]
@@ -278,14 +287,9 @@ class _Joint:
         fixed = np.zeros(len(self._parts), bool)
         plain = self._parts
         for _ in range(_MAX_SHIFT_STEPS):
-            gradients = []
-            for k in range(len(plain)):
-                dy, dx = np.gradient(fit.model(k))
-                gradients.append([-dx, -dy])
-            trial = self._fit(fit.parts, gradients=gradients)
-            steps = np.array([trial.common[places["shift"]] for places in trial.places])
-            variance = np.diag(np.linalg.inv(_reduced(trial)))
-            errors = np.array([variance[places["shift"]] for places in trial.places]) ** 0.5
+            steps, self._errors = self._steps(fit)
+            self._measured = self._shifts + steps
+            fixed |= np.isnan(steps[:, 0])
             found = self._shifts + np.where(fixed[:, None], 0.0, steps)
             scales = np.array([part.scale for part in fit.parts])
             far = np.hypot(*found.T) * scales > limit
@@ -300,7 +304,6 @@ class _Joint:
             found[fixed] = 0.0
             step = np.abs(found - self._shifts).max()
             self._shifts = self._shifts + np.clip(found - self._shifts, -1.0, 1.0)
-            self._shift_errors = np.where(fixed[:, None], np.nan, errors)
             moved = [part.moved(shift) for part, shift in zip(plain, self._shifts, strict=True)]
             fit = self._fit(moved)
             if step < _SHIFT_DONE:
@@ -308,11 +311,40 @@ class _Joint:
         self._parts = fit.parts
         return fit
 
+    def _steps(self, fit):
+        """Shifts of exposures beyond those of their templates, to first order, and errors: pixels, (k, 2)."""
+        gradients = []
+        for k, part in enumerate(fit.parts):
+            dy, dx = np.gradient(fit.model(k))
+            own = [-dx, -dy]
+            power = [np.sum((one * part.inverse_sigma) ** 2, dtype=float) for one in own]
+            # too little light to find a shift of less than a pixel
+            gradients.append(own if min(power) > 1 else [])
+        trial = self._fit(fit.parts, fit.xy[self._n :], gradients)
+        variance = np.diag(trial.fit.common_covariance)
+        steps = np.full((len(fit.parts), 2), np.nan)
+        errors = steps.copy()
+        for k, places in enumerate(trial.places):
+            if "shift" in places:
+                steps[k] = trial.common[places["shift"]]
+                errors[k] = np.sqrt(variance[places["shift"]])
+        return steps, errors
+
+    def _on_sky(self, shifts):
+        """Shifts of exposures (pixels) as arcsec to the east and north."""
+        found = []
+        for part, shift in zip(self._parts, shifts, strict=True):
+            ny, nx = part.arrays.flux.shape
+            middle = np.array([[(nx - 1) / 2, (ny - 1) / 2]])
+            turn = self._turns(part, middle)[0]
+            found.append((turn @ shift) * self._scale * [-1.0, 1.0])
+        return np.array(found)
+
     def _new_positions(self, fit):
         """
         Where the residuals show sources that the catalog lacks, in the plane, and the evidence for them.
 
-        As for one image: false ones are as many as the negative of the residual shows, and those of Gaussian noise.
+        As for one image, the negative of the residual and Gaussian noise say how many are false.
         """
         decide = self._settings.second_pass is None
         flux = np.full(len(self._catalog.id), np.nan)
@@ -379,6 +411,8 @@ class _Joint:
         weight = np.zeros(n)
         others = np.zeros(n)
         for k, part in enumerate(fit.parts):
+            if not len(part.source):
+                continue
             model = fit.model(k)
             residual = fit.residual(k, model)
             view = _Offsets(part, fit.flux[part.row_source])
@@ -386,7 +420,7 @@ class _Joint:
             step, error, rest = source_offsets(view, residual, model, rows)
             good = np.isfinite(error) & np.isfinite(step).all(axis=1) & (error > 0)
             source = part.row_source[good]
-            turned = np.einsum("kij,kj->ki", self._turns(part)[good], step[good])
+            turned = np.einsum("kij,kj->ki", self._turns(part, part.bank.xy)[good], step[good])
             own = error[good] ** -2.0
             total[source] += own[:, None] * turned
             weight[source] += own
@@ -394,9 +428,11 @@ class _Joint:
         with np.errstate(divide="ignore", invalid="ignore"):
             return total / weight[:, None], weight**-0.5, others / weight
 
-    def _turns(self, part):
-        """Linear maps from pixels of an exposure to those of the plane at its bank's rows, (k, 2, 2)."""
-        xy = part.bank.xy
+    def _turns(self, part, xy):
+        """Linear maps from pixels of an exposure to those of the plane at some pixels, (k, 2, 2)."""
+        if not len(xy):
+            # which astropy cannot convert
+            return np.empty((0, 2, 2))
         middle = np.array(pixel_to_pixel(part.arrays.wcs, self._plane.wcs, *xy.T))
         sides = []
         for step in ([1.0, 0.0], [0.0, 1.0]):
@@ -441,15 +477,9 @@ class _Joint:
             moved = []
             for part in plain:
                 inverse = np.empty((len(part.source), 2, 2))
-                inverse[part.bank.order] = np.linalg.inv(self._turns(part))
+                inverse[part.bank.order] = np.linalg.inv(self._turns(part, part.bank.xy))
                 moved.append(part.moved(np.einsum("kij,kj->ki", inverse, own[part.source])))
             fit = self._fit(moved)
             if change < _OFFSET_FLOOR / 2:
                 break
         return fit
-
-
-def _reduced(fit):
-    """Normal matrix of the common parameters with the fluxes eliminated."""
-    solution = fit.fit
-    return solution.corner - solution.border.T @ solution.solve(solution.border)

@@ -11,8 +11,8 @@ from astropy.table import QTable
 from miricigale.instrument import pixel_area_map
 from miricigale.instrument.image import Image
 from miricigale.photometry._core.stamps import residual_statistics
-from miricigale.photometry.fit_errors import BLOCK_CORE, BLOCK_HALO, psf_errors
 from miricigale.photometry.exposure_fit import gaussian_width
+from miricigale.photometry.fit_errors import BLOCK_CORE, BLOCK_HALO, psf_errors
 from miricigale.photometry.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.packaging import new_source_table
 from miricigale.photometry.residual_sources import residual_peaks, unexplained_neighbors
@@ -28,6 +28,11 @@ _FREE = 0.3
 _FEWEST_PIXELS = 400
 _OTHER_NOISE = 0.1
 
+#: Least offset (pixels) that is warned of, with so many sources above so many sigma (as for one image).
+_OFFSET = 0.1
+_FEWEST_BRIGHT = 5
+_BRIGHT = 10.0
+
 #: uJy per MJy.
 _MICRO = 1e12
 
@@ -41,9 +46,9 @@ class ExposureResults:
     ----------
     table : `~astropy.table.QTable`
         A row for each exposure: ``exposure`` (its number from 0), ``source`` (its file), ``n_sources``,
-        ``sky`` and ``sky_err`` (its mean level, MJy/sr), ``shift_x``, ``shift_y`` and their error ``shift_err``
-        (arcsec along its axes; zero and NaN where none was fitted), ``noise`` (robust rms of the residual over the
-        stated error, in pixels without sources) and ``correlation`` (of neighboring pixels there).
+        ``sky`` and ``sky_err`` (its mean level, MJy/sr), ``offset_east``, ``offset_north`` and ``offset_err`` (of
+        the exposure from the templates, arcsec; fitted with ``max_shift``), ``noise`` (robust rms of the residual
+        over the stated error, in pixels without sources) and ``correlation`` (of neighboring pixels there).
     model_images, residual_images : tuple of `~astropy.nddata.CCDData`
         MJy/sr, on the pixels of each exposure; the model has its sky, the residual its errors and mask.
     """
@@ -100,14 +105,14 @@ def _peaks(fit, plane, xy, models, residuals, inverse, sign=1.0):
     return residual_peaks(view, sign * residual * area, model * area, xy), weight > 0
 
 
-def joint_result(fit, plane, images, catalog, new_xy, evidence, meta):
+def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     """
     Make the `ForcedPhotometryResult` of a fit of exposures.
 
     Parameters
     ----------
     fit : `~miricigale.photometry.exposure_fit.ExposureFit`
-        The fit, with the ``shifts`` (pixels) of the exposures and their ``shift_errors``.
+        The fit.
     plane : `~miricigale.photometry.coadd.Plane`
         What exposures have in common.
     images : list of `~astropy.nddata.CCDData`
@@ -118,6 +123,8 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, meta):
         Positions of sources that it lacks, in the plane: the last of the fit's sources.
     evidence : dict or None
         Of a second pass.
+    offsets : tuple
+        Of the exposures from the templates, east and north in arcsec, shape (k, 2), and their errors, (k,).
     meta : dict
         The ``template``, and the ``filter`` if that is known.
     """
@@ -157,11 +164,18 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, meta):
         names = ("flux", "flux_err", "flags", "coverage", "chi2")
         rows = {name: columns[name][n:] for name in names}
         new = new_source_table(catalog, new_xy, plane.wcs, rows)
-    exposures = _exposures(fit, images, models, residuals, inverse, common, checks)
+    exposures = _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
     model, residual = _plane_images(plane, models, residuals, inverse, meta)
     sky, weight = exposures.table["sky"], exposures.table["sky_err"] ** -2
     reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
     counted = {} if evidence is None else {"second_pass": evidence}
+    known = np.isfinite(offsets[1])
+    if known.any():
+        # along x and y of the plane, as for one image
+        weights = offsets[1][known] ** -2.0
+        east, north = np.average(offsets[0][known], axis=0, weights=weights)
+        counted["offset"] = [round(-float(east), 5), round(float(north), 5)]
+        counted["offset_err"] = [round(float(np.sum(weights) ** -0.5), 5)] * 2
     return ForcedPhotometryResult(
         id=np.array(catalog.id),
         sky=catalog.sky,
@@ -210,14 +224,18 @@ def _compared(fit, models, residuals):
         for block in part.bank.blocks():
             rows = slice(block.first, block.last)
             residual_statistics(*block.stamps, own, part.inverse_sigma, found[rows])
-            for row, (first, last) in enumerate(zip(block.start[:-1], block.start[1:], strict=True)):
+            for row, (first, last) in enumerate(
+                zip(block.start[:-1], block.start[1:], strict=True)
+            ):
                 seen[block.first + row] = block.values[first:last].sum()
         good = np.isfinite(found[:, 0]) & (seen > 0)
         np.add.at(square, source[good], (seen * found[:, 0])[good])
         np.add.at(weight, source[good], seen[good])
         np.add.at(left, source[good], found[good, 1])
         np.add.at(core, source[good], found[good, 2])
-        checks.append(_noise_check(own * part.inverse_sigma, model * area * part.inverse_sigma, part))
+        checks.append(
+            _noise_check(own * part.inverse_sigma, model * area * part.inverse_sigma, part)
+        )
     with np.errstate(divide="ignore", invalid="ignore"):
         chi2 = square / weight
         left = left / (fit.flux * core)
@@ -306,7 +324,7 @@ def _flags(fit, place, n_all, flux, blending, poor):
     return flags, coverage
 
 
-def _exposures(fit, images, models, residuals, inverse, common, checks):
+def _exposures(fit, images, models, residuals, inverse, common, checks, offsets):
     """The `ExposureResults` of a fit."""
     table = QTable({"exposure": np.arange(len(images))})
     table["source"] = [str(one.meta.get("source", k)) for k, one in enumerate(images)]
@@ -315,10 +333,10 @@ def _exposures(fit, images, models, residuals, inverse, common, checks):
     errors = np.full(len(fit.common), np.nan) if common is None else np.sqrt(np.diag(common))
     table["sky"] = fit.common[first] * SURFACE_BRIGHTNESS
     table["sky_err"] = errors[first] * SURFACE_BRIGHTNESS
-    scales = np.array([part.scale for part in fit.parts])
-    table["shift_x"], table["shift_y"] = (fit.shifts * scales[:, None]).T * ANGLE
-    table["shift_err"] = fit.shift_errors.mean(axis=1) * scales * ANGLE
+    table["offset_east"], table["offset_north"] = offsets[0].T * ANGLE
+    table["offset_err"] = offsets[1] * ANGLE
     table["noise"], table["correlation"] = np.transpose(checks)
+    _warn_of_offsets(fit, offsets)
     for row in table:
         if abs(row["noise"] - 1) > _OTHER_NOISE:
             msg = (
@@ -341,6 +359,21 @@ def _exposures(fit, images, models, residuals, inverse, common, checks):
             Image(residual, mask=~usable, uncertainty=noise, meta=dict(kept), **options)
         )
     return ExposureResults(table, tuple(model_images), tuple(residual_images))
+
+
+def _warn_of_offsets(fit, offsets):
+    """Warn of exposures that lie off their templates, if sources are bright and no shift is fitted."""
+    if fit.settings.max_shift is not None or not len(fit.rows):
+        return
+    snr = fit.fit.flux * np.sqrt(fit.fit.matrix.diagonal())
+    offset = np.hypot(*offsets[0].T)
+    far = (offset > _OFFSET * fit.scale) & (offset > 3 * offsets[1])
+    if far.any() and np.count_nonzero(snr > _BRIGHT) >= _FEWEST_BRIGHT:
+        msg = (
+            f"{np.count_nonzero(far)} exposures lie up to {offset.max():.3f} arcsec from their templates: "
+            "'max_shift' fits that"
+        )
+        warn(msg, PhotometryWarning)
 
 
 def _n_seen(part):

@@ -95,8 +95,18 @@ class Inputs:
             if self.catalog is not None:
                 _check_catalog(self.catalog, one, self.highres)
             _check_psfs(one, self.highres, own)
+        self._check_bands()
+
+    def _check_bands(self):
+        """Refuse several images of one filter."""
         if len(set(self.bands)) < len(self.bands):
-            raise argument_error("image", "of different filters", self.bands)
+            wanted = "of different filters (or exposures, _cal, of one, measured whole)"
+            raise argument_error("image", wanted, self.bands)
+
+    @property
+    def labels(self):
+        """What the images of models and residuals are called, one for each image; empty for a single one."""
+        return [""] if len(self.images) == 1 else [short_band(band) for band in self.bands]
 
     def n_bytes(self, prior=None, images=None):
         """About how many bytes parts of these shapes take, with sources; without, the whole images alone."""
@@ -142,19 +152,19 @@ class Inputs:
             sharp = _blank(files[0].header.shape, files[0].header.wcs)
         return Pixels(sharp, [one for one in others if one is not None], found)
 
+    def fit_options(self, n_threads=None):
+        """Options of a `~miricigale.photometry.ForcedPhotometer`, with the defaults of files."""
+        defaults = {"background_order": 0, "second_pass": None, "n_threads": n_threads}
+        return defaults | self.options
+
     def photometers(self, n_threads=None):
         """What measures each band: dict of `~miricigale.photometry.ForcedPhotometer`."""
         from miricigale.photometry import ForcedPhotometer
 
-        options = {
-            "background_order": 0,
-            "second_pass": None,
-            "n_threads": n_threads,
-            **self.options,
-        }
+        options = self.fit_options(n_threads)
         found = {}
         for band, one, own in zip(self.bands, self.images, self.kernels, strict=True):
-            kernel = _kernel(one, self.highres, own)
+            kernel = file_kernel(one, self.highres, own)
             stars = self.psf_stars if own is None else False
             found[band] = ForcedPhotometer(kernel, psf_stars=stars, **options)
         return found
@@ -180,6 +190,11 @@ class Inputs:
 
         results = measure_prior(pixels.images, photometers, pixels.prior, segments, sources)
         return Measurement(self, pixels, photometers, segments, results)
+
+
+def short_band(band):
+    """Name of a filter without its instrument."""
+    return str(band).rpartition(".")[2]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -209,6 +224,10 @@ class Measurement:
         table.meta.update(image=paths, highres=str(inputs.highres.path))
         return table
 
+    def products(self, name):
+        """Models (``"model"``) or residuals (``"residual"``), one for each image that was read."""
+        return [getattr(one, f"{name}_image") for one in self.results.values()]
+
     def write_page(self, path):
         """Write the page, of those bands that have data."""
         from miricigale.photometry.page import Measured, write_page
@@ -216,15 +235,21 @@ class Measurement:
 
         measured = []
         for name, result in self.results.items():
-            if "source" not in self.pixels.images[name].meta:
+            image, pulls = self._shown(name)
+            if "source" not in image.meta:
                 continue
             kernel = self.photometers[name].kernel
             if result.psf_stars is not None:
                 kernel = result.psf_stars.kernel
-            kernel = kernel.mean if isinstance(kernel, KernelField) else kernel
-            measured.append(Measured(name, result, self.pixels.images[name], kernel, None))
+            if result.exposures is not None or isinstance(kernel, KernelField):
+                kernel = kernel.mean
+            measured.append(Measured(name, result, image, kernel, pulls))
         confidence, seed = self.inputs.confidence, self.inputs.seed
         write_page(path, measured, self.pixels.prior, self.segments, confidence, seed)
+
+    def _shown(self, band):
+        """The image of a band for the page, and pulls at empty positions, None where the page makes them."""
+        return self.pixels.images[band], None
 
 
 def _blank(shape, wcs):
@@ -235,7 +260,7 @@ def _blank(shape, wcs):
     return Image(data, unit=SURFACE_BRIGHTNESS, wcs=wcs, mask=mask, uncertainty=noise)
 
 
-def _kernel(image, highres, path):
+def file_kernel(image, highres, path):
     """The kernel between two images; that of a file may be of several places."""
     from miricigale.psf import KernelField
 

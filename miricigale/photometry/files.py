@@ -12,6 +12,7 @@ from astropy.table import QTable, Table
 from miricigale.instrument.image import Image
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.error_files import write_ecsv
+from miricigale.photometry.exposure_result import ExposureResults
 from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.offsets import OffsetMap
 from miricigale.photometry.results import ForcedPhotometryResult
@@ -135,6 +136,8 @@ def _write_result(result, path, *, overwrite=False):
     if result.offset_map is not None:
         fields["offset_map"] = result.offset_map.field
         tables["offsets"] = sky_as_angles(result.offset_map.sources)
+    if result.exposures is not None:
+        tables["exposures"] = result.exposures.table
     if result.new_sources is not None:
         tables["new"] = sky_as_angles(result.new_sources)
     for name, field in fields.items():
@@ -167,6 +170,8 @@ def _read_result(path):
         if "offset_map" in text:
             field = _field(text["offset_map"])
             found["offset_map"] = OffsetMap(_table(parts, "offsets"), field, wcs)
+        if "exposures" in parts:
+            found["exposures"] = ExposureResults(QTable(parts.table("exposures")))
         if "new" in parts:
             found["new_sources"] = _table(parts, "new")
         options = {"unit": SURFACE_BRIGHTNESS, "wcs": wcs}

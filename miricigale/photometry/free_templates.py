@@ -144,7 +144,9 @@ def free_templates(fit, fitted):
     other = bank.at_resolution(bank.order[rows[owner]], [one.cutout for one in every])
     owner = owner[other.order]
     fixed = np.array([one.fixed for one in every], bool)[other.order]
-    basis = change_basis(len(rows), owner, np.array([one.light for one in every])[other.order], fixed)
+    basis = change_basis(
+        len(rows), owner, np.array([one.light for one in every])[other.order], fixed
+    )
     images = [fit.arrays.whitened(one) for one in (fit.arrays.flux, *fit.columns)]
     own, projection, _, _ = normal_matrix(other, fit.inverse_sigma, images)
     cross = cross_matrix(bank, other, fit.inverse_sigma).tocsr()[rows]

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from miricigale.instrument.image_files import write_image
+from miricigale.photometry.exposure_files import with_exposures
 from miricigale.photometry.file_inputs import Inputs
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing
@@ -49,7 +50,8 @@ def measure_files(
     ----------
     image : path-like or `~miricigale.photometry.MosaicFile`, or a list of them
         The image, or those of several bands; as `~miricigale.photometry.MosaicFile` with what is not in their
-        headers, such as filters, maps of the noise and PSFs.
+        headers, such as filters, maps of the noise and PSFs. Several exposures (``_cal``) of one filter are
+        fitted together, each with its PSFs by place and roll and its own sky.
     highres : path-like or `~miricigale.photometry.MosaicFile`
         The prior. Its sources are looked at once for all bands.
     segmentation, catalog : path-like, optional
@@ -70,7 +72,8 @@ def measure_files(
     output, page, model, residual : path-like, optional
         Where the table (ECSV or FITS), the HTML page and FITS images of the fitted model (with its
         background) and of the residual are written; not if None. Those of several bands have the
-        name of the filter before their ending. A page has one of its sources beside it, ``NAME-sources.html``.
+        name of the filter before their ending, those of exposures that and the name of the
+        exposure. A page has one of its sources beside it, ``NAME-sources.html``.
     overwrite : bool, optional
         Whether files that are there are replaced.
     seed : int, optional
@@ -108,10 +111,13 @@ def measure_files(
         image, highres, detection=detection, segmentation=segmentation, catalog=catalog,
         kernel=kernel, confidence=confidence, psf_stars=psf_stars, seed=seed, **options,
     )  # fmt: skip
+    inputs = with_exposures(inputs)
     results = {("output", 0): output, ("page", 0): page}
-    for k, one in enumerate(inputs.images):
-        own = one if len(inputs.images) > 1 else None
-        results |= {("model", k): _of_band(model, own), ("residual", k): _of_band(residual, own)}
+    for k, label in enumerate(inputs.labels):
+        results |= {
+            ("model", k): _labelled(model, label),
+            ("residual", k): _labelled(residual, label),
+        }
     results = {key: path for key, path in results.items() if path is not None}
     for (what, _), path in results.items():
         check_output(path, what, overwrite=overwrite, inputs=inputs.paths, **_KINDS[what])
@@ -143,20 +149,19 @@ def measure_files(
         if output is not None:
             with replacing(output, overwrite=overwrite) as partial:
                 write_table(table, partial)
-        for k, result in enumerate(measured.results.values()):
-            for what in {"model", "residual"} & {one for one, _ in results}:
+        for what in {"model", "residual"} & {one for one, _ in results}:
+            for k, image in enumerate(measured.products(what)):
                 with replacing(results[what, k]) as partial:
-                    write_image(getattr(result, f"{what}_image"), partial)
+                    write_image(image, partial)
         if page is not None:
             measured.write_page(page)
         bar.update()
     return table
 
 
-def _of_band(path, file):
-    """The path of what belongs to one of several images, if one is given: with its filter before the ending."""
-    if path is None or file is None:
+def _labelled(path, label):
+    """A path with a label before its ending, if there are both."""
+    if path is None or not label:
         return path
     name, dot, ending = Path(path).name.partition(".")
-    band = str(file.header.filter).rpartition(".")[2]
-    return Path(path).with_name(f"{name}_{band}{dot}{ending}")
+    return Path(path).with_name(f"{name}_{label}{dot}{ending}")

@@ -229,7 +229,11 @@ class MosaicFile:
         good = self.filter is None or name in (None, self.filter)
         check_that(good, "filter", f"{name!r}, the filter in {self.path}", repr(self.filter))
         # a mosaic of our own has a list of angles
-        stated = {"filter": self.filter or name, "pa_aper": get("PA_APER")}
+        stated = {
+            "filter": self.filter or name,
+            "pa_aper": get("PA_APER"),
+            "subarray": get("SUBARRAY"),
+        }
         stated = {key: meta.get(key) if value is None else value for key, value in stated.items()}
         return MosaicHeader(
             index=index,

@@ -49,7 +49,11 @@ def write_page(path, bands, highres, segments, confidence, seed):
     ``bands`` are what was measured (`Measured`), ``highres`` and ``segments`` (int array) the prior; upper limits
     are of the ``confidence``, and ``seed`` that of the empty positions.
     """
-    bands = [b._replace(pulls=empty_pulls(b.result, b.kernel, seed)) for b in bands]
+    tested = []
+    for one in bands:
+        pulls = empty_pulls(one.result, one.kernel, seed) if one.pulls is None else one.pulls
+        tested.append(one._replace(pulls=pulls))
+    bands = tested
     names = ", ".join(one.name for one in bands)
     files = ", ".join(Path(one.image.meta["source"]).name for one in bands)
     title, prior = f"Forced photometry: {names}", Path(highres.meta["source"]).name
@@ -79,6 +83,11 @@ def write_page(path, bands, highres, segments, confidence, seed):
         figure, axes = new_figure(1, 1, size=(5.6, 3.4))
         plot_pulls(one.pulls, ax=axes[0, 0], limit=6.0).set_xlabel("flux / error")
         page.figure("figure", figure, n=len(one.pulls), band=one.name)
+    joint = [one for one in bands if one.result.exposures is not None]
+    if joint:
+        page.section("exposures")
+    for one in joint:
+        page.table("table", _exposure_rows(one.result.exposures.table), band=one.name)
     shown = [one for one in bands if one.result.psf_stars is not None]
     if shown:
         page.section("stars")
@@ -124,6 +133,17 @@ def _notices(page, bands, highres):
     level = highres.meta.get("sky_over_noise", 0.0)
     if abs(level) > 1:
         page.notice("sky", level=level)
+
+
+def _exposure_rows(table):
+    """Rows of the table of exposures that were fitted together."""
+    rows = []
+    for one in table:
+        row = {name: getattr(one[name], "value", one[name]) for name in table.colnames}
+        offset = f"{row['offset_east']:+.3f}, {row['offset_north']:+.3f} ± {row['offset_err']:.3f}"
+        sky = f"{row['sky']:.5g} ± {row['sky_err']:.1g}"
+        rows.append(row | {"source": Path(row["source"]).name, "offset": offset, "level": sky})
+    return rows
 
 
 def _pairs(meta):
@@ -346,7 +366,7 @@ def _text(value):
 
 def empty_pulls(result, kernel, seed):
     """Flux over error of points where a `ForcedPhotometryResult` has none; None without a PSF or such places."""
-    empty = _empty_positions(result, seed)
+    empty = empty_positions(result, seed)
     if kernel.target is None or not len(empty):
         return None
     blank = ForcedPhotometer(kernel, template="psf")
@@ -356,7 +376,7 @@ def empty_pulls(result, kernel, seed):
         return blank.measure(result.residual_image, catalog=empty).snr
 
 
-def _empty_positions(result, seed):
+def empty_positions(result, seed):
     """
     Random positions at which a measurement left no light: ``id`` and ``sky``.
 

@@ -3,6 +3,8 @@ from ._stpsf import stpsf_psf as stpsf_psf
 from .by_filter import MODEL_FILTERS as MODEL_FILTERS
 from .by_filter import checked_psf as checked_psf
 from .by_filter import filter_psf as filter_psf
+from .distorted import imager_kernels as imager_kernels
+from .distorted import undistorted_psf as undistorted_psf
 from .effects import EFFECTS as EFFECTS
 from .effects import cruciform_fraction as cruciform_fraction
 from .energy import encircled_energy as encircled_energy
