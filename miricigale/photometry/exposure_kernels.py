@@ -59,7 +59,7 @@ class ExposureKernels:
                 raise argument_error("kernel", "kernels with their PSFs", "one without")
 
     @classmethod
-    def from_images(cls, images, highres, highres_psf=None, *, n_psfs=9):
+    def from_images(cls, images, highres, highres_psf=None, *, n_psfs=9, **options):
         """
         Make the kernels of MIRI exposures from the model PSFs of their places and rolls.
 
@@ -74,6 +74,8 @@ class ExposureKernels:
             Its PSF, on the sky; by default the model of its filter.
         n_psfs : int, optional
             Places on the array (see `~miricigale.psf.imager_kernels`).
+        **options
+            Those of `~miricigale.psf.miri_psf`.
 
         Returns
         -------
@@ -103,7 +105,7 @@ class ExposureKernels:
             else:
                 field = imager_kernels(
                     sharp, wcs=image.wcs, pa=pa * u.deg, pixel_scale=scale, grid_angle=turn,
-                    n_psfs=n_psfs, **alike,
+                    n_psfs=n_psfs, **alike, **options,
                 )  # fmt: skip
                 made.append((alike, pa, image.wcs, field))
                 kernels.append(field)

@@ -255,6 +255,8 @@ def _noise_check(white, model, part):
     if np.count_nonzero(free) < _FEWEST_PIXELS:
         return np.nan, np.nan
     rms = float(mad_std(white[free]))
+    if not rms > 0:
+        return rms, np.nan
     calm = free & (np.abs(white) < 5 * rms)
     products = []
     for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
