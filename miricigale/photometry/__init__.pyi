@@ -13,6 +13,8 @@ from .detection import detection_purity as detection_purity
 from .detection_image import chi_image as chi_image
 from .error_calibration import ErrorCalibration as ErrorCalibration
 from .error_model import ErrorModel as ErrorModel
+from .exposure_kernels import ExposureKernels as ExposureKernels
+from .exposure_result import ExposureResults as ExposureResults
 from .fields import SmoothField as SmoothField
 from .flags import ForcedFlags as ForcedFlags
 from .forced import ForcedPhotometer as ForcedPhotometer

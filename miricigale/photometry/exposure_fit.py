@@ -90,10 +90,14 @@ class ExposurePart:
         terms = legendre_terms(x, y, area.shape, order)
         return [np.asarray(area * term, np.float32) for term in terms]
 
-    def moved(self, shift):
-        """The same with its templates moved by some pixels, (2,) or (k, 2)."""
+    def moved(self, shift, like=None):
+        """
+        The same with its templates moved by some pixels, (2,) or (k, 2).
+
+        Templates that stay where they are in the bank of ``like``, another `ExposurePart`, are taken from there.
+        """
         bank = self.bank.shifted(shift)
-        self.bank.forget()
+        bank.reuse((self if like is None else like).bank)
         return dataclasses.replace(self, bank=bank)
 
 

@@ -41,6 +41,19 @@ class ExposureKernels:
     ------
     ValueError
         If there is none, one is something else or has no PSFs, or they differ in form.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.photometry import ExposureKernels, ForcedPhotometer
+    >>> from miricigale.psf import MatchingKernel, gaussian_psf
+    >>> form = {"pixel_scale": 0.06 * u.arcsec, "fov": 3 * u.arcsec}
+    >>> sharp = gaussian_psf(0.2 * u.arcsec, **form)
+    >>> wide = [gaussian_psf(width * u.arcsec, **form) for width in (0.5, 0.6)]
+    >>> kernels = ExposureKernels([MatchingKernel.from_psfs(sharp, one) for one in wide])
+    >>> len(kernels)
+    2
+    >>> photometer = ForcedPhotometer(kernels)
     """
 
     kernels: tuple

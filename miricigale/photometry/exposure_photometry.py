@@ -304,7 +304,9 @@ class _Joint:
             found[fixed] = 0.0
             step = np.abs(found - self._shifts).max()
             self._shifts = self._shifts + np.clip(found - self._shifts, -1.0, 1.0)
-            moved = [part.moved(shift) for part, shift in zip(plain, self._shifts, strict=True)]
+            moved = []
+            for part, shift, like in zip(plain, self._shifts, fit.parts, strict=True):
+                moved.append(part.moved(shift, like))
             fit = self._fit(moved)
             if step < _SHIFT_DONE:
                 break
@@ -371,7 +373,7 @@ class _Joint:
 
     def _with_points(self, new_xy):
         """Positions of new sources, refined, and the fit with them."""
-        fit = self._fit(self._added(new_xy), new_xy)
+        fit = self._fit(self._added(new_xy, self._parts), new_xy)
         for _ in range(_REFINED):
             step, error, _ = self._offsets(fit)
             rows = np.arange(self._n, self._n + len(new_xy))
@@ -379,11 +381,11 @@ class _Joint:
             good = error[rows] < 0.25 * width
             new_xy = new_xy.copy()
             new_xy[good] += np.clip(step[rows][good], -width, width)
-            fit = self._fit(self._added(new_xy), new_xy)
+            fit = self._fit(self._added(new_xy, fit.parts), new_xy)
         return new_xy, fit
 
-    def _added(self, new_xy):
-        """The exposures with points at positions of the plane among their templates."""
+    def _added(self, new_xy, like):
+        """The exposures with points at positions of the plane; templates that are those of ``like`` are kept."""
         sky = self._plane.wcs.pixel_to_world(*new_xy.T).icrs
         added = []
         for k, (part, place, grid) in enumerate(
@@ -395,6 +397,7 @@ class _Joint:
             xy = xy[here]
             poly = local_maps(xy, np.full(len(xy), place.margin / 2), wcs, grid)
             bank = part.bank.with_points(xy + self._shifts[k], poly)
+            bank.reuse(like[k].bank)
             source = np.concatenate([part.source, self._n + here])
             added.append(ExposurePart(part.arrays, part.settings, bank, source))
         return added
@@ -475,10 +478,11 @@ class _Joint:
             change = np.abs(new - own).max()
             own = new
             moved = []
-            for part in plain:
+            for part, like in zip(plain, fit.parts, strict=True):
                 inverse = np.empty((len(part.source), 2, 2))
                 inverse[part.bank.order] = np.linalg.inv(self._turns(part, part.bank.xy))
-                moved.append(part.moved(np.einsum("kij,kj->ki", inverse, own[part.source])))
+                steps = np.einsum("kij,kj->ki", inverse, own[part.source])
+                moved.append(part.moved(steps, like))
             fit = self._fit(moved)
             if change < _OFFSET_FLOOR / 2:
                 break

@@ -50,7 +50,32 @@ class ExposureResults:
         the exposure from the templates, arcsec; fitted with ``max_shift``), ``noise`` (robust rms of the residual
         over the stated error, in pixels without sources) and ``correlation`` (of neighboring pixels there).
     model_images, residual_images : tuple of `~astropy.nddata.CCDData`
-        MJy/sr, on the pixels of each exposure; the model has its sky, the residual its errors and mask.
+        MJy/sr, on the pixels of each exposure; the model has its sky, the residual its errors and mask. Empty
+        if the result was read from a file.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import imager_wcs
+    >>> from miricigale.photometry import ForcedPhotometer
+    >>> from miricigale.psf import gaussian_psf
+    >>> star = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> rng = np.random.default_rng(1)
+    >>> exposures = []
+    >>> for roll, sky in ((20, 3.0), (50, 5.0)):
+    ...     wcs = imager_wcs(star[0], roll * u.deg, subarray="SUB64")
+    ...     data = sky + rng.normal(0, 0.1, (64, 72))
+    ...     error = StdDevUncertainty(np.full(data.shape, 0.1))
+    ...     exposures.append(CCDData(data, unit="MJy/sr", wcs=wcs, uncertainty=error))
+    >>> psf = gaussian_psf(0.5 * u.arcsec, pixel_scale=0.06 * u.arcsec, fov=3 * u.arcsec)
+    >>> result = ForcedPhotometer(psf=psf).measure(exposures, star)
+    >>> result.exposures
+    <ExposureResults of 2 exposures>
+    >>> result.exposures.table["sky"].round(2)
+    <Quantity [3., 5.] MJy / sr>
     """
 
     table: QTable

@@ -48,7 +48,8 @@ class ForcedPhotometer(Interactive):
         measured: that of a drizzled mosaic for a drizzled mosaic. With kernels of several places
         each source has that of its own; shapes are fitted with the mean of the sources. Of a kernel
         without PSFs sources are the segments as they are (``template="cutout"``, ``wings=False``),
-        which a warning says; those without a segment are not measured.
+        which a warning says; those without a segment are not measured. For exposures that are fitted together
+        a list of kernels, or `ExposureKernels`, one for each.
     psf, highres_psf : `~photutils.psf.ImagePSF`, str or other, optional
         In place of the kernel the PSFs of the image and of the high-resolution image, in the forms of
         `~miricigale.psf.MatchingKernel.from_psfs`, which makes the kernel. Of an image without a
@@ -228,7 +229,9 @@ class ForcedPhotometer(Interactive):
         ----------
         image : `~astropy.nddata.CCDData`, path-like or other (see `as_mosaic`)
             The image, in units of surface brightness or of the flux in a pixel, background subtracted unless
-            it is fitted, with WCS, uncertainty and mask. Any pixel scale and orientation.
+            it is fitted, with WCS, uncertainty and mask. Any pixel scale and orientation. A list of exposures of
+            one filter is fitted together, each on its own pixels and with a sky of its own (a polynomial of
+            ``background_order``, a constant for None).
         highres : `~astropy.nddata.CCDData`, path-like or other, optional
             The high-resolution image, background subtracted, on pixels of the kernel (or the catalog,
             where there is none). Needed for cutouts; without it the kernel's grid is taken to be north up.

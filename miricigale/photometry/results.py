@@ -144,7 +144,7 @@ class ForcedPhotometryResult(Tabular):
         ``chi2``. None without a second pass.
     psf_stars : `~miricigale.photometry.stars.KernelStars` or None
         The stars that corrected the PSFs, and the corrected kernel; None where it was not asked for.
-    exposures : `~miricigale.photometry.exposure_result.ExposureResults` or None
+    exposures : `~miricigale.photometry.ExposureResults` or None
         Of a fit of exposures their sky levels, shifts and noise, and the model and the residual of each;
         ``model_image`` and ``residual_image`` are then weighted means of nearest pixels, for pictures, on which
         ``x`` and ``y`` are. None for one image.

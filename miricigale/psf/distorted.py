@@ -40,7 +40,7 @@ def undistorted_psf(psf):
     >>> from miricigale.psf import miri_psf, undistorted_psf
     >>> psf = miri_psf("F1500W", position=(1000, 1000), fov=4 * u.arcsec)
     >>> print(f"{psf.pixel_scale:.4f}, {undistorted_psf(psf).pixel_scale:.4f}")
-    0.1094 arcsec, 0.1109 arcsec
+    0.1099 arcsec, 0.1109 arcsec
     """
     if psf.frame != "detector" or psf.position is None:
         raise argument_error("psf", "one of a place in the detector frame", repr(psf.frame))

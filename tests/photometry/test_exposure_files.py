@@ -14,8 +14,13 @@ from helpers.errors import refuses
 from helpers.mosaics import CENTER, FINE, LO, disks, kernel, lattice, picture, places, render
 from miricigale.instrument import Exposure, imager_wcs
 from miricigale.instrument.image_files import read_image, write_image
-from miricigale.photometry import ForcedPhotometer, MosaicFile, SourceTemplates, measure_files
-from miricigale.photometry.exposure_kernels import ExposureKernels
+from miricigale.photometry import (
+    ExposureKernels,
+    ForcedPhotometer,
+    MosaicFile,
+    SourceTemplates,
+    measure_files,
+)
 from miricigale.psf import gaussian_psf, miri_psf_grid
 from miricigale.scene import Scene
 
