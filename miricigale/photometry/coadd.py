@@ -33,7 +33,7 @@ class Plane:
         ``images`` are pairs of coordinates and shape, one for each exposure.
         """
         shape = wcs.pixel_shape[::-1]
-        pixels = tuple(_nearest(wcs, shape, other, size) for other, size in images)
+        pixels = tuple(_nearest(wcs, shape, image_wcs, size) for image_wcs, size in images)
         return cls(wcs, shape, pixels)
 
     def mean(self, images, weights):
@@ -50,27 +50,28 @@ class Plane:
         mean, weight : `~numpy.ndarray`, shape (ny, nx)
             The mean, zero where no exposure has weight, and the sum of the weights.
         """
-        total, weight = np.zeros(self.shape), np.zeros(self.shape)
-        for image, own, pixels in zip(images, weights, self.pixels, strict=True):
-            here = pixels >= 0
-            values = np.asarray(own, float).ravel()[pixels[here]]
-            total[here] += values * np.asarray(image, float).ravel()[pixels[here]]
-            weight[here] += values
+        total = np.zeros(self.shape)
+        weight = np.zeros(self.shape)
+        for image, image_weight, pixels in zip(images, weights, self.pixels, strict=True):
+            shown = pixels >= 0
+            values = np.asarray(image_weight, float).ravel()[pixels[shown]]
+            total[shown] += values * np.asarray(image, float).ravel()[pixels[shown]]
+            weight[shown] += values
         mean = np.divide(total, weight, out=np.zeros(self.shape), where=weight > 0)
         return mean, weight
 
 
-def _nearest(wcs, shape, other, size):
+def _nearest(wcs, shape, image_wcs, size):
     """Flat numbers of the pixels of an image that are nearest to those of a plane; -1 beyond the image."""
     nodes = [np.arange(0, n + _STEP, _STEP) for n in shape]
     y, x = np.meshgrid(*nodes, indexing="ij")
-    there = pixel_to_pixel(wcs, other, x.ravel(), y.ravel())
+    positions = pixel_to_pixel(wcs, image_wcs, x.ravel(), y.ravel())
     rows, columns = np.indices(shape, np.float32)
     at = np.stack([rows, columns]) / _STEP
-    found = []
-    for values in there:
+    pixel = []
+    for values in positions:
         values = np.asarray(values, float).reshape(x.shape)
-        found.append(scipy.ndimage.map_coordinates(values, at, order=1))
-    column, row = np.nan_to_num(np.rint(found), nan=-1.0).astype(int)
+        pixel.append(scipy.ndimage.map_coordinates(values, at, order=1))
+    column, row = np.nan_to_num(np.rint(pixel), nan=-1.0).astype(int)
     inside = (column >= 0) & (column < size[1]) & (row >= 0) & (row < size[0])
     return np.where(inside, row * size[1] + column, -1).astype(np.int32)

@@ -27,9 +27,9 @@ def with_exposures(inputs):
     if len(inputs.images) == 1:
         return inputs
     counts = collections.Counter(inputs.bands)
-    several = {band for band, n in counts.items() if n > 1}
-    repeated = [one for one in inputs.images if one.header.filter in several]
-    if not repeated or not all(one.header.exposure for one in repeated):
+    repeated_bands = {band for band, n in counts.items() if n > 1}
+    repeated_files = [file for file in inputs.images if file.header.filter in repeated_bands]
+    if not repeated_files or not all(file.header.exposure for file in repeated_files):
         return inputs
     values = {field.name: getattr(inputs, field.name) for field in dataclasses.fields(inputs)}
     return ExposureInputs(**values)
@@ -42,20 +42,20 @@ class ExposureInputs(Inputs):
     @property
     def groups(self):
         """Numbers of the images of each filter: dict of str to list of int."""
-        found = {}
+        groups = {}
         for k, band in enumerate(self.bands):
-            found.setdefault(band, []).append(k)
-        return found
+            groups.setdefault(band, []).append(k)
+        return groups
 
     @property
     def labels(self):
         """As of `Inputs`, with the names of the exposures."""
         labels = []
         for band, rows in self.groups.items():
-            several = len(self.groups) > 1
+            many_bands = len(self.groups) > 1
             for k in rows:
                 name = Path(str(self.images[k].path)).name.partition(".")[0]
-                parts = [short_band(band)] if several else []
+                parts = [short_band(band)] if many_bands else []
                 if len(rows) > 1:
                     parts.append(name)
                 labels.append("_".join(parts))
@@ -83,43 +83,45 @@ class ExposureInputs(Inputs):
             raise argument_error(
                 "prior, images", "None for exposures, which are read whole", "parts"
             )
-        found = {}
+        images_of_band = {}
         for band, rows in self.groups.items():
             read = [self.images[k].read() for k in rows]
-            found[band] = read if len(read) > 1 else read[0]
-        return Pixels(self.highres.read(), [one.read() for one in self.detection], found)
+            images_of_band[band] = read if len(read) > 1 else read[0]
+        return Pixels(self.highres.read(), [file.read() for file in self.detection], images_of_band)
 
     def photometers(self, n_threads=None):
         """As of `Inputs`; the kernels of exposures are those of their places and rolls."""
-        alone = [rows[0] for rows in self.groups.values() if len(rows) == 1]
-        found = {}
-        if alone:
-            plain = dataclasses.replace(
+        single = [rows[0] for rows in self.groups.values() if len(rows) == 1]
+        photometers = {}
+        if single:
+            mosaics = dataclasses.replace(
                 self,
-                images=tuple(self.images[k] for k in alone),
-                kernels=tuple(self.kernels[k] for k in alone),
+                images=tuple(self.images[k] for k in single),
+                kernels=tuple(self.kernels[k] for k in single),
             )
-            found = Inputs.photometers(plain, n_threads)
+            photometers = Inputs.photometers(mosaics, n_threads)
         from miricigale.photometry.forced import ForcedPhotometer
 
         options = self.fit_options(n_threads)
         for band, rows in self.groups.items():
             if len(rows) > 1:
-                found[band] = ForcedPhotometer(self._kernels(rows), psf_stars=False, **options)
-        return {band: found[band] for band in self.groups}
+                photometers[band] = ForcedPhotometer(
+                    self._kernels(rows), psf_stars=False, **options
+                )
+        return {band: photometers[band] for band in self.groups}
 
     def _kernels(self, rows):
         """Kernels of some exposures: of files, or models by place and roll."""
         files = [self.images[k] for k in rows]
-        given = [self.kernels[k] is not None or self.images[k].psf is not None for k in rows]
-        modeled = files[0].header.filter.startswith("miri.") and not any(given)
+        has_own = [self.kernels[k] is not None or self.images[k].psf is not None for k in rows]
+        modeled = files[0].header.filter.startswith("miri.") and not any(has_own)
         if modeled:
             sharp = image_psf(self.highres, "highres_psf")
-            headers = [one.header for one in files]
+            headers = [file.header for file in files]
             return ExposureKernels.from_images(headers, self.highres.header, sharp)
         kernels = []
-        for k, one in zip(rows, files, strict=True):
-            kernels.append(file_kernel(one, self.highres, self.kernels[k]))
+        for k, file in zip(rows, files, strict=True):
+            kernels.append(file_kernel(file, self.highres, self.kernels[k]))
         return ExposureKernels(kernels)
 
     def measure(self, pixels, photometers, segments, sources):
@@ -135,13 +137,13 @@ class ExposureMeasurement(Measurement):
 
     def products(self, name):
         """Models or residuals, one for each image in the order of the labels."""
-        found = []
+        products = []
         for result in self.results.values():
             if result.exposures is None:
-                found.append(getattr(result, f"{name}_image"))
+                products.append(getattr(result, f"{name}_image"))
             else:
-                found += getattr(result.exposures, f"{name}_images")
-        return found
+                products += getattr(result.exposures, f"{name}_images")
+        return products
 
     def _shown(self, band):
         """The first exposure with a name for all, and pulls of points fitted to all residuals."""

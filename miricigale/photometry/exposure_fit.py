@@ -78,8 +78,8 @@ class ExposurePart:
     def gather(self, n):
         """Matrix, (n, k), that sums the bank's rows by source."""
         k = len(self.source)
-        where = self.row_source, np.arange(k)
-        return scipy.sparse.coo_array((np.ones(k), where), shape=(n, k)).tocsr()
+        place = self.row_source, np.arange(k)
+        return scipy.sparse.coo_array((np.ones(k), place), shape=(n, k)).tocsr()
 
     def sky_columns(self, order):
         """Images of the terms of the sky: a polynomial of an order, in uJy per pixel for 1 MJy/sr."""
@@ -164,18 +164,28 @@ class ExposureFit:
     """
 
     def __init__(self, parts, settings, xy, scale, order, gradients=None):
-        self.parts, self.settings = parts, settings
-        self.xy, self.scale, self.order = xy, scale, order
+        self.parts = parts
+        self.settings = settings
+        self.xy = xy
+        self.scale = scale
+        self.order = order
         self.free = None
         self._solve(gradients)
 
     def _solve(self, gradients):
         n = len(self.xy)
         matrix = scipy.sparse.csr_array((n, n))
-        correction, rhs = np.zeros(n), np.zeros(n)
-        self.light, self.power = np.zeros((n, 2)), np.zeros(n)
-        self.n_exposures, self.noisy = np.zeros(n, int), np.ones(n, bool)
-        borders, corners, corner_rhs, self.places, n_common = [], [], [], [], 0
+        correction = np.zeros(n)
+        rhs = np.zeros(n)
+        self.light = np.zeros((n, 2))
+        self.power = np.zeros(n)
+        self.n_exposures = np.zeros(n, int)
+        self.noisy = np.ones(n, bool)
+        borders = []
+        corners = []
+        corner_rhs = []
+        self.places = []
+        n_common = 0
         for k, part in enumerate(self.parts):
             columns = part.sky_columns(self.order)
             places = {"sky": slice(n_common, n_common + len(columns))}
@@ -184,24 +194,25 @@ class ExposureFit:
                 places["shift"] = slice(places["sky"].stop, n_common + len(columns))
             n_common += len(columns)
             self.places.append(places)
-            white = [part.arrays.whitened(one) for one in columns]
+            white = [part.arrays.whitened(column) for column in columns]
             data = part.arrays.whitened(part.arrays.flux)
-            own, projection, power, light = normal_matrix(
+            square, projection, power, light = normal_matrix(
                 part.bank, part.inverse_sigma, [data, *white]
             )
-            gather, source = part.gather(n), part.row_source
+            gather = part.gather(n)
+            source = part.row_source
             light = light / part.bank.full_light()[:, None]
             with np.errstate(divide="ignore", invalid="ignore"):
                 excess = part.bank.noise_terms() / np.where(power > 0, power, np.inf)
-            matrix = matrix + gather @ own @ gather.T
-            correction += gather @ (np.minimum(excess, _MAX_EXCESS) * own.diagonal())
+            matrix = matrix + gather @ square @ gather.T
+            correction += gather @ (np.minimum(excess, _MAX_EXCESS) * square.diagonal())
             rhs += gather @ projection[:, 0]
             borders.append(gather @ projection[:, 1:])
             corners.append([[inner(a, b) for b in white] for a in white])
             corner_rhs += [inner(a, data) for a in white]
-            seen = light[:, 1] >= MIN_COVERAGE
-            self.n_exposures[source[seen]] += 1
-            self.noisy[source[seen & (excess <= _MAX_EXCESS)]] = False
+            is_seen = light[:, 1] >= MIN_COVERAGE
+            self.n_exposures[source[is_seen]] += 1
+            self.noisy[source[is_seen & (excess <= _MAX_EXCESS)]] = False
             best = light[:, 1] > self.light[source, 1]
             self.light[source[best]] = light[best]
             self.power[source[best]] = power[best]
@@ -211,7 +222,8 @@ class ExposureFit:
         self.rows = np.flatnonzero(rows & ~self.degenerate)
         matrix = (matrix - scipy.sparse.diags_array(correction)).tocsr()
         matrix = matrix[self.rows][:, self.rows]
-        self.fit, self.flux = None, np.zeros(n)
+        self.fit = None
+        self.flux = np.zeros(n)
         if len(self.rows):
             border = np.concatenate(borders, axis=1)[self.rows]
             corner = scipy.linalg.block_diag(*corners)
@@ -227,11 +239,11 @@ class ExposureFit:
 
     def cutouts(self):
         """The light of each source (`~miricigale.photometry.cutouts.Cutout`), None for points."""
-        found = [None] * len(self.xy)
+        cutouts = [None] * len(self.xy)
         for part in self.parts:
             for source, light in zip(part.source, part.bank.sources.cutout, strict=True):
-                found[source] = light
-        return found
+                cutouts[source] = light
+        return cutouts
 
     def model(self, k):
         """The sources on one exposure in uJy per pixel, without its sky."""
@@ -239,20 +251,21 @@ class ExposureFit:
         layers = [(part.bank, self.flux[part.row_source])]
         if self.free is not None:
             flux, change = self.free.amplitudes
-            every = np.zeros(len(self.flux))
-            every[self.rows] = flux
-            bank, which = self.free.bank[k]
-            layers = [(part.bank, every[part.row_source]), (bank, change[which])]
+            row_flux = np.zeros(len(self.flux))
+            row_flux[self.rows] = flux
+            bank, numbers = self.free.bank[k]
+            layers = [(part.bank, row_flux[part.row_source]), (bank, change[numbers])]
         image = part.arrays.new()
         for bank, flux in layers:
             for block in bank.blocks():
-                some = flux[block.first : block.last]
-                add_model(image, block.values, block.box, block.start, some)
+                part_flux = flux[block.first : block.last]
+                add_model(image, block.values, block.box, block.start, part_flux)
         return image
 
     def sky(self, k):
         """The sky of one exposure in uJy per pixel."""
-        part, values = self.parts[k], self.common[self.places[k]["sky"]]
+        part = self.parts[k]
+        values = self.common[self.places[k]["sky"]]
         image = part.arrays.new()
         for column, value in zip(part.sky_columns(self.order), values, strict=True):
             image += np.float32(value) * column
@@ -273,32 +286,35 @@ class ExposureFit:
         size_scatter = self.settings.errors.size_scatter
         if self.fit is None or size_scatter is None:
             return
-        known = not_fitted(len(self.xy))
-        known[: len(fitted)] = fitted
+        shapes = not_fitted(len(self.xy))
+        shapes[: len(fitted)] = fitted
         # positions move no flux to first order
-        known["covariance"][:, 1:3] = 0.0
-        known["covariance"][:, :, 1:3] = 0.0
-        known = known[self.rows]
-        changes, noise = self._changes(known, size_scatter)
+        shapes["covariance"][:, 1:3] = 0.0
+        shapes["covariance"][:, :, 1:3] = 0.0
+        shapes = shapes[self.rows]
+        changes, noise = self._changes(shapes, size_scatter)
         if not (changes or noise.any()):
             return
         owner = np.array([row for row, _ in changes], int)
-        fixed = np.array([one.fixed for _, one in changes], bool)
-        light = np.array([one.light for _, one in changes])
-        n, n_changes = len(self.rows), len(changes)
+        fixed = np.array([change.fixed for _, change in changes], bool)
+        light = np.array([change.light for _, change in changes])
+        n = len(self.rows)
+        n_changes = len(changes)
         basis = change_basis(n, owner, light, fixed)
-        own = scipy.sparse.csr_array((n_changes, n_changes))
+        squares = scipy.sparse.csr_array((n_changes, n_changes))
         cross = scipy.sparse.csr_array((n, n_changes))
-        rhs, borders, banks = np.zeros(n_changes), [], []
+        rhs = np.zeros(n_changes)
+        borders = []
+        banks = []
         for k, part in enumerate(self.parts):
-            bank, which = self._change_bank(part, changes)
-            banks.append((bank, which))
+            bank, numbers = self._change_bank(part, changes)
+            banks.append((bank, numbers))
             data = part.arrays.whitened(part.arrays.flux)
             columns = part.sky_columns(self.order)
-            white = [part.arrays.whitened(one) for one in columns]
+            white = [part.arrays.whitened(change) for change in columns]
             square, projection, _, _ = normal_matrix(bank, part.inverse_sigma, [data, *white])
-            place = _selection(which, n_changes)
-            own = own + place @ square @ place.T
+            place = _selection(numbers, n_changes)
+            squares = squares + place @ square @ place.T
             cross = cross + self._cross(part, bank, place, None)
             rhs += place @ projection[:, 0]
             border = np.zeros((n_changes, len(self.fit.corner_rhs)))
@@ -307,8 +323,8 @@ class ExposureFit:
         border = basis.T @ np.concatenate([self.fit.border, np.sum(borders, axis=0)])
         owner = owner[~fixed]
         prior = np.concatenate([np.zeros(n), self.fit.flux[owner] ** -2.0])
-        matrix = joined_matrix(self.fit.matrix, cross, own, basis)
-        free = LinearFit(
+        matrix = joined_matrix(self.fit.matrix, cross, squares, basis)
+        solution = LinearFit(
             (matrix + scipy.sparse.diags_array(prior)).tocsr(),
             basis.T @ np.concatenate([self.fit.rhs, rhs]),
             border,
@@ -316,25 +332,30 @@ class ExposureFit:
             self.fit.corner_rhs,
         )
         places = self.xy[self.rows[[row for row, _ in changes]]].reshape(-1, 2)
-        self.free = JointChanges(free, banks, n, basis, owner, prior, noise, places)
+        self.free = JointChanges(solution, banks, n, basis, owner, prior, noise, places)
         self.flux[self.rows] = self.free.flux
 
-    def _changes(self, known, size_scatter):
+    def _changes(self, shapes, size_scatter):
         """Changes of templates with the number of their row, and the variance of ln flux of each row."""
-        kernel, plain = self.settings.mean_kernel, self.fit
+        kernel = self.settings.mean_kernel
+        fit = self.fit
         finder = TemplateChanges(kernel.source, kernel.target, size_scatter)
-        snr = np.abs(plain.flux) * np.sqrt(plain.matrix.diagonal())
-        wanted = np.isfinite(known["parameters"][:, 0]) & (snr > LEAST) & (plain.flux > 0)
+        snr = np.abs(fit.flux) * np.sqrt(fit.matrix.diagonal())
+        wanted = np.isfinite(shapes["parameters"][:, 0]) & (snr > LEAST) & (fit.flux > 0)
         wanted = np.flatnonzero(wanted)
         light = self.cutouts()
 
         def find(row):
-            return finder.of(light[self.rows[row]], known[row], LEAST / snr[row])
+            return finder.of(light[self.rows[row]], shapes[row], LEAST / snr[row])
 
-        found = parallel_map(find, wanted, executor=self.parts[0].bank.executor)
+        results = parallel_map(find, wanted, executor=self.parts[0].bank.executor)
         noise = np.zeros(len(self.rows))
-        noise[wanted] = [variance for _, variance in found]
-        changes = [(row, one) for row, (some, _) in zip(wanted, found, strict=True) for one in some]
+        noise[wanted] = [variance for _, variance in results]
+        changes = [
+            (row, change)
+            for row, (row_changes, _) in zip(wanted, results, strict=True)
+            for change in row_changes
+        ]
         return changes, noise
 
     def _change_bank(self, part, changes):
@@ -342,15 +363,15 @@ class ExposureFit:
         place = np.full(len(self.xy), -1)
         place[part.source] = np.arange(len(part.source))
         local = place[self.rows[[row for row, _ in changes]]]
-        here = np.flatnonzero(local >= 0)
-        bank = part.bank.at_resolution(local[here], [changes[j][1].cutout for j in here])
-        return bank, here[bank.order]
+        shown = np.flatnonzero(local >= 0)
+        bank = part.bank.at_resolution(local[shown], [changes[j][1].cutout for j in shown])
+        return bank, shown[bank.order]
 
     def _cross(self, part, bank, place, correlation):
         """Products of an exposure's templates and changes, rows and changes of the joint fit."""
-        found = cross_matrix(part.bank, bank, part.inverse_sigma, correlation).tocsr()
+        products = cross_matrix(part.bank, bank, part.inverse_sigma, correlation).tocsr()
         gather = part.gather(len(self.xy))[self.rows]
-        return gather @ found @ place.T
+        return gather @ products @ place.T
 
     def noise_filling(self):
         """
@@ -361,43 +382,47 @@ class ExposureFit:
         """
         if all(part.correlation is None for part in self.parts):
             return None
-        n, solution = len(self.rows), self.fit if self.free is None else self.free.fit
-        n_common = len(solution.corner_rhs)
-        n_changes = 0 if self.free is None else self.free.basis.shape[0] - n
+        n = len(self.rows)
+        n_common = len(self.fit.corner_rhs)
+        n_changes = 0
+        if self.free is not None:
+            n_changes = self.free.basis.shape[0] - n
         middle = scipy.sparse.csr_array((n, n))
-        own = scipy.sparse.csr_array((n_changes, n_changes))
+        squares = scipy.sparse.csr_array((n_changes, n_changes))
         cross = scipy.sparse.csr_array((n, n_changes))
-        border, more = np.zeros((n, n_common)), np.zeros((n_changes, n_common))
+        border = np.zeros((n, n_common))
+        change_border = np.zeros((n_changes, n_common))
         corner = np.zeros((n_common, n_common))
         for k, part in enumerate(self.parts):
             correlation = part.correlation
             correlation = np.ones((1, 1)) if correlation is None else correlation
-            white = [part.arrays.whitened(one) for one in part.sky_columns(self.order)]
-            spread = [_spread(one, correlation) for one in white]
-            sky, gather = self.places[k]["sky"], part.gather(len(self.xy))[self.rows]
+            white = [part.arrays.whitened(column) for column in part.sky_columns(self.order)]
+            spread = [_spread(column, correlation) for column in white]
+            sky = self.places[k]["sky"]
+            gather = part.gather(len(self.xy))[self.rows]
             square, side = sandwich_matrix(part.bank, part.inverse_sigma, correlation, spread)
             middle = middle + gather @ square @ gather.T
             border[:, sky] = gather @ side
             corner[sky, sky] = [[inner(a, b) for b in spread] for a in white]
             if self.free is None:
                 continue
-            bank, which = self.free.bank[k]
-            place = _selection(which, n_changes)
+            bank, numbers = self.free.bank[k]
+            place = _selection(numbers, n_changes)
             square, side = sandwich_matrix(bank, part.inverse_sigma, correlation, spread)
-            own = own + place @ square @ place.T
-            more[:, sky] = place @ side
+            squares = squares + place @ square @ place.T
+            change_border[:, sky] = place @ side
             cross = cross + self._cross(part, bank, place, correlation)
         if self.free is None:
             return middle, border, corner
         basis = self.free.basis
-        middle = joined_matrix(middle, cross, own, basis)
-        return middle, basis.T @ np.concatenate([border, more]), corner
+        middle = joined_matrix(middle, cross, squares, basis)
+        return middle, basis.T @ np.concatenate([border, change_border]), corner
 
 
-def _selection(which, n):
+def _selection(numbers, n):
     """Matrix, (n, k), that puts rows of a bank to their numbers."""
-    k = len(which)
-    return scipy.sparse.coo_array((np.ones(k), (which, np.arange(k))), shape=(n, k)).tocsr()
+    k = len(numbers)
+    return scipy.sparse.coo_array((np.ones(k), (numbers, np.arange(k))), shape=(n, k)).tocsr()
 
 
 def _spread(image, correlation):

@@ -64,10 +64,10 @@ class ExposureKernels:
         wanted = "a MatchingKernel or a KernelField for each exposure"
         if not kernels:
             raise argument_error("kernel", wanted, "none")
-        for one in kernels:
-            if not isinstance(one, (MatchingKernel, KernelField)):
-                raise argument_error("kernel", wanted, type(one).__name__)
-            mean = one.mean if isinstance(one, KernelField) else one
+        for kernel in kernels:
+            if not isinstance(kernel, (MatchingKernel, KernelField)):
+                raise argument_error("kernel", wanted, type(kernel).__name__)
+            mean = kernel.mean if isinstance(kernel, KernelField) else kernel
             if mean.source is None or mean.target is None:
                 raise argument_error("kernel", "kernels with their PSFs", "one without")
 
@@ -103,16 +103,16 @@ class ExposureKernels:
         scale = pixel_scale(highres.wcs) * ANGLE
         turn = grid_angle(highres.wcs, highres.shape)
         sharp = _sharp_psf(highres, highres_psf, scale, turn)
-        made, kernels = [], []
+        roll_fields, kernels = [], []
         for k, image in enumerate(images):
             facts = ImageFacts.of(image)
             wanted = "exposures of one of the imager's filters"
-            known = facts.filter in MIRI_FILTERS
-            check_that(known, f"images[{k}]", wanted, facts.filter)
+            is_imager = facts.filter in MIRI_FILTERS
+            check_that(is_imager, f"images[{k}]", wanted, facts.filter)
             pa = exposure_roll(image)
             alike = {"filter": facts.filter, "subarray": _subarray(image, facts.subarray)}
-            for other, other_pa, wcs, field in made:
-                if other == alike and abs((other_pa - pa + 180) % 360 - 180) < _SAME_ROLL:
+            for made_for, other_pa, wcs, field in roll_fields:
+                if made_for == alike and abs((other_pa - pa + 180) % 360 - 180) < _SAME_ROLL:
                     kernels.append(moved_kernels(field, wcs, image.wcs))
                     break
             else:
@@ -120,7 +120,7 @@ class ExposureKernels:
                     sharp, wcs=image.wcs, pa=pa * u.deg, pixel_scale=scale, grid_angle=turn,
                     n_psfs=n_psfs, **alike, **options,
                 )  # fmt: skip
-                made.append((alike, pa, image.wcs, field))
+                roll_fields.append((alike, pa, image.wcs, field))
                 kernels.append(field)
         return cls(kernels)
 
@@ -133,22 +133,24 @@ class ExposureKernels:
     @functools.cached_property
     def mean(self):
         """The mean `~miricigale.psf.MatchingKernel`."""
-        means = [one.mean if isinstance(one, KernelField) else one for one in self.kernels]
+        means = [
+            kernel.mean if isinstance(kernel, KernelField) else kernel for kernel in self.kernels
+        ]
         return MatchingKernel.blend(means)
 
 
 def exposure_roll(image):
     """Position angle (deg) of the detector's +y: as stated (``pa_aper``), or that of the coordinates."""
-    stated = image.meta.get("pa_aper")
-    if stated is not None and np.size(stated) == 1:
-        return float(np.ravel(u.Quantity(stated, u.deg).value)[0])
+    pa_aper = image.meta.get("pa_aper")
+    if pa_aper is not None and np.size(pa_aper) == 1:
+        return float(np.ravel(u.Quantity(pa_aper, u.deg).value)[0])
     return float(grid_angle(image.wcs, image.shape).to_value(u.deg))
 
 
-def _subarray(image, stated):
+def _subarray(image, stated_name):
     """Name of the sub-array: as stated, or that of the shape."""
-    if stated is not None:
-        return stated
+    if stated_name is not None:
+        return stated_name
     for name in subarrays():
         if aperture(name).shape == image.shape:
             return name
@@ -163,8 +165,8 @@ def _sharp_psf(highres, psf, scale, turn):
     if psf is not None:
         psf = instrument_psf(psf, "highres_psf")
         return rotate_psf(psf, grid_angle=turn)
-    stated = highres.meta.get("pa_aper")
-    pa = None if stated is None else u.Quantity(stated, u.deg)
+    pa_aper = highres.meta.get("pa_aper")
+    pa = None if pa_aper is None else u.Quantity(pa_aper, u.deg)
     name = ImageFacts.of(highres).filter
     check_that(
         name is not None, "highres", "one whose meta has its filter (or 'highres_psf')", None

@@ -80,7 +80,7 @@ def measure_exposures(
     images = _opened(images)
     settings = _settings_of_each(photometer, len(images))
     _check_offered(photometer)
-    prior_given = any(one is not None for one in (highres, segmentation, catalog))
+    prior_given = any(value is not None for value in (highres, segmentation, catalog))
     if templates is None:
         highres, segmentation, catalog = photometer._prior(
             images[0], highres, segmentation, catalog
@@ -93,23 +93,24 @@ def measure_exposures(
         sources = templates
     if sources.components is not None and np.any(sources.components == 2):
         raise argument_error("components", "1 for exposures", "2 for some of the sources")
-    arrays = [fit_arrays(one, f"image[{k}]") for k, one in enumerate(images)]
+    arrays = [fit_arrays(image, f"image[{k}]") for k, image in enumerate(images)]
     placed = [
-        Placement.of(own, one, sources.sky) for own, one in zip(settings, arrays, strict=True)
+        Placement.of(own_settings, exposure, sources.sky)
+        for own_settings, exposure in zip(settings, arrays, strict=True)
     ]
-    near = np.unique(np.concatenate([one.near for one in placed]))
-    if len(sources.id) and not len(near):
+    near_rows = np.unique(np.concatenate([place.near for place in placed]))
+    if len(sources.id) and not len(near_rows):
         msg = f"none of the {len(sources.id)} sources is on or near the exposures: nothing is measured"
         warn(msg, PhotometryWarning)
     if templates is None:
-        templates = photometer._templates(highres, segmentation, catalog[near])
+        templates = photometer._templates(highres, segmentation, catalog[near_rows])
     else:
-        templates = templates[near]
+        templates = templates[near_rows]
     photometer._check_grid(templates)
     plane = _plane(arrays)
-    margin = max(one.margin for one in placed)
+    margin = max(place.margin for place in placed)
     xy = sky_pixels(sources.sky, plane.wcs, plane.shape, margin)
-    rows = _catalog_rows(sources, templates, near, xy)
+    rows = _catalog_rows(sources, templates, near_rows, xy)
     meta = {"template": templates.meta.get("template", photometer.template)}
     name = images[0].meta.get("filter", images[0].meta.get("FILTER"))
     if name is not None:
@@ -125,8 +126,8 @@ def _opened(images):
     """The exposures as images, checked to be of one filter."""
     if not len(images):
         raise argument_error("image", "at least one exposure", "none")
-    opened = [as_mosaic(one, f"image[{k}]") for k, one in enumerate(images)]
-    names = {str(one.meta["filter"]) for one in opened if one.meta.get("filter") is not None}
+    opened = [as_mosaic(image, f"image[{k}]") for k, image in enumerate(images)]
+    names = {str(image.meta["filter"]) for image in opened if image.meta.get("filter") is not None}
     check_that(len(names) <= 1, "image", "exposures of one filter", sorted(names))
     return opened
 
@@ -141,11 +142,11 @@ def _settings_of_each(photometer, n):
     wanted = f"one for each of {n} exposures"
     check_that(len(kernel) == n, "kernel", wanted, f"{len(kernel)} kernels")
     # kernels of one roll are often the same object
-    known = {}
-    for one in kernel.kernels:
-        if id(one) not in known:
-            known[id(one)] = photometer.replace(kernel=one)
-    return [known[id(one)] for one in kernel.kernels]
+    by_kernel = {}
+    for kernel_of_one in kernel.kernels:
+        if id(kernel_of_one) not in by_kernel:
+            by_kernel[id(kernel_of_one)] = photometer.replace(kernel=kernel_of_one)
+    return [by_kernel[id(kernel_of_one)] for kernel_of_one in kernel.kernels]
 
 
 def _check_offered(photometer):
@@ -163,17 +164,19 @@ def _check_offered(photometer):
 
 def _plane(arrays):
     """The grid that exposures have in common: north up, with pixels of their mean size."""
-    shapes = [one.flux.shape for one in arrays]
-    scale = np.mean([pixel_scale(one.wcs) for one in arrays])
+    shapes = [exposure.flux.shape for exposure in arrays]
+    scale = np.mean([pixel_scale(exposure.wcs) for exposure in arrays])
     sized = []
-    for one, shape in zip(arrays, shapes, strict=True):
-        wcs = one.wcs
+    for exposure, shape in zip(arrays, shapes, strict=True):
+        wcs = exposure.wcs
         if wcs.pixel_shape is None:
             wcs = wcs.deepcopy()
             wcs.pixel_shape = shape[::-1]
         sized.append(wcs)
     wcs = mosaic_wcs(sized, scale * ANGLE)
-    return Plane.over(wcs, [(one.wcs, shape) for one, shape in zip(arrays, shapes, strict=True)])
+    return Plane.over(
+        wcs, [(exposure.wcs, shape) for exposure, shape in zip(arrays, shapes, strict=True)]
+    )
 
 
 def _catalog_rows(sources, templates, near, xy):
@@ -222,7 +225,9 @@ class _Joint:
     """The fits of the sources of a catalog: shifts of exposures, bright sources, sources that it lacks."""
 
     def __init__(self, photometer, plane, catalog):
-        self._settings, self._plane, self._catalog = photometer, plane, catalog
+        self._settings = photometer
+        self._plane = plane
+        self._catalog = catalog
         self._scale = pixel_scale(plane.wcs)
         order = photometer.background_order
         # an exposure always has a sky of its own
@@ -232,7 +237,7 @@ class _Joint:
     def place(self, placed, templates, executor):
         """Make the templates of each exposure."""
         self._placed = placed
-        self._grids = [one.grid(templates) for one in placed]
+        self._grids = [place.grid(templates) for place in placed]
         number = np.full(len(self._catalog.id), -1)
         number[self._catalog.near] = np.arange(self._n)
         # memory that is kept is that of all exposures
@@ -241,8 +246,8 @@ class _Joint:
         self._parts = []
         for place in placed:
             rows = number[place.near]
-            own = dataclasses.replace(place, settings=place.settings.replace(memory=memory))
-            bank = own.bank(place.near, templates[rows], executor)
+            placement = dataclasses.replace(place, settings=place.settings.replace(memory=memory))
+            bank = placement.bank(place.near, templates[rows], executor)
             self._parts.append(ExposurePart(place.arrays, place.settings, bank, rows))
         #: Pixels by which each exposure's templates are moved.
         self._shifts = np.zeros((len(placed), 2))
@@ -285,27 +290,27 @@ class _Joint:
         """The fit with templates moved by a shift of each exposure."""
         limit = self._settings.max_shift.value
         fixed = np.zeros(len(self._parts), bool)
-        plain = self._parts
+        first_parts = self._parts
         for _ in range(_MAX_SHIFT_STEPS):
             steps, self._errors = self._steps(fit)
             self._measured = self._shifts + steps
             fixed |= np.isnan(steps[:, 0])
-            found = self._shifts + np.where(fixed[:, None], 0.0, steps)
+            shifts = self._shifts + np.where(fixed[:, None], 0.0, steps)
             scales = np.array([part.scale for part in fit.parts])
-            far = np.hypot(*found.T) * scales > limit
+            far = np.hypot(*shifts.T) * scales > limit
             for k in np.flatnonzero(far & ~fixed):
-                value = np.round(found[k] * scales[k], 3)
+                value = np.round(shifts[k] * scales[k], 3)
                 msg = (
                     f"a shift of exposure {k} by {value} arcsec is beyond 'max_shift' "
                     f"{self._settings.max_shift}: it is measured without a shift"
                 )
                 warn(msg, PhotometryWarning)
             fixed |= far
-            found[fixed] = 0.0
-            step = np.abs(found - self._shifts).max()
-            self._shifts = self._shifts + np.clip(found - self._shifts, -1.0, 1.0)
+            shifts[fixed] = 0.0
+            step = np.abs(shifts - self._shifts).max()
+            self._shifts = self._shifts + np.clip(shifts - self._shifts, -1.0, 1.0)
             moved = []
-            for part, shift, like in zip(plain, self._shifts, fit.parts, strict=True):
+            for part, shift, like in zip(first_parts, self._shifts, fit.parts, strict=True):
                 moved.append(part.moved(shift, like))
             fit = self._fit(moved)
             if step < _SHIFT_DONE:
@@ -318,10 +323,12 @@ class _Joint:
         gradients = []
         for k, part in enumerate(fit.parts):
             dy, dx = np.gradient(fit.model(k))
-            own = [-dx, -dy]
-            power = [np.sum((one * part.inverse_sigma) ** 2, dtype=float) for one in own]
+            derivatives = [-dx, -dy]
+            power = [
+                np.sum((image * part.inverse_sigma) ** 2, dtype=float) for image in derivatives
+            ]
             # too little light to find a shift of less than a pixel
-            gradients.append(own if min(power) > 1 else [])
+            gradients.append(derivatives if min(power) > 1 else [])
         trial = self._fit(fit.parts, fit.xy[self._n :], gradients)
         variance = np.diag(trial.fit.common_covariance)
         steps = np.full((len(fit.parts), 2), np.nan)
@@ -334,13 +341,13 @@ class _Joint:
 
     def _on_sky(self, shifts):
         """Shifts of exposures (pixels) as arcsec to the east and north."""
-        found = []
+        offsets = []
         for part, shift in zip(self._parts, shifts, strict=True):
             ny, nx = part.arrays.flux.shape
             middle = np.array([[(nx - 1) / 2, (ny - 1) / 2]])
             turn = self._turns(part, middle)[0]
-            found.append((turn @ shift) * self._scale * [-1.0, 1.0])
-        return np.array(found)
+            offsets.append((turn @ shift) * self._scale * [-1.0, 1.0])
+        return np.array(offsets)
 
     def _new_positions(self, fit):
         """
@@ -362,14 +369,14 @@ class _Joint:
         n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
         rate = float(n_false / max(np.count_nonzero(new), 1))
         fitted = bool(self._settings.second_pass or rate <= _FALSE_RATE)
-        found = peaks.refined[new & fitted]
+        positions = peaks.refined[new & fitted]
         evidence = {
             "peaks": int(new.sum()),
             "threshold": LEFT_SNR,
             "false_rate": float(f"{rate:.2g}"),
-            "fitted": bool(fitted and len(found)),
+            "fitted": bool(fitted and len(positions)),
         }
-        return found, evidence
+        return positions, evidence
 
     def _with_points(self, new_xy):
         """Positions of new sources, refined, and the fit with them."""
@@ -393,12 +400,12 @@ class _Joint:
         ):
             wcs = part.arrays.wcs
             xy = sky_pixels(sky, wcs, part.arrays.flux.shape, place.margin)
-            here = np.flatnonzero(np.isfinite(xy[:, 0]))
-            xy = xy[here]
+            rows = np.flatnonzero(np.isfinite(xy[:, 0]))
+            xy = xy[rows]
             poly = local_maps(xy, np.full(len(xy), place.margin / 2), wcs, grid)
             bank = part.bank.with_points(xy + self._shifts[k], poly)
             bank.reuse(like[k].bank)
-            source = np.concatenate([part.source, self._n + here])
+            source = np.concatenate([part.source, self._n + rows])
             added.append(ExposurePart(part.arrays, part.settings, bank, source))
         return added
 
@@ -412,7 +419,7 @@ class _Joint:
         n = len(fit.xy)
         total = np.zeros((n, 2))
         weight = np.zeros(n)
-        others = np.zeros(n)
+        neighbors = np.zeros(n)
         for k, part in enumerate(fit.parts):
             if not len(part.source):
                 continue
@@ -420,16 +427,16 @@ class _Joint:
             residual = fit.residual(k, model)
             view = _Offsets(part, fit.flux[part.row_source])
             rows = np.arange(len(part.source))
-            step, error, rest = source_offsets(view, residual, model, rows)
+            step, error, neighbor_light = source_offsets(view, residual, model, rows)
             good = np.isfinite(error) & np.isfinite(step).all(axis=1) & (error > 0)
             source = part.row_source[good]
-            turned = np.einsum("kij,kj->ki", self._turns(part, part.bank.xy)[good], step[good])
-            own = error[good] ** -2.0
-            total[source] += own[:, None] * turned
-            weight[source] += own
-            others[source] += own * rest[good]
+            plane_step = np.einsum("kij,kj->ki", self._turns(part, part.bank.xy)[good], step[good])
+            step_weight = error[good] ** -2.0
+            total[source] += step_weight[:, None] * plane_step
+            weight[source] += step_weight
+            neighbors[source] += step_weight * neighbor_light[good]
         with np.errstate(divide="ignore", invalid="ignore"):
-            return total / weight[:, None], weight**-0.5, others / weight
+            return total / weight[:, None], weight**-0.5, neighbors / weight
 
     def _turns(self, part, xy):
         """Linear maps from pixels of an exposure to those of the plane at some pixels, (k, 2, 2)."""
@@ -439,8 +446,8 @@ class _Joint:
         middle = np.array(pixel_to_pixel(part.arrays.wcs, self._plane.wcs, *xy.T))
         sides = []
         for step in ([1.0, 0.0], [0.0, 1.0]):
-            there = np.array(pixel_to_pixel(part.arrays.wcs, self._plane.wcs, *(xy + step).T))
-            sides.append((there - middle).T)
+            moved = np.array(pixel_to_pixel(part.arrays.wcs, self._plane.wcs, *(xy + step).T))
+            sides.append((moved - middle).T)
         return np.stack(sides, axis=-1)
 
     def _settled(self, fit):
@@ -452,36 +459,36 @@ class _Joint:
         if not len(fit.rows):
             return fit
         width = gaussian_width(self._settings.mean_kernel) / self._scale
-        own = np.zeros((len(fit.xy), 2))
-        plain = self._parts
+        offsets = np.zeros((len(fit.xy), 2))
+        first_parts = self._parts
         for _ in range(_OFFSET_PASSES):
-            step, error, others = self._offsets(fit)
+            step, error, neighbors = self._offsets(fit)
             snr = np.zeros(len(fit.xy))
             snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
-            good = (snr > _BRIGHT_SNR) & (others < _ISOLATED) & ~fit.noisy & np.isfinite(error)
+            good = (snr > _BRIGHT_SNR) & (neighbors < _ISOLATED) & ~fit.noisy & np.isfinite(error)
             good &= (fit.light > 0.9).all(axis=1) & (error < width / _BRIGHT_SNR * 2)
-            found = own + np.where(good[:, None], step, 0.0)
-            good &= np.hypot(*found.T) < _LARGEST_OFFSET * width
+            measured = offsets + np.where(good[:, None], step, 0.0)
+            good &= np.hypot(*measured.T) < _LARGEST_OFFSET * width
             if np.count_nonzero(good) < _FEWEST_SOURCES:
                 break
             error = np.hypot(error, _OFFSET_FLOOR)
-            common = np.median(found[good], axis=0)
+            common = np.median(measured[good], axis=0)
             if np.hypot(*common) > _COMMON_OFFSET * np.sqrt(8 * np.log(2)) * width:
                 break
             # of two normal errors the median distance is 1.18
-            distance = np.median(np.hypot(*found[good].T)) / 1.1774
+            distance = np.median(np.hypot(*measured[good].T)) / 1.1774
             scatter = distance**2 - np.median(error[good]) ** 2
             if scatter <= _OFFSET_FLOOR**2:
                 break
-            new = np.zeros_like(own)
-            new[good] = found[good] * (scatter / (scatter + error[good] ** 2))[:, None]
-            change = np.abs(new - own).max()
-            own = new
+            new = np.zeros_like(offsets)
+            new[good] = measured[good] * (scatter / (scatter + error[good] ** 2))[:, None]
+            change = np.abs(new - offsets).max()
+            offsets = new
             moved = []
-            for part, like in zip(plain, fit.parts, strict=True):
+            for part, like in zip(first_parts, fit.parts, strict=True):
                 inverse = np.empty((len(part.source), 2, 2))
                 inverse[part.bank.order] = np.linalg.inv(self._turns(part, part.bank.xy))
-                steps = np.einsum("kij,kj->ki", inverse, own[part.source])
+                steps = np.einsum("kij,kj->ki", inverse, offsets[part.source])
                 moved.append(part.moved(steps, like))
             fit = self._fit(moved)
             if change < _OFFSET_FLOOR / 2:

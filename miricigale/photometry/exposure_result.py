@@ -110,7 +110,9 @@ def plane_peaks(fit, plane, xy, sign=1.0):
 
 def _images(fit):
     """Model without sky, residual and inverse errors of each exposure, in MJy/sr."""
-    models, residuals, inverse = [], [], []
+    models = []
+    residuals = []
+    inverse = []
     for k, part in enumerate(fit.parts):
         area = part.arrays.areas()
         model = fit.model(k)
@@ -121,7 +123,7 @@ def _images(fit):
 
 
 def _peaks(fit, plane, xy, models, residuals, inverse, sign=1.0):
-    weights = [one.astype(float) ** 2 for one in inverse]
+    weights = [image.astype(float) ** 2 for image in inverse]
     residual, weight = plane.mean(residuals, weights)
     model, _ = plane.mean(models, weights)
     area = pixel_area_map(plane.wcs, plane.shape) * _MICRO
@@ -157,7 +159,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     n_all = n + len(new_xy)
     place = np.concatenate([catalog.near, np.arange(n, n_all)])
     models, residuals, inverse = _images(fit)
-    chi2, left, poor, checks = _compared(fit, models, residuals)
+    chi2, residual_fraction, poor, checks = _compared(fit, models, residuals)
     terms, common, blending = _covariances(fit)
     joint = scipy.sparse.csr_array((n_all, n_all))
     errors = {name: np.full(n_all, np.nan) for name in ("", "_noise", "_template", "_psf")}
@@ -167,23 +169,23 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     if len(fit.rows):
         k = np.arange(len(measured))
         gather = scipy.sparse.coo_array((np.ones(len(k)), (measured, k)), shape=(n_all, len(k)))
-        spread = [(gather @ one @ gather.T).tocsr() for one in terms]
+        spread = [(gather @ term @ gather.T).tocsr() for term in terms]
         joint = (spread[0] + spread[1] + spread[2]).tocsr()
         joint.sort_indices()
-        for name, one in zip(errors, (joint, *spread), strict=True):
-            errors[name][measured] = np.sqrt(np.maximum(one.diagonal()[measured], 0.0))
+        for name, term in zip(errors, (joint, *spread), strict=True):
+            errors[name][measured] = np.sqrt(np.maximum(term.diagonal()[measured], 0.0))
     xy = np.concatenate([catalog.xy, new_xy])
     peaks, _ = _peaks(fit, plane, xy, models, residuals, inverse)
     flags, coverage = _flags(fit, place, n_all, flux, blending, poor)
     flags[:n] |= catalog.flags
     flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
-    near = unexplained_neighbors(peaks, xy, flux)
-    flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    has_neighbor = unexplained_neighbors(peaks, xy, flux)
+    flags[has_neighbor & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
     columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage}
     columns["chi2"] = _spread_over(chi2, place, n_all)
-    columns["residual_fraction"] = _spread_over(left, place, n_all)
-    for name, one in errors.items():
-        columns[f"flux_err{name}"] = one * FNU
+    columns["residual_fraction"] = _spread_over(residual_fraction, place, n_all)
+    for name, term in errors.items():
+        columns[f"flux_err{name}"] = term * FNU
     new = None
     if fit.settings.second_pass or len(new_xy):
         names = ("flux", "flux_err", "flags", "coverage", "chi2")
@@ -191,14 +193,19 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
         new = new_source_table(catalog, new_xy, plane.wcs, rows)
     exposures = _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
     model, residual = _plane_images(plane, models, residuals, inverse, meta)
-    sky, weight = exposures.table["sky"], exposures.table["sky_err"] ** -2
+    sky = exposures.table["sky"]
+    weight = exposures.table["sky_err"] ** -2
     reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
+    background = {}
+    if len(fit.rows):
+        background["background"] = np.sum(sky * weight) / np.sum(weight)
+        background["background_err"] = np.sum(weight) ** -0.5
     counted = {} if evidence is None else {"second_pass": evidence}
-    known = np.isfinite(offsets[1])
-    if known.any():
+    has_offset = np.isfinite(offsets[1])
+    if has_offset.any():
         # along x and y of the plane, as for one image
-        weights = offsets[1][known] ** -2.0
-        east, north = np.average(offsets[0][known], axis=0, weights=weights)
+        weights = offsets[1][has_offset] ** -2.0
+        east, north = np.average(offsets[0][has_offset], axis=0, weights=weights)
         counted["offset"] = [round(-float(east), 5), round(float(north), 5)]
         counted["offset_err"] = [round(float(np.sum(weights) ** -0.5), 5)] * 2
     return ForcedPhotometryResult(
@@ -211,8 +218,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
         crowded=crowded(catalog.sky, reference),
         x=catalog.xy[:, 0].copy(),
         y=catalog.xy[:, 1].copy(),
-        background=np.sum(sky * weight) / np.sum(weight) if len(fit.rows) else None,
-        background_err=np.sum(weight) ** -0.5 if len(fit.rows) else None,
+        **background,
         new_sources=new,
         psf_fwhm=np.sqrt(8 * np.log(2)) * gaussian_width(fit.settings.mean_kernel) * ANGLE,
         model_image=model,
@@ -239,39 +245,42 @@ def _spread_over(values, place, n):
 def _compared(fit, models, residuals):
     """Chi-square of each source, light left, whether that is poor; noise and correlation of each exposure."""
     n = len(fit.xy)
-    square, weight, left, core = np.zeros((4, n))
+    square, weight, light_left, core = np.zeros((4, n))
     checks = []
     for part, model, residual in zip(fit.parts, models, residuals, strict=True):
         area = part.arrays.areas()
-        source, seen = part.row_source, np.zeros(len(part.source))
-        found = np.full((len(part.source), 3), np.nan)
-        own = np.asarray(residual * area, np.float32)
+        source = part.row_source
+        row_light = np.zeros(len(part.source))
+        statistics = np.full((len(part.source), 3), np.nan)
+        residual_flux = np.asarray(residual * area, np.float32)
         for block in part.bank.blocks():
             rows = slice(block.first, block.last)
-            residual_statistics(*block.stamps, own, part.inverse_sigma, found[rows])
+            residual_statistics(*block.stamps, residual_flux, part.inverse_sigma, statistics[rows])
             for row, (first, last) in enumerate(
                 zip(block.start[:-1], block.start[1:], strict=True)
             ):
-                seen[block.first + row] = block.values[first:last].sum()
-        good = np.isfinite(found[:, 0]) & (seen > 0)
-        np.add.at(square, source[good], (seen * found[:, 0])[good])
-        np.add.at(weight, source[good], seen[good])
-        np.add.at(left, source[good], found[good, 1])
-        np.add.at(core, source[good], found[good, 2])
+                row_light[block.first + row] = block.values[first:last].sum()
+        good = np.isfinite(statistics[:, 0]) & (row_light > 0)
+        np.add.at(square, source[good], (row_light * statistics[:, 0])[good])
+        np.add.at(weight, source[good], row_light[good])
+        np.add.at(light_left, source[good], statistics[good, 1])
+        np.add.at(core, source[good], statistics[good, 2])
         checks.append(
-            _noise_check(own * part.inverse_sigma, model * area * part.inverse_sigma, part)
+            _noise_check(
+                residual_flux * part.inverse_sigma, model * area * part.inverse_sigma, part
+            )
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         chi2 = square / weight
-        left = left / (fit.flux * core)
+        light_left = light_left / (fit.flux * core)
     out = np.ones(n, bool)
     out[fit.rows] = False
     chi2[out] = np.nan
-    left[out] = np.nan
+    light_left[out] = np.nan
     poor = chi2 > POOR_CHI2
     if fit.free is not None:
         poor[fit.rows] |= fit.free.strain > POOR_STRAIN
-    return chi2, left, poor, checks
+    return chi2, light_left, poor, checks
 
 
 def _noise_check(white, model, part):
@@ -284,9 +293,9 @@ def _noise_check(white, model, part):
         return rms, np.nan
     calm = free & (np.abs(white) < 5 * rms)
     products = []
-    for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        both = calm[one] & calm[other]
-        products.append(np.mean(white[one][both] * white[other][both], dtype=float))
+    for first, second in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        calm_pairs = calm[first] & calm[second]
+        products.append(np.mean(white[first][calm_pairs] * white[second][calm_pairs], dtype=float))
     return rms, float(np.mean(products) / np.mean(white[calm] ** 2, dtype=float))
 
 
@@ -295,33 +304,37 @@ def _covariances(fit):
     blending = np.full(len(fit.xy), np.nan)
     if not len(fit.rows):
         return [], None, blending
-    n, plain, free = len(fit.rows), fit.fit, fit.free
-    solution, xy = plain, fit.xy[fit.rows]
+    n = len(fit.rows)
+    fixed = fit.fit
+    changes = fit.free
+    solution = fixed
+    xy = fit.xy[fit.rows]
     noise_filling = fit.noise_filling()
     fillings = [noise_filling]
-    if free is not None:
-        solution, xy = free.fit, np.concatenate([xy, free.xy])
+    if changes is not None:
+        solution = changes.fit
+        xy = np.concatenate([xy, changes.xy])
         if noise_filling is None:
             # the priors are no noise
-            white = (solution.matrix - scipy.sparse.diags_array(free.prior)).tocsr()
+            white = (solution.matrix - scipy.sparse.diags_array(changes.prior)).tocsr()
             fillings = [(white, solution.border, solution.corner)]
         n_common = len(solution.corner_rhs)
         nothing = np.zeros((len(solution.rhs), n_common)), np.zeros((n_common, n_common))
-        fillings.append((free.filling(plain.matrix), *nothing))
-    coo = plain.matrix.tocoo()
+        fillings.append((changes.filling(fixed.matrix), *nothing))
+    coo = fixed.matrix.tocoo()
     pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=solution.matrix.shape)
-    found, alone = solution.covariances(
+    covariances, all_blending = solution.covariances(
         xy, fillings, core=BLOCK_CORE / fit.scale, halo=BLOCK_HALO / fit.scale, pattern=pattern
     )
-    noise, common = found[0]
+    noise, common = covariances[0]
     noise = noise[:n][:, :n]
-    blending[fit.rows] = alone[:n]
+    blending[fit.rows] = all_blending[:n]
     template = scipy.sparse.csr_array((n, n))
-    if free is not None:
-        blending[fit.rows] *= np.sqrt(free.alone())
-        template, more = found[1]
+    if changes is not None:
+        blending[fit.rows] *= np.sqrt(changes.alone())
+        template, change_common = covariances[1]
         template = template[:n][:, :n]
-        common = common + more
+        common = common + change_common
     light = [light is not None and light.kind == "cutout" for light in fit.cutouts()]
     error = psf_errors(fit, np.array(light, bool))[fit.rows]
     coo = noise.tocoo()
@@ -354,10 +367,12 @@ def _flags(fit, place, n_all, flux, blending, poor):
 def _exposures(fit, images, models, residuals, inverse, common, checks, offsets):
     """The `ExposureResults` of a fit."""
     table = QTable({"exposure": np.arange(len(images))})
-    table["source"] = [str(one.meta.get("source", k)) for k, one in enumerate(images)]
+    table["source"] = [str(image.meta.get("source", k)) for k, image in enumerate(images)]
     table["n_sources"] = [_n_seen(part) for part in fit.parts]
     first = [places["sky"].start for places in fit.places]
-    errors = np.full(len(fit.common), np.nan) if common is None else np.sqrt(np.diag(common))
+    errors = np.full(len(fit.common), np.nan)
+    if common is not None:
+        errors = np.sqrt(np.diag(common))
     table["sky"] = fit.common[first] * SURFACE_BRIGHTNESS
     table["sky_err"] = errors[first] * SURFACE_BRIGHTNESS
     table["offset_east"], table["offset_north"] = offsets[0].T * ANGLE
@@ -378,12 +393,14 @@ def _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
         with np.errstate(divide="ignore"):
             sigma = np.where(usable, 1 / inverse[k], np.nan)
         options = {"unit": SURFACE_BRIGHTNESS, "wcs": part.arrays.wcs}
-        kept = {key: images[k].meta[key] for key in ("filter", "source") if key in images[k].meta}
-        model_images.append(Image(models[k] + sky, meta=dict(kept), **options))
+        image_meta = {
+            key: images[k].meta[key] for key in ("filter", "source") if key in images[k].meta
+        }
+        model_images.append(Image(models[k] + sky, meta=dict(image_meta), **options))
         residual = np.where(usable, residuals[k], np.nan)
         noise = StdDevUncertainty(sigma)
         residual_images.append(
-            Image(residual, mask=~usable, uncertainty=noise, meta=dict(kept), **options)
+            Image(residual, mask=~usable, uncertainty=noise, meta=dict(image_meta), **options)
         )
     return ExposureResults(table, tuple(model_images), tuple(residual_images))
 
@@ -412,18 +429,22 @@ def _n_seen(part):
 
 def _plane_images(plane, models, residuals, inverse, meta):
     """Mean model and residual in the plane, for pictures."""
-    weights = [one.astype(float) ** 2 for one in inverse]
+    weights = [image.astype(float) ** 2 for image in inverse]
     model, weight = plane.mean(models, weights)
     residual, _ = plane.mean(residuals, weights)
     usable = weight > 0
     sigma = np.full(plane.shape, np.nan)
     sigma[usable] = weight[usable] ** -0.5
     residual[~usable] = np.nan
-    kept = {key: meta[key] for key in ("filter",) if key in meta}
+    image_meta = {key: meta[key] for key in ("filter",) if key in meta}
     options = {"unit": SURFACE_BRIGHTNESS, "wcs": plane.wcs}
     return (
-        Image(model, meta=dict(kept), **options),
+        Image(model, meta=dict(image_meta), **options),
         Image(
-            residual, mask=~usable, uncertainty=StdDevUncertainty(sigma), meta=dict(kept), **options
+            residual,
+            mask=~usable,
+            uncertainty=StdDevUncertainty(sigma),
+            meta=dict(image_meta),
+            **options,
         ),
     )
