@@ -91,7 +91,7 @@ def _workers(args):
             yield cluster._client.get_executor(pure=False)
 
 
-def _images(args, paths, prefix=""):
+def images_of(args, paths, prefix=""):
     """Images with their options, each given as often as there are images, in their order; - for none."""
     from miricigale.photometry import MosaicFile
 
@@ -116,7 +116,7 @@ def photometry(args):
     if not paths or not ways or len(args.highres or ()) > 1:
         msg = "wanted are --image and --highres, or the images and last the prior without options"
         raise ValueError(msg)
-    images, prior = _images(args, paths), _images(args, [prior], "highres_")[0]
+    images, prior = images_of(args, paths), images_of(args, [prior], "highres_")[0]
     options = {
         "kernel": args.kernel and [None if one == "-" else one for one in args.kernel],
         **chosen(args, "detection segmentation catalog confidence"),

@@ -136,6 +136,8 @@ def make_parser(argv):
         stopped = command.get("stopped", "miricigale: stopped")
         made.set_defaults(call=command["call"], stopped=stopped)
         options = command.get("options", {})
+        for other, flags in command.get("as_in", {}).items():
+            options |= {one: declared[other]["options"][one] for one in flags}
         options |= {shared[one]["flags"]: shared[one] for one in command.get("shared", ())}
         groups = {}
         for flags, option in _of_both(options):

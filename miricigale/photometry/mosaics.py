@@ -259,9 +259,14 @@ class MosaicFile:
             raise argument_error("pa_aper", wanted, angle)
         return angle
 
-    def read(self):
+    def read(self, added=None):
         """
         Read the image.
+
+        Parameters
+        ----------
+        added : `~numpy.ndarray`, shape (ny, nx), optional
+            Surface brightness in MJy/sr that is added to the pixels before anything is measured on them.
 
         Returns
         -------
@@ -330,6 +335,8 @@ class MosaicFile:
         what = "has no usable pixel: all are masked, not finite or without weight"
         check_data(usable.any(), self.path, what)
         data *= factor
+        if added is not None:
+            data += added
         if self.background_box is not None:
             from miricigale.utils.sep_tools import background
 

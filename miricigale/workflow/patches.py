@@ -2,9 +2,7 @@
 
 import dataclasses
 import functools
-import json
 import math
-import os
 import re
 import shutil
 import tempfile
@@ -24,23 +22,25 @@ from miricigale.photometry.priors import read_catalog
 from miricigale.utils.caching import cached
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import cached_by_file, file_place, replacing
+from miricigale.utils.files import cached_by_file, replacing
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_least
 from miricigale.utils.outputs import check_output
-from miricigale.utils.store import plain_value
 from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.units import ANGLE, ab_magnitude, positive
 from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.options import Configuration, Section, option
+from miricigale.workflow.recorded_inputs import (
+    absolute,
+    file_states,
+    inputs_from_text,
+    inputs_text,
+)
 from miricigale.workflow.sections import RunBasics
 
 #: Most bytes that a patch may take, and of these for templates, where no others are given.
 _MEMORY, _TEMPLATES = 2_000_000_000, photometry.MemorySettings(max_bytes=3e8)
-#: Fields of an image that name files, whose states go into the record.
-_PATHS = ("path", "error", "variance", "inverse_variance", "weight", "psf")
-_KINDS = (photometry.ErrorSettings, photometry.MemorySettings, photometry.MosaicFile)
 
 
 class RunSection(RunBasics):
@@ -100,32 +100,9 @@ class PatchConfig(Configuration):
     patches: PatchSection = dataclasses.field(default_factory=PatchSection)
 
 
-def _as_plain(value):
-    """What JSON does not know, as it does; `_from_plain` takes it back."""
-    if isinstance(value, u.Quantity):
-        return {"value": float(value.value), "unit": value.unit.to_string()}
-    if isinstance(value, _KINDS):
-        known = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
-        known |= {name: _absolute(known[name]) for name in known.keys() & set(_PATHS)}
-        return {"of": type(value).__name__, **known}
-    return os.fspath(value) if isinstance(value, os.PathLike) else plain_value(value)
-
-
-def _from_plain(values):
-    if values.keys() == {"value", "unit"}:
-        return values["value"] * u.Unit(values["unit"])
-    return getattr(photometry, values.pop("of"))(**values) if "of" in values else values
-
-
-def _absolute(path):
-    # workers have another working directory
-    return None if path is None else os.path.abspath(path)
-
-
 @cached(maxsize=4)
 def _made(files, patches):
-    values = json.loads(files.inputs, object_hook=_from_plain)
-    inputs = Inputs(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    inputs = inputs_from_text(files.inputs)
     whole, images = inputs.highres.header, [one.header for one in inputs.images]
     return inputs, PatchGrid.over(whole, images, patches.size, patches.overlap)
 
@@ -138,11 +115,7 @@ def _task(config):
 def _states(config, unit):
     """Size and time of each file that is read, for the digest."""
     inputs, _ = _task(config)
-    files = [inputs.highres, *inputs.images, *inputs.detection]
-    paths = [getattr(one, name) for one in files for name in _PATHS]
-    paths = {file_place(one)[0] for one in (*paths, *inputs.paths) if one is not None}
-    states = {path: os.stat(path) for path in sorted(map(str, paths))}
-    return {path: [one.st_size, one.st_mtime_ns] for path, one in states.items()}
+    return file_states(inputs)
 
 
 def _bytes(inputs, grid, unit):
@@ -314,10 +287,10 @@ def measure_patches(
     >>> table = measure_patches("f770w_i2d.fits", "f444w_i2d.fits", "patches")  # doctest: +SKIP
     """
     inputs = Inputs.of(image, highres, **{"memory": _TEMPLATES, **options})
-    named = {name: _absolute(getattr(inputs, name)) for name in ("segmentation", "catalog")}
+    named = {name: absolute(getattr(inputs, name)) for name in ("segmentation", "catalog")}
     # all patches have one PSF unless their stars are asked for
     named |= {"psf_stars": bool(inputs.psf_stars)}
-    inputs = dataclasses.replace(inputs, kernels=tuple(map(_absolute, inputs.kernels)), **named)
+    inputs = dataclasses.replace(inputs, kernels=tuple(map(absolute, inputs.kernels)), **named)
     check_output(output, "output", overwrite=overwrite, inputs=inputs.paths, **TABLE_KIND)
     inputs.check()
     # refused here rather than in each patch
@@ -327,10 +300,9 @@ def measure_patches(
     if patch_size is None:
         patch_size = _largest(inputs, rim)
     check_least(patch_size, "patch_size", max(rim, 1), whole=True)
-    values = {one.name: getattr(inputs, one.name) for one in dataclasses.fields(inputs)}
     config = PatchConfig(
         run=RunSection(threads=n_threads or 0, seed=inputs.seed),
-        files=FilesSection(inputs=json.dumps(values, default=_as_plain, sort_keys=True)),
+        files=FilesSection(inputs=inputs_text(inputs)),
         patches=PatchSection(size=int(patch_size), overlap=rim, pages=pages),
     )
     runner = StudyRunner(

@@ -1,0 +1,3 @@
+from .completeness import CompletenessCurve as CompletenessCurve
+from .results import InjectionResult as InjectionResult
+from .sessions import Injection as Injection

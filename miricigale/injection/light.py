@@ -1,0 +1,90 @@
+"""Light of sources on the pixels of an image."""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.instrument.sky_axes import grid_angle
+from miricigale.photometry.arrays import pixel_scale
+from miricigale.psf import make_psf, psf_image, rotate_psf
+from miricigale.scene import Scene
+from miricigale.utils.units import ANGLE
+
+#: Cells within the width (FWHM) of a PSF.
+_CELLS = 6
+
+
+def psf_on_pixels(psf, wcs, shape):
+    """
+    A PSF on the sky in cells that divide the pixels of an image.
+
+    Parameters
+    ----------
+    psf : `~miricigale.psf.InstrumentPSF`
+        In the frame of the sky, with the image's pixel in it.
+    wcs : `~astropy.wcs.WCS`
+        The image.
+    shape : (int, int)
+        Its shape.
+
+    Returns
+    -------
+    psf : `~miricigale.psf.InstrumentPSF`
+        In the orientation of the image, of the same light.
+    """
+    scale = pixel_scale(wcs)
+    angle = grid_angle(wcs, shape)
+    oversampling = max(2, int(np.ceil(_CELLS * scale / psf.fwhm.to_value(ANGLE))))
+    cell = scale / oversampling
+    n = 2 * int(psf.half_width / cell) + 1
+    turned = rotate_psf(psf, grid_angle=angle)
+    data = psf_image(turned, pixel_scale=cell * ANGLE, shape=n)
+    data *= psf.enclosed / data.sum()
+    return make_psf(
+        data * oversampling**2,
+        pixel_scale=scale * ANGLE,
+        frame="sky",
+        oversampling=oversampling,
+        angle=angle.to_value(u.deg) * u.deg,
+    )
+
+
+def light_on_image(sources, flux, wcs, shape, psf, n_threads=None):
+    """
+    Surface brightness of sources on an image.
+
+    Parameters
+    ----------
+    sources : `~astropy.table.QTable`
+        ``sky``, ``profile`` and shapes.
+    flux : `~astropy.units.Quantity`, shape (n,)
+        Their fluxes.
+    wcs, shape
+        The image.
+    psf : `~miricigale.psf.InstrumentPSF`
+        Of `psf_on_pixels`, or in the axes of the detector.
+    n_threads : int, optional
+        Threads; the light does not depend on them.
+
+    Returns
+    -------
+    light : `~numpy.ndarray`, shape (ny, nx)
+        MJy/sr, without noise.
+    """
+    if not len(sources):
+        return np.zeros(shape)
+    names = ["sky", "profile", "half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
+    rows = QTable(sources[names], copy=True)
+    rows["id"] = np.arange(1, len(rows) + 1)
+    rows["redshift"] = np.full(len(rows), np.nan)
+    # light has no color here
+    band = "miri.f770w" if psf.filter is None else psf.filter
+    rows[band] = flux
+    wcs = wcs.deepcopy()
+    wcs.pixel_shape = shape[::-1]
+    return scene_light(rows, band, wcs, psf, n_threads)
+
+
+def scene_light(rows, band, wcs, psf, n_threads):
+    """What a `~miricigale.scene.Scene` renders, as an array."""
+    return np.asarray(Scene(rows, filter=band, wcs=wcs, psf=psf, n_threads=n_threads).render().data)

@@ -1,0 +1,363 @@
+"""A run of injection: the field itself, each trial, and the result, resumed one by one."""
+
+import dataclasses
+import io
+import json
+import os
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from astropy.table import QTable, vstack
+
+from miricigale.injection.field import image_field, over_noise
+from miricigale.injection.population import read_sources
+from miricigale.injection.results import InjectionResult
+from miricigale.injection.settings import InjectionSettings
+from miricigale.injection.trials import (
+    Base,
+    injected_sources,
+    measure_base,
+    place_names,
+    run_trial,
+)
+from miricigale.photometry import DetectionPreset, MosaicFile
+from miricigale.photometry.file_inputs import Inputs
+from miricigale.psf import read_psf
+from miricigale.utils.declared import declared
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_that
+from miricigale.utils.table_files import read_table
+from miricigale.utils.tables import as_table
+from miricigale.utils.units import ab_magnitude
+from miricigale.workflow.engine.runner import StudyRunner
+from miricigale.workflow.engine.stage import Context, stage
+from miricigale.workflow.options import Configuration, Section, option
+from miricigale.workflow.recorded_inputs import (
+    absolute,
+    as_text,
+    file_states,
+    from_text,
+    inputs_from_text,
+    inputs_text,
+)
+from miricigale.workflow.sections import RunBasics
+
+#: Bytes of a process with the images of a field, for each pixel, beside those of its photometry.
+_BYTES = 60
+
+#: Options of photometry that are not of one image.
+_FOREIGN = ("detection", "output", "page", "model", "residual", "overwrite")
+
+
+class RunSection(RunBasics):
+    """
+    How the run goes.
+
+    Parameters
+    ----------
+    memory
+        Memory (GB) of trials side by side on a machine; 0 for half of all.
+    """
+
+    name: str = option("injection", folder=True)
+    memory: float = option(0.0, low=0.0, high=1e5)
+
+
+class InjectionSection(Section):
+    """
+    What is measured, and what is injected.
+
+    Parameters
+    ----------
+    inputs
+        Files and options of the photometry as JSON.
+    settings
+        Settings of the injection as JSON.
+    n_trials
+        How often sources are injected.
+    """
+
+    inputs: str = ""
+    settings: str = ""
+    n_trials: int = option(1, low=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class InjectionConfig(Configuration):
+    """What a run of injection depends on."""
+
+    heading: ClassVar = "# miricigale inject; a record of what was asked for"
+
+    run: RunSection = dataclasses.field(default_factory=RunSection)
+    injection: InjectionSection = dataclasses.field(default_factory=InjectionSection)
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """
+    What a run does, of its configuration.
+
+    Parameters
+    ----------
+    inputs : `~miricigale.photometry.file_inputs.Inputs` or None
+        What is measured on a prior; None without one.
+    image : `~miricigale.photometry.MosaicFile`
+        The image.
+    options : dict
+        Of the photometer, without a prior.
+    injection : `~miricigale.injection.settings.InjectionSettings`
+        Settings.
+    """
+
+    inputs: Inputs | None
+    image: MosaicFile
+    options: dict
+    injection: InjectionSettings
+
+    @classmethod
+    def of(cls, config, seed):
+        """Of a configuration and the seed of the run."""
+        values = json.loads(config.injection.inputs)
+        inputs = None
+        if values["inputs"] is not None:
+            inputs = inputs_from_text(values["inputs"])
+        settings = from_text(config.injection.settings)
+        if isinstance(settings["preset"], dict):
+            settings["preset"] = DetectionPreset(**settings["preset"])
+        image = from_text(values["image"])
+        options = from_text(values["options"])
+        return cls(inputs, image, options, InjectionSettings(**settings, seed=seed))
+
+    def field(self, n_threads):
+        """The field that is measured."""
+        return image_field(self.image, self.inputs, self.injection.preset, self.options, n_threads)
+
+    def sources(self, field, wcs):
+        """The own catalog, or None."""
+        catalog = self.injection.catalog
+        if catalog is None:
+            return None
+        if catalog.startswith("#"):
+            catalog = QTable.read(catalog, format="ascii.ecsv")
+        return read_sources(catalog, field.band, field.prior_band, wcs)
+
+    @property
+    def files(self):
+        """Files that it reads, but for those of ``inputs``."""
+        catalog = self.injection.catalog
+        paths = [getattr(self.image, name) for name in ("path", "psf", "error", "variance")]
+        paths += [self.image.inverse_variance, self.image.weight]
+        if catalog is not None and not catalog.startswith("#"):
+            paths.append(catalog)
+        return [path for path in paths if path is not None]
+
+
+def _states(config, unit):
+    task = Task.of(config, config.run.seed)
+    if task.inputs is not None:
+        return file_states(task.inputs, task.files)
+    return {str(path): [os.stat(path).st_size, os.stat(path).st_mtime_ns] for path in task.files}
+
+
+def _bytes(config, unit):
+    """About how many bytes a trial takes."""
+    task = Task.of(config, config.run.seed)
+    pixels = np.prod(task.image.header.shape, dtype=float)
+    if task.inputs is None:
+        return int(600_000_000 + 4 * _BYTES * pixels)
+    pixels += np.prod(task.inputs.highres.header.shape, dtype=float)
+    return int(task.inputs.n_bytes() + 200_000_000 + _BYTES * pixels)
+
+
+def trial_names(config):
+    """Names of the trials."""
+    return [f"trial-{k + 1:03d}" for k in range(config.injection.n_trials)]
+
+
+_READS = {"sections": ("injection.inputs", "injection.settings"), "plan": _states}
+
+
+@stage("field", "field", memory=_bytes, **_READS)
+def field_stage(context, _):
+    """Measure the field as its user does."""
+    task = Task.of(context.config, context.seed)
+    base = measure_base(task.field(context.n_threads), task.injection)
+    context.save_table("photometry.fits", base.table)
+    context.save_rows("field/known", base.known)
+    context.save_rows("field/population", base.population)
+    detections = [_detection_rows(one, base.model) for one in (base.detections, base.negatives)]
+    for name, rows in zip(("detections", "negatives"), detections, strict=True):
+        context.save_rows(f"field/{name}", rows)
+    pulls = np.zeros(0) if base.empty_pulls is None else np.asarray(base.empty_pulls)
+    context.save_table("field/empty.fits", QTable({"pull": pulls}))
+    context.save_image("field/model.fits", base.model)
+    for name, psf in zip(("psf", "prior_psf"), base.psfs, strict=True):
+        if psf is not None:
+            context.save(f"field/{name}.fits", lambda path, psf=psf: psf.write(path))
+    text = json.dumps(base.facts, sort_keys=True)
+    context.save("field/facts.json", lambda path: path.write_text(text, "utf-8"))
+
+
+def _detection_rows(table, model):
+    """Detections with what results are binned by."""
+    xy = np.stack([table["x_centroid"], table["y_centroid"]], axis=-1).reshape(-1, 2)
+    rows = QTable({"sky": table["sky"], "flux": table["flux"]})
+    rows["magnitude"] = ab_magnitude(table["flux"])
+    rows["size"] = table["semimajor_axis"]
+    rows["place"] = place_names(xy, model.data.shape)
+    rows["neighbor_light"] = over_noise(model, xy)
+    return rows
+
+
+def _read_base(context):
+    """What `field_stage` has written."""
+    psfs = [None, None]
+    for k, name in enumerate(("psf", "prior_psf")):
+        if context.products.path(f"field/{name}.fits").exists():
+            psfs[k] = read_psf(context.path(f"field/{name}.fits"))
+    return Base(
+        table=None,
+        known=context.table("field/known.ecsv"),
+        detections=context.table("field/detections.ecsv"),
+        negatives=context.table("field/negatives.ecsv"),
+        population=context.table("field/population.ecsv"),
+        psfs=tuple(psfs),
+        model=context.image("field/model.fits"),
+        empty_pulls=np.asarray(context.table("field/empty.fits")["pull"]),
+        facts=json.loads(context.path("field/facts.json").read_text("utf-8")),
+    )
+
+
+@stage("trial", "trial", needs=("field",), units=trial_names, memory=_bytes, **_READS)
+def trial_stage(context, unit):
+    """Inject sources into the field and measure it."""
+    task = Task.of(context.config, context.seed)
+    base = _read_base(context)
+    number = int(unit.rpartition("-")[2])
+    field = task.field(context.n_threads)
+    usable = _usable(base, field, task)
+    sources = injected_sources(
+        task.injection, task.sources(field, base.model.wcs), base, usable, base.model.wcs, number
+    )
+    rows, table = run_trial(field, task.injection, base, sources)
+    if len(rows):
+        rows.add_column(np.full(len(rows), number), name="trial", index=0)
+        texts = declared("miricigale.injection", "columns.toml")["sources"]
+        for name in rows.colnames:
+            rows[name].info.description = texts[name]
+    else:
+        # the user's own result
+        context.save_table(f"trials/{unit}-photometry.fits", table)
+        rows = QTable({"trial": np.zeros(0, int)})
+    context.save_table(f"trials/{unit}.fits", rows)
+
+
+def _usable(base, field, task):
+    prior = None if task.inputs is None else task.inputs.highres.read()
+    return field.usable(base.model, prior)
+
+
+@stage("result", "result", needs=("field", "trial"), sections=("injection",), plan=_states)
+def result_stage(context, _):
+    """Put all trials together, and write the page."""
+    from miricigale.injection.page import write_page
+
+    result = _result(context, context.config, context.seed)
+    context.save_table("sources.fits", result.sources)
+    if not len(result.sources):
+        return
+    context.save_table("summary.ecsv", result.summary)
+    context.save_table("purity.ecsv", result.purity())
+    image = Task.of(context.config, context.seed).image
+    context.save("index.html", lambda path: write_page(path, result, Path(image.path).name))
+
+
+def _result(context, config, seed):
+    base = _read_base(context)
+    paths = [context.path(f"trials/{name}.fits") for name in trial_names(config)]
+    tables = [read_table(path, wanted="a table of a trial") for path in paths]
+    sources = vstack([one for one in tables if len(one)] or tables, metadata_conflicts="silent")
+    for table, negative in ((base.detections, False), (base.negatives, True)):
+        table["negative"] = np.full(len(table), negative)
+    detections = vstack([base.detections, base.negatives], metadata_conflicts="silent")
+    injection = Task.of(config, seed).injection
+    meta = provenance(
+        seed=seed,
+        n_trials=config.injection.n_trials,
+        threshold=injection.threshold,
+        preset=str(injection.preset),
+        **base.facts,
+    )
+    sources.meta = dict(meta)
+    return InjectionResult(
+        sources=sources,
+        detections=detections,
+        photometry=read_table(context.products.path("photometry.fits"), wanted="the table"),
+        empty_pulls=base.empty_pulls,
+        meta=meta,
+    )
+
+
+def injection_stages():
+    """The stages of a run of injection."""
+    return field_stage, trial_stage, result_stage
+
+
+def run_injection(
+    injection, image, highres, folder, *, executor, redo, n_threads, progress_bar, options
+):
+    """Run a `~miricigale.injection.Injection`; see its method ``run``."""
+    foreign = sorted(set(options) & set(_FOREIGN))
+    check_that(not foreign, "options", f"others than {list(_FOREIGN)}", foreign)
+    file = image if isinstance(image, MosaicFile) else MosaicFile(image)
+    inputs = None
+    if highres is not None:
+        inputs = Inputs.of(file, highres, **{"psf_stars": None, **options})
+        named = {name: absolute(getattr(inputs, name)) for name in ("segmentation", "catalog")}
+        kernels = tuple(map(absolute, inputs.kernels))
+        inputs = dataclasses.replace(inputs, kernels=kernels, **named)
+        inputs.check()
+        options = {}
+    if file.header.filter is None:
+        raise argument_error("filter", f"given, for {file.path} does not name it", None)
+    values = {
+        "inputs": None if inputs is None else inputs_text(inputs),
+        "image": as_text(file),
+        "options": as_text(options),
+    }
+    settings = {one.name: getattr(injection, one.name) for one in dataclasses.fields(injection)}
+    del settings["n_trials"], settings["seed"]
+    settings["catalog"] = _catalog_text(injection.catalog)
+    if isinstance(injection.preset, DetectionPreset):
+        settings["preset"] = dataclasses.asdict(injection.preset)
+    config = InjectionConfig(
+        run=RunSection(threads=n_threads or 0, seed=injection.seed),
+        injection=InjectionSection(
+            inputs=json.dumps(values, sort_keys=True),
+            settings=json.dumps(settings, sort_keys=True),
+            n_trials=injection.n_trials,
+        ),
+    )
+    # faults of the user's are refused here rather than in a trial
+    field = Task.of(config, injection.seed).field(n_threads)
+    _ = field.photometers if inputs is not None else field.psf
+    Task.of(config, injection.seed).sources(field, file.header.wcs)
+    runner = StudyRunner(
+        config, folder, injection_stages, executor=executor, redo=redo, progress_bar=progress_bar
+    )
+    runner.run()
+    result = _result(Context(config, folder), config, injection.seed)
+    return dataclasses.replace(result, folder=Path(folder))
+
+
+def _catalog_text(catalog):
+    """An own catalog as a path, or as text."""
+    if catalog is None:
+        return None
+    if isinstance(catalog, (str, os.PathLike)):
+        return absolute(catalog)
+    text = io.StringIO()
+    as_table(catalog, "catalog").write(text, format="ascii.ecsv")
+    return text.getvalue()
