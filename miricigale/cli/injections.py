@@ -1,38 +1,54 @@
 """The command that injects sources."""
 
 from miricigale.cli.catalogs import images_of
-from miricigale.cli.options import chosen, workers
+from miricigale.cli.exposures import reducer_of
+from miricigale.cli.options import TYPES, chosen, declarations, workers
 
 #: Options of photometry that are left to its defaults where they are not given.
 _PHOTOMETRY = "max_shift background_order offset_order second_pass components"
 
+#: Options that need a prior, beside those of the prior itself.
+_OF_PRIOR = ("segmentation", "catalog", "kernel", "psf_stars")
+
 
 def inject(args):
-    """Inject sources into an image."""
+    """Inject sources into an image or ramps."""
     from miricigale.injection import Injection
+    from miricigale.injection.ramps import is_ramp
 
+    ramps = []
+    while len(ramps) < len(args.images) and is_ramp(args.images[len(ramps)].partition("[")[0]):
+        ramps.append(args.images[len(ramps)])
+    others = args.images[len(ramps) :] if ramps else args.images[1:]
+    if len(others) > 1:
+        msg = f"wanted are an image, or ramps, and at most one prior, got {len(others)} priors"
+        raise ValueError(msg)
+    highres = None
     options = chosen(args, _PHOTOMETRY)
-    image, highres = _image_and_prior(args)
-    if highres is None:
-        _refuse_prior_options(args)
+    if others:
+        (highres,) = images_of(args, others, "highres_")
+        options |= chosen(args, "segmentation catalog psf_stars") | {"kernel": args.kernel}
     else:
-        options |= chosen(args, "segmentation catalog psf_stars")
-        options["kernel"] = args.kernel
+        names = [name for name in vars(args) if name.startswith("highres_")]
+        _refuse(args, (*names, *_OF_PRIOR), "given with a prior")
     injection = Injection(
         args.sources,
         **chosen(args, "n_trials n_sources stars threshold preset seed"),
     )
+    options |= chosen(args, "redo") | {"folder": args.output, "n_threads": args.threads}
+    options["progress_bar"] = not args.no_progress
     with workers(None, args.threads) as executor:
-        result = injection.run(
-            image,
-            highres,
-            folder=args.output,
-            executor=executor,
-            redo=args.redo,
-            n_threads=args.threads,
-            progress_bar=not args.no_progress,
-            **options,
-        )
+        options["executor"] = executor
+        if ramps:
+            of_image = [name.removeprefix("highres_") for name in vars(args)]
+            of_image = {name for name in of_image if f"highres_{name}" in vars(args)}
+            _refuse(args, sorted(of_image), "left out for ramps, whose mosaic states it")
+            options |= chosen(args, "pixel_scale align") | {"reducer": reducer_of(args)}
+            result = injection.run_exposures(ramps, highres, **options)
+        else:
+            _refuse_reduction(args)
+            (image,) = images_of(args, args.images[:1])
+            result = injection.run(image, highres, **options)
     for question in ("detection", "forced"):
         curve = result.curve(question) if len(result.sources) else None
         if curve is not None:
@@ -42,25 +58,26 @@ def inject(args):
     return 0
 
 
-def _image_and_prior(args):
-    """The image and the prior (or None), with their options."""
-    if len(args.images) > 2:
-        msg = f"wanted are an image and a prior, got {len(args.images)} files"
-        raise ValueError(msg)
-    (image,) = images_of(args, args.images[:1])
-    if len(args.images) == 1:
-        return image, None
-    (highres,) = images_of(args, args.images[1:], "highres_")
-    return image, highres
-
-
-def _refuse_prior_options(args):
-    """Refuse options that need a prior."""
+def _refuse(args, names, wanted):
+    """Refuse options that mean nothing for what is given."""
     from miricigale.utils.exceptions import argument_error
 
-    names = [name for name in vars(args) if name.startswith("highres_")]
-    for name in (*names, "segmentation", "catalog", "kernel", "psf_stars"):
+    for name in names:
         value = getattr(args, name)
         if value is not None:
-            flag = "--" + name.replace("_", "-")
-            raise argument_error(flag, "given with a prior", value)
+            raise argument_error(name, wanted, value)
+
+
+def _refuse_reduction(args):
+    """Refuse options of the reduction for an image that is one already."""
+    from miricigale.utils.exceptions import argument_error
+
+    declared = declarations()
+    for flag in declared["inject"]["as_in"]["reduce"]:
+        option = declared["reduce"]["options"][flag]
+        name = flag.lstrip("-").replace("-", "_")
+        default = option.get("default", False if option.get("action") else None)
+        if isinstance(default, str) and "type" in option:
+            default = TYPES[option["type"]](default)
+        if getattr(args, name) != default:
+            raise argument_error(name, "given for ramps (level 1b)", getattr(args, name))

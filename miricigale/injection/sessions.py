@@ -1,10 +1,14 @@
 """Injection of sources into real data: the class that a session uses."""
 
 import dataclasses
+from pathlib import Path
 
+from miricigale.injection.ramps import Exposures
 from miricigale.injection.settings import InjectionSettings
 from miricigale.injection.stages import run_injection
+from miricigale.reduction import Reducer
 from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.units import ANGLE
 
 
 @checked_calls
@@ -128,4 +132,70 @@ class Injection(Interactive, InjectionSettings):
             n_threads=n_threads,
             progress_bar=progress_bar,
             options=options,
+        )
+
+    def run_exposures(
+        self,
+        paths,
+        highres=None,
+        *,
+        folder,
+        reducer=None,
+        pixel_scale=0.11 * ANGLE,
+        align=None,
+        executor=None,
+        redo=False,
+        n_threads=None,
+        progress_bar=False,
+        **options,
+    ):
+        """
+        Inject sources into ramps, reduce these, and measure the mosaic.
+
+        Parameters
+        ----------
+        paths : iterable of path-like
+            Level-1b files (``_uncal``) of one filter.
+        highres
+            As for `run`.
+        folder : path-like
+            As for `run`. The ramps as they are are reduced into ``<folder>-reduced`` beside it.
+        reducer, pixel_scale, align : optional
+            As for `~miricigale.reduction.reduce_files`. The references of the reducer are those by which light
+            becomes counts.
+        executor, redo, n_threads, progress_bar, **options
+            As for `run`.
+
+        Returns
+        -------
+        result : `InjectionResult`
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.OtherResultsError`, `~miricigale.utils.exceptions.DataError`, ValueError
+            As `run`; if a file is not level 1b or cannot be reduced, or files are of several filters.
+
+        Notes
+        -----
+        Light goes through the model PSF of the detector at the middle of the field, the distortion, flat field
+        and photometric conversion of the reduction, Poisson noise, interpixel capacitance and the inverse of
+        the linearity (`miricigale.injection.ramps.inject_ramp`). All other noise is the ramp's own.
+        """
+        exposures = Exposures(
+            tuple(paths), Reducer() if reducer is None else reducer, pixel_scale, align
+        )
+        folder = Path(folder)
+        beside = folder.with_name(f"{folder.name}-reduced")
+        mosaic = exposures.reduce(beside, n_threads=n_threads, progress_bar=progress_bar)
+        return run_injection(
+            self,
+            mosaic,
+            highres,
+            folder,
+            executor=executor,
+            redo=redo,
+            n_threads=n_threads,
+            progress_bar=progress_bar,
+            options=options,
+            exposures=exposures,
         )

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import os
+import tempfile
 from pathlib import Path
 from typing import ClassVar
 
@@ -12,6 +13,7 @@ from astropy.table import QTable, vstack
 
 from miricigale.injection.field import image_field, over_noise
 from miricigale.injection.population import read_sources
+from miricigale.injection.ramps import Exposures
 from miricigale.injection.results import InjectionResult
 from miricigale.injection.settings import InjectionSettings
 from miricigale.injection.trials import (
@@ -109,12 +111,15 @@ class Task:
         Of the photometer, without a prior.
     injection : `~miricigale.injection.settings.InjectionSettings`
         Settings.
+    exposures : `~miricigale.injection.ramps.Exposures` or None
+        Ramps that the image was reduced from, into which sources are put.
     """
 
     inputs: Inputs | None
     image: MosaicFile
     options: dict
     injection: InjectionSettings
+    exposures: Exposures | None = None
 
     @classmethod
     def of(cls, config, seed):
@@ -128,7 +133,11 @@ class Task:
             settings["preset"] = DetectionPreset(**settings["preset"])
         image = from_text(values["image"])
         options = from_text(values["options"])
-        return cls(inputs, image, options, InjectionSettings(**settings, seed=seed))
+        exposures = None
+        if values["exposures"] is not None:
+            exposures = from_text(values["exposures"])
+            exposures = Exposures(**exposures | {"paths": tuple(exposures["paths"])})
+        return cls(inputs, image, options, InjectionSettings(**settings, seed=seed), exposures)
 
     def field(self, n_threads):
         """The field that is measured."""
@@ -151,6 +160,8 @@ class Task:
         paths += [self.image.inverse_variance, self.image.weight]
         if catalog is not None and not catalog.startswith("#"):
             paths.append(catalog)
+        if self.exposures is not None:
+            paths += self.exposures.paths
         return [path for path in paths if path is not None]
 
 
@@ -241,7 +252,12 @@ def trial_stage(context, unit):
     sources = injected_sources(
         task.injection, task.sources(field, base.model.wcs), base, usable, base.model.wcs, number
     )
-    rows, table = run_trial(field, task.injection, base, sources)
+    with tempfile.TemporaryDirectory() as folder:
+        image = None
+        if task.exposures is not None and len(sources):
+            where = context.seed, number, folder, context.n_threads
+            image = task.image.replace(path=task.exposures.injected(sources, *where))
+        rows, table = run_trial(field, task.injection, base, sources, image)
     if len(rows):
         rows.add_column(np.full(len(rows), number), name="trial", index=0)
         texts = declared("miricigale.injection", "columns.toml")["sources"]
@@ -270,8 +286,12 @@ def result_stage(context, _):
         return
     context.save_table("summary.ecsv", result.summary)
     context.save_table("purity.ecsv", result.purity())
-    image = Task.of(context.config, context.seed).image
-    context.save("index.html", lambda path: write_page(path, result, Path(image.path).name))
+    task = Task.of(context.config, context.seed)
+    name = Path(task.image.path).name
+    in_ramps = task.exposures is not None
+    if in_ramps:
+        name = f"{len(task.exposures.paths)} ramps"
+    context.save("index.html", lambda path: write_page(path, result, name, in_ramps=in_ramps))
 
 
 def _result(context, config, seed):
@@ -306,7 +326,17 @@ def injection_stages():
 
 
 def run_injection(
-    injection, image, highres, folder, *, executor, redo, n_threads, progress_bar, options
+    injection,
+    image,
+    highres,
+    folder,
+    *,
+    executor,
+    redo,
+    n_threads,
+    progress_bar,
+    options,
+    exposures=None,
 ):
     """Run a `~miricigale.injection.Injection`; see its method ``run``."""
     foreign = sorted(set(options) & set(_FOREIGN))
@@ -326,6 +356,7 @@ def run_injection(
         "inputs": None if inputs is None else inputs_text(inputs),
         "image": as_text(file),
         "options": as_text(options),
+        "exposures": None if exposures is None else as_text(_plain_exposures(exposures)),
     }
     settings = {one.name: getattr(injection, one.name) for one in dataclasses.fields(injection)}
     del settings["n_trials"], settings["seed"]
@@ -350,6 +381,14 @@ def run_injection(
     runner.run()
     result = _result(Context(config, folder), config, injection.seed)
     return dataclasses.replace(result, folder=Path(folder))
+
+
+def _plain_exposures(exposures):
+    """Ramps and settings as `as_text` takes them."""
+    values = {one.name: getattr(exposures, one.name) for one in dataclasses.fields(exposures)}
+    values["paths"] = [absolute(path) for path in exposures.paths]
+    values["reducer"] = exposures.reducer.replace(n_threads=None)
+    return values
 
 
 def _catalog_text(catalog):
