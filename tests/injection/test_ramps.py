@@ -165,6 +165,7 @@ def test_files_keep_all_but_their_counts(exposure, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the image lies about")
 def test_ramps_go_through_the_users_reduction(tmp_path, capsys):
     """By the command: dithers of a field of stars, own bright stars, no prior."""
     first = Exposure("F770W", n_groups=8, subarray="SUB128", pointing="53 -27")
