@@ -69,3 +69,14 @@ def difference_weight(i, n, v, s):
     weight = f * g / (v * (1.0 + (1.0 - f) * (1.0 - g)))
     leverage = f * g * (2.0 - f) * (2.0 - g) * (1.0 + q)
     return weight, leverage / (s * q * (2.0 + q) * end)
+
+
+def shared_photons(n_frames):
+    """
+    Covariance of neighboring differences over the Poisson variance of one, for means of ``n_frames`` frames.
+
+    Frames of a group have the charge of those before. A difference of two means counts the charge that comes in
+    frame i with weight min(i, 2 M - i) / M, i = 1 ... 2 M - 1, and shares M - 1 frames with the next. The sums of
+    squares and products are (2 M^2 + 1) / (3 M^2) and (M^2 - 1) / (6 M^2) of the variance in the time of a group.
+    """
+    return (n_frames**2 - 1) / (6 * n_frames**2)

@@ -9,7 +9,7 @@ from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
 from miricigale.psf import MIRI_PIXEL_SCALE, instrument_psf, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_positive, check_that
-from miricigale.utils.units import ANGLE, positive, to_array
+from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 #: Factors on the noise of the sky by name: what surveys in flight lose against an ideal fit, and nothing.
 EXCESS = {"flight": 1.4, "ideal": 1.0}
@@ -51,6 +51,7 @@ def fitted_noise(
     psf=None,
     n_integrations=1,
     frame_time=2.775 * u.s,
+    n_frames=1,
     n_dithers=1,
     residual=None,
     mosaic=0.11 * u.arcsec,
@@ -77,6 +78,8 @@ def fitted_noise(
         Ramps into which the time is divided (over all dithers).
     frame_time : `~astropy.units.Quantity`, optional
         Time of one frame.
+    n_frames : int, optional
+        Frames that are averaged to one group.
     n_dithers : int, optional
         Positions over which the time is divided; a residual pattern averages down with them.
     residual : str, float or None, optional
@@ -130,9 +133,12 @@ def fitted_noise(
     seconds = positive(time, u.s, "time")
     for name, value in (("n_integrations", n_integrations), ("n_dithers", n_dithers)):
         check_that(int(value) == value and value >= 1, name, "an integer of at least 1", value)
-    step = float(to_array(frame_time, u.s, "frame_time"))
-    n_frames = int(seconds / n_integrations / step * (1 + 1e-9))
-    check_that(n_frames >= 2, "time", f"at least two frames of {step} s in each integration", time)
+    n_frames = check_count(n_frames, "n_frames")
+    step = n_frames * float(to_array(frame_time, u.s, "frame_time"))
+    n_groups = int(seconds / n_integrations / step * (1 + 1e-9))
+    group = "frames" if n_frames == 1 else "groups"
+    wanted = f"at least two {group} of {step} s in each integration"
+    check_that(n_groups >= 2, "time", wanted, time)
     factor = excess_factor(excess)
     share = _share(filter, psf, size)
     if mosaic is None:
@@ -143,11 +149,12 @@ def fitted_noise(
     noise = ExposureNoise(
         filter=filter,
         background=background,
-        n_groups=n_frames,
+        n_groups=n_groups,
         group_time=step,
-        n_ramps=seconds / (n_frames * step),
+        n_ramps=seconds / (n_groups * step),
         detector=detector,
         subarray=subarray,
+        n_frames=n_frames,
     )
     electrons = noise.electrons
     power = np.sum(weight**2) / _SAMPLES**2

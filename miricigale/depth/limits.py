@@ -10,7 +10,7 @@ from photutils.aperture import CircularAnnulus, CircularAperture
 from miricigale.depth.fitted import fitted_noise, psf_of
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
 from miricigale.depth.published import etc_setup, scaled_limit
-from miricigale.instrument import Exposure, frame_time, imager_filters
+from miricigale.instrument import Exposure, frame_time, frames_per_group, imager_filters
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
@@ -170,7 +170,8 @@ def aperture_noise(
     amplitude = pattern_amplitude(residual, filter)
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
     groups = setup.n_groups if n_groups is None else n_groups
-    step = frame_time(readout, subarray).to_value(TIME)
+    n_frames = frames_per_group(readout)
+    step = n_frames * frame_time(readout, subarray).to_value(TIME)
     check_positive(n_sigma, "n_sigma")
     check_least(n_dithers, "n_dithers", 1)
     check_least(groups, "n_groups", 2, whole=True)
@@ -184,6 +185,7 @@ def aperture_noise(
         n_ramps=seconds / (groups * step),
         detector=detector,
         subarray=subarray,
+        n_frames=n_frames,
     )
     _check_well(noise)
     variance, growth, sky, electrons = noise.variance(), noise.growth, noise.sky, noise.electrons
@@ -304,7 +306,7 @@ def sensitivity(
     names = ("n_groups", "readout", "subarray")
     form = {name: options.pop(name) for name in names if name in options}
     options |= _ramps(filter, time, n_dithers, **form) | {"n_dithers": n_dithers}
-    step = options["frame_time"].to_value(TIME)
+    step = options["n_frames"] * options["frame_time"].to_value(TIME)
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
     noise = ExposureNoise(
         filter=filter,
@@ -314,6 +316,7 @@ def sensitivity(
         n_ramps=options["n_integrations"],
         detector=options.get("detector"),
         subarray=options["subarray"],
+        n_frames=options["n_frames"],
     )
     _check_well(noise)
     if excess is None:
@@ -333,14 +336,21 @@ def _ramps(filter, time, n_dithers, *, n_groups=None, readout="FASTR1", subarray
         return {
             "n_integrations": n_integrations,
             "frame_time": exposure.frame_time,
+            "n_frames": exposure.n_frames,
             "subarray": subarray,
         }
     check_least(n_groups, "n_groups", 2, whole=True)
-    step = frame_time(readout, subarray)
+    frame = frame_time(readout, subarray)
+    n_frames = frames_per_group(readout)
+    step = n_frames * frame.to_value(TIME)
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
-    _check_time(time, n_groups, step.to_value(TIME))
-    n_integrations = round(seconds / (n_groups * step.to_value(TIME)))
-    return {"n_integrations": n_integrations, "frame_time": step, "subarray": subarray}
+    _check_time(time, n_groups, step)
+    return {
+        "n_integrations": round(seconds / (n_groups * step)),
+        "frame_time": frame,
+        "n_frames": n_frames,
+        "subarray": subarray,
+    }
 
 
 #: Columns of `sensitivity_table` by what `aperture_noise` calls them.

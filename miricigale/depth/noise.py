@@ -4,6 +4,7 @@ import dataclasses
 
 import astropy.units as u
 import numpy as np
+from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
 from miricigale.depth import _core
@@ -41,6 +42,8 @@ class ExposureNoise:
         `~miricigale.instrument.miri_detector` if None.
     subarray : str
         Whose response counts.
+    n_frames : int
+        Frames whose mean a group is.
 
     Raises
     ------
@@ -64,6 +67,7 @@ class ExposureNoise:
     n_ramps: float
     detector: DetectorProperties | None = None
     subarray: str = "FULL"
+    n_frames: int = 1
 
     def __post_init__(self):
         check_kind(self.detector, "detector", DetectorProperties)
@@ -114,7 +118,8 @@ class ExposureNoise:
         variance : float
             (Electrons per second) squared.
         """
-        ramp = {"n_groups": self.n_groups, "group_time": self.group_time}
+        names = ("n_groups", "group_time", "n_frames")
+        ramp = {name: getattr(self, name) for name in names}
         noise = self.detector.read_noise * self.detector.gain
         return ramp_variance(self.rate + further, **ramp, read_noise=noise) / self.n_ramps
 
@@ -125,18 +130,33 @@ class ExposureNoise:
         return (self.variance(step) - self.variance()) / step
 
 
-def ramp_variance(rate, *, n_groups, group_time, read_noise):
+def ramp_variance(rate, *, n_groups, group_time, read_noise, n_frames=1):
     """
     Variance of the optimally weighted slope of one ramp, (electrons per second) squared.
 
     The differences of groups have Poisson variance on the diagonal (``rate`` in electrons per
     second times ``group_time`` in s) and share the ``read_noise`` (electrons) with their
-    neighbors; the best slope has the variance 1 / (1^T C^-1 1).
+    neighbors; the best slope has the variance 1 / (1^T C^-1 1). Means of ``n_frames`` frames have less
+    read noise, and share photons with their neighbors, too.
     """
     if rate == 0 and read_noise == 0:
         return 0.0
-    total, _ = _core.weight_sums(n_groups - 1, float(rate * group_time), float(read_noise) ** 2)
+    photons = float(rate * group_time)
+    read = float(read_noise) ** 2
+    if n_frames == 1:
+        total, _ = _core.weight_sums(n_groups - 1, photons, read)
+    else:
+        total = _averaged_sum(n_groups - 1, photons, read, n_frames)
     return 1.0 / (total * group_time**2)
+
+
+def _averaged_sum(n_differences, photons, read, n_frames):
+    """Sum of the weights of differences of averaged groups: their matrix has three diagonals."""
+    shared = read / n_frames - _core.shared_photons(n_frames) * photons
+    matrix = np.empty((2, n_differences))
+    matrix[0] = -shared
+    matrix[1] = photons + 2 * shared
+    return float(solveh_banded(matrix, np.ones(n_differences)).sum())
 
 
 def noise_power(weights, correlation=None):

@@ -337,7 +337,7 @@ class Detector(Interactive):
             As `expose`.
         ValueError
             As `expose`; or if the detector has 1/f noise, the brighter-fatter effect, a decay after resets,
-            or effects of other kinds than the package's.
+            or effects of other kinds than the package's; or if groups are means of several frames.
 
         Warns
         -----
@@ -359,6 +359,9 @@ class Detector(Interactive):
                 raise argument_error("effects", wanted, repr(effect))
         seed = check_seed(seed)
         task = self._task(image, exposure, seed, previous)
+        wanted = "one of groups that are single frames, to be collected without them"
+        one_frame = task.exposure.n_frames == 1
+        check_that(one_frame, "exposure", wanted, task.exposure.readout)
         *planes, pixel_dq = task.collect(n_threads, progress_bar)
         return Charge(
             task.exposure, *planes, pixel_dq, task.effects, self.properties, seed, task.meta

@@ -18,7 +18,7 @@ from miricigale.instrument import (
     reference_pixel_mask,
     steps_done,
 )
-from miricigale.utils.exceptions import DataError, data_error
+from miricigale.utils.exceptions import DataError, DetectorWarning, data_error, warn
 from miricigale.utils.files import open_fits
 from miricigale.utils.options import check_data
 from miricigale.utils.parallel import check_memory
@@ -140,6 +140,7 @@ def _exposure(path, header, shape):
 def _check_header(path, header, exposure):
     """Refuse a header that contradicts its data or its read-out pattern."""
     part = exposure.aperture
+    n_frames = exposure.n_frames
     frame = exposure.frame_time.to_value("s")
     n_int = exposure.n_integrations
     if "INTSTART" in header and "INTEND" in header:
@@ -150,23 +151,39 @@ def _check_header(path, header, exposure):
     wanted = {
         "NGROUPS": (header.get("NGROUPS"), exposure.n_groups, "in SCI"),
         "NINTS": (n_int, exposure.n_integrations, "in SCI"),
-        "NFRAMES": (header.get("NFRAMES"), 1, pattern),
+        "NFRAMES": (header.get("NFRAMES"), n_frames, pattern),
+        "FRMDIVSR": (header.get("FRMDIVSR"), n_frames, pattern),
         "GROUPGAP": (header.get("GROUPGAP"), 0, pattern),
         "SUBSIZE1": (header.get("SUBSIZE1"), part.shape[1], part_name),
         "SUBSIZE2": (header.get("SUBSIZE2"), part.shape[0], part_name),
         "SUBSTRT1": (header.get("SUBSTRT1"), part.origin[0] + 1, part_name),
         "SUBSTRT2": (header.get("SUBSTRT2"), part.origin[1] + 1, part_name),
     }
+    if header.get("NFRAMES") == 1 and header.get("FRMDIVSR", n_frames) == n_frames:
+        # before calwebb_detector1 has multiplied them, for groups that are averaged on board
+        del wanted["NFRAMES"]
     for name, (stated, true, where) in wanted.items():
         what = f"{name} is {stated} in the header and {true} {where}"
         check_data(not (stated is not None and stated != true), path, f"contradicts itself: {what}")
-    for name in ("TGROUP", "TFRAME"):
+    times = {"TFRAME": frame, "TGROUP": n_frames * frame}
+    for name, true in times.items():
         stated = header.get(name)
-        # the table of the read-out patterns is rounded to a millisecond or three digits
-        if stated is not None and not abs(stated - frame) < 5e-3 * frame:
+        if name == "TGROUP" and n_frames > 1 and _is_time(stated, frame):
+            msg = (
+                f"{path}: TGROUP = {stated} s is the time of a frame, as in files of 2023 and before; a group of "
+                f"{exposure.readout} takes {true:.6g} s, which is used"
+            )
+            warn(msg, DetectorWarning)
+        elif stated is not None and not _is_time(stated, true):
             truth = f"the frame of {exposure.readout} {exposure.subarray} takes {frame} s"
-            what = f"{name} = {stated} s, but {truth}, and is one group"
+            group = "one group" if n_frames == 1 else f"one of {n_frames} of a group"
+            what = f"{name} = {stated} s, but {truth}, and is {group}"
             raise data_error(path, f"contradicts itself: {what}")
+
+
+def _is_time(stated, true):
+    """Whether a time in a header is that of the table, which is rounded to a millisecond or three digits."""
+    return stated is not None and abs(stated - true) < 5e-3 * true
 
 
 def _counts(hdu):

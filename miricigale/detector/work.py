@@ -1,6 +1,7 @@
 """The work of an exposure: effects that act on blocks of rows, side by side."""
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -60,10 +61,15 @@ class Work:
         e = self.exposure
         return (e.n_integrations, e.n_groups, *e.shape)
 
+    @functools.cached_property
+    def frames(self):
+        """The exposure that the effects see: each frame is a group of it."""
+        return self.exposure.of_frames()
+
     def run(self, store, n_threads, progress_bar):
         """Expose all rows, block by block; each block is handed to ``store``."""
-        n_int, n_group, _, nx = self.shape
-        height = max(1, _BLOCK_SAMPLES // (n_int * n_group * nx))
+        n_int, nx = self.shape[0], self.shape[3]
+        height = max(1, _BLOCK_SAMPLES // (n_int * self.frames.n_groups * nx))
 
         def work(rows):
             store(rows, *self._exposed(rows))
@@ -103,14 +109,17 @@ class Work:
     def _exposed(self, rows):
         """Apply the effects to some rows: counts, flags of pixels, flags of groups."""
         wide, inner = self._with_halo(rows, self.keyed)
-        shape = (*self.shape[:2], wide.stop - wide.start, self.shape[3])
+        shape = (self.shape[0], self.frames.n_groups, wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape[2:], np.uint32)
         group_dq = np.zeros(shape, np.uint8)
-        where = (self.exposure, self.properties, wide, pixel_dq, group_dq)
+        where = (self.frames, self.properties, wide, pixel_dq, group_dq)
         _, array, rest = self._lit(Block, where, self.keyed)
         for effect, key in rest:
             array = effect.apply(array, Block(*where, key, self.previous))
-        return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
+        counts, flags = array[:, :, inner], group_dq[:, :, inner]
+        if self.exposure.n_frames > 1:
+            counts, flags = _averaged(counts, flags, self.exposure.n_frames)
+        return counts, pixel_dq[inner], flags
 
     def _lit(self, kind, where, chain):
         """
@@ -162,3 +171,16 @@ class Work:
                 # the shape alone is used of its flags
                 hits = effect.hits(Block(*context[:2], rows, pixel_dq, flags, key))
         return mean[inner], ramp[0, 0, inner], pixel_dq[inner], *hits
+
+
+def _averaged(counts, flags, n_frames):
+    """
+    Average frames to groups as on board: sums of counts, shifted by the bits of ``n_frames``, a power of two.
+
+    A group has the flags of its frames. The sum is rounded down.
+    """
+    n_int, n_all, *shape = counts.shape
+    parts = (n_int, n_all // n_frames, n_frames, *shape)
+    total = counts.reshape(parts).sum(axis=2, dtype=np.uint32)
+    shift = n_frames.bit_length() - 1
+    return (total >> shift).astype(counts.dtype), np.bitwise_or.reduce(flags.reshape(parts), axis=2)

@@ -17,7 +17,9 @@ from .dq import dq_planes as dq_planes
 from .dq import read_dq as read_dq
 from .dq import with_own_bits as with_own_bits
 from .exposure import Exposure as Exposure
+from .exposure import frame_pattern as frame_pattern
 from .exposure import frame_time as frame_time
+from .exposure import frames_per_group as frames_per_group
 from .exposure import readout_patterns as readout_patterns
 from .figures import imager_filters as imager_filters
 from .history import REFERENCES as REFERENCES

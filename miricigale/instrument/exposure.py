@@ -29,9 +29,38 @@ def readout_patterns():
     --------
     >>> from miricigale.instrument import readout_patterns
     >>> readout_patterns()
-    ('FASTR1', 'SLOWR1')
+    ('FASTR1', 'SLOWR1', 'FASTGRPAVG', 'FASTGRPAVG8', 'FASTGRPAVG16', 'FASTGRPAVG32', 'FASTGRPAVG64')
     """
-    return tuple(table()["readout"])
+    return (*table()["readout"], *table()["averaged"])
+
+
+def frames_per_group(readout="FASTR1"):
+    """
+    Frames that are averaged on board to one group.
+
+    Parameters
+    ----------
+    readout : str, optional
+        One of `readout_patterns`.
+
+    Returns
+    -------
+    n_frames : int
+        1 for FASTR1 and SLOWR1.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import frames_per_group
+    >>> frames_per_group("FASTGRPAVG8")
+    8
+    """
+    check_names([readout], "readout pattern", readout_patterns())
+    return table()["averaged"].get(readout, 1)
+
+
+def frame_pattern(readout):
+    """The pattern in which the frames of a readout pattern are read: itself, or that which is averaged."""
+    return "FASTR1" if readout in table()["averaged"] else readout
 
 
 def frame_time(readout="FASTR1", subarray="FULL"):
@@ -43,12 +72,12 @@ def frame_time(readout="FASTR1", subarray="FULL"):
     readout : str, optional
         One of `readout_patterns`.
     subarray : str, optional
-        One of `~miricigale.instrument.subarrays`; only FASTR1 reads sub-arrays.
+        One of `~miricigale.instrument.subarrays`; SLOWR1 reads none.
 
     Returns
     -------
     time : `~astropy.units.Quantity`
-        In s. Both patterns have one frame in a group.
+        In s. A group has as many frames as `frames_per_group` says.
 
     Examples
     --------
@@ -56,28 +85,28 @@ def frame_time(readout="FASTR1", subarray="FULL"):
     >>> frame_time().round(3), frame_time("FASTR1", "SUB64").round(3)
     (<Quantity 2.775 s>, <Quantity 0.085 s>)
     """
-    times = table()["readout"]
-    check_names([readout], "readout pattern", times)
-    check_names([subarray], f"sub-array of {readout}", times[readout])
-    return times[readout][subarray] * u.s
+    check_names([readout], "readout pattern", readout_patterns())
+    times = table()["readout"][frame_pattern(readout)]
+    check_names([subarray], f"sub-array of {readout}", times)
+    return times[subarray] * u.s
 
 
-def _counts_of(filter, time, frame, n_integrations, max_fill=0.6, max_groups=100):
+def _counts_of(filter, time, group, n_integrations, max_fill=0.6, max_groups=100):
     """Groups and integrations whose time is nearest to the wanted one; the integrations may be given."""
     seconds = float(to_array(time, u.s, "time", ndim=0, finite=True))
-    frames = round(seconds / frame.value)
-    check_that(frames >= 2, "time", f"at least two frames of {frame}", time)
+    groups = round(seconds / group.value)
+    check_that(groups >= 2, "time", f"at least two groups of {group}", time)
     choices = [n_integrations]
     if n_integrations is None:
-        fills = miri_detector().full_well / electron_rate(filter) / frame.value
+        fills = miri_detector().full_well / electron_rate(filter) / group.value
         longest = min(
             max(2, math.floor(max_fill * fills)), check_count(max_groups, "max_groups", 2)
         )
-        least = math.ceil(frames / longest)
+        least = math.ceil(groups / longest)
         # one more, or up to a tenth, if they come nearer
         choices = range(least, least + max(2, least // 10 + 1))
-    counts = [(max(2, round(frames / n)), n) for n in choices]
-    return min(counts, key=lambda pair: abs(math.prod(pair) - frames))
+    counts = [(max(2, round(groups / n)), n) for n in choices]
+    return min(counts, key=lambda pair: abs(math.prod(pair) - groups))
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -93,7 +122,8 @@ class Exposure(Interactive):
         Wanted exposure time in place of ``n_groups``; `from_time` splits it, and ``exposure_time`` is what
         comes of it.
     readout : str, optional
-        Readout pattern, ``"FASTR1"`` or ``"SLOWR1"``.
+        Readout pattern, one of `readout_patterns`: ``"FASTR1"``, ``"SLOWR1"``, or ``"FASTGRPAVG8"`` and
+        its kind, whose groups are means of frames of FASTR1.
     n_groups : int, optional
         Groups in an integration, at least 2.
     n_integrations : int, optional
@@ -153,7 +183,7 @@ class Exposure(Interactive):
         readout = str(readout).upper()
         subarray = str(subarray).upper()
         aperture(subarray)
-        frame = frame_time(readout, subarray)
+        group = frames_per_group(readout) * frame_time(readout, subarray)
         if (n_groups is None) == (time is None):
             if time is None:
                 got = "neither"
@@ -164,7 +194,7 @@ class Exposure(Interactive):
         if n_integrations is not None:
             n_integrations = check_count(n_integrations, "n_integrations")
         if time is not None:
-            n_groups, n_integrations = _counts_of(filter, time, frame, n_integrations)
+            n_groups, n_integrations = _counts_of(filter, time, group, n_integrations)
         counts["n_groups"] = check_count(n_groups, "n_groups", 2)
         counts["n_integrations"] = n_integrations or 1
         if pointing is not None:
@@ -224,8 +254,8 @@ class Exposure(Interactive):
         ----------
         .. [1] JWST User Documentation, "MIRI Detector Readout FASTR1".
         """
-        frame = cls(filter, n_groups=2, **options).frame_time
-        n_groups, n_integrations = _counts_of(filter, time, frame, None, max_fill, max_groups)
+        group = cls(filter, n_groups=2, **options).group_time
+        n_groups, n_integrations = _counts_of(filter, time, group, None, max_fill, max_groups)
         return cls(filter, n_groups=n_groups, n_integrations=n_integrations, **options)
 
     def replace(self, **changes):
@@ -246,7 +276,29 @@ class Exposure(Interactive):
         """Time of one frame, s."""
         return frame_time(self.readout, self.subarray)
 
-    group_time = property(attrgetter("frame_time"), doc="Time between groups, s: one frame.")
+    @property
+    def n_frames(self):
+        """Frames that are averaged to one group."""
+        return frames_per_group(self.readout)
+
+    @property
+    def group_time(self):
+        """Time between groups, s: that of their frames."""
+        return self.n_frames * self.frame_time
+
+    def of_frames(self):
+        """
+        This exposure with each frame a group of its own.
+
+        Returns
+        -------
+        exposure : `Exposure`
+            Itself where groups are no averages.
+        """
+        if self.n_frames == 1:
+            return self
+        n_groups = self.n_groups * self.n_frames
+        return self.replace(readout=frame_pattern(self.readout), n_groups=n_groups)
 
     @property
     def integration_time(self):

@@ -216,8 +216,8 @@ class ErrorModel(Interactive):
             Factor on the noise of the sky: by default that of surveys in flight, 1.4; ``"ideal"`` is a fit of a
             source of known shape on a clean sky.
         **options
-            ``background``, ``size``, ``psf``, ``n_integrations``, ``frame_time``, ``n_dithers``, ``residual``,
-            ``mosaic``, ``subarray`` and ``detector``, as for `~miricigale.depth.fitted_noise`.
+            ``background``, ``size``, ``psf``, ``n_integrations``, ``frame_time``, ``n_frames``, ``n_dithers``,
+            ``residual``, ``mosaic``, ``subarray`` and ``detector``, as for `~miricigale.depth.fitted_noise`.
 
         Returns
         -------
@@ -239,9 +239,8 @@ class ErrorModel(Interactive):
         from miricigale.depth import fitted_noise
 
         if isinstance(filter, Exposure):
-            known = {
-                name: getattr(filter, name) for name in ("n_integrations", "frame_time", "subarray")
-            }
+            names = ("n_integrations", "frame_time", "n_frames", "subarray")
+            known = {name: getattr(filter, name) for name in names}
             options = known | options
             time = filter.exposure_time if time is None else time
             filter = filter.filter

@@ -16,7 +16,7 @@ from miricigale.depth import (
     scaled_limit,
     sensitivity,
 )
-from miricigale.instrument import Exposure, frame_time, miri_detector, psf_fwhm
+from miricigale.instrument import Exposure, frame_time, frames_per_group, miri_detector, psf_fwhm
 from miricigale.photometry import ErrorModel
 from miricigale.reduction import imager_response
 from miricigale.utils.caching import cached
@@ -161,6 +161,7 @@ class BandPlan:
             size=size,
             n_integrations=self.n_dithers * self.exposure.n_integrations,
             frame_time=self.exposure.frame_time,
+            n_frames=self.exposure.n_frames,
             subarray=self.exposure.subarray,
             fractional=self.noise.fractional,
             excess=self.noise.excess,
@@ -208,8 +209,9 @@ def _time_to(depth, filter, n_dithers, config):
         plan = _band_plan(filter, 10**log_time * u.s, n_dithers, config)
         return plan.errors().limiting_magnitude(filter).value - depth
 
-    # two frames in each dither at least
-    low = np.log10(2.5 * n_dithers * frame_time(config.exposures.readout).value)
+    # two groups in each dither at least
+    readout = config.exposures.readout
+    low = np.log10(2.5 * n_dithers * frames_per_group(readout) * frame_time(readout).value)
     if excess(low) >= 0:
         return 10**low * u.s
     if not excess(7.0) > 0:

@@ -207,6 +207,8 @@ class _References:
         model = self._model(kind, data=data)
         model.dq = dq
         exposure = model.meta.exposure
-        exposure.readpatt, exposure.nframes, exposure.groupgap = self._exposure.readout, 1, 0
+        exposure.readpatt = self._exposure.readout
+        exposure.nframes = self._exposure.n_frames
+        exposure.groupgap = 0
         exposure.nints, exposure.ngroups = data.shape[:2]
         return model

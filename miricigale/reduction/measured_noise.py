@@ -4,7 +4,9 @@ import dataclasses
 
 import numpy as np
 
+from miricigale.depth._core import shared_photons
 from miricigale.instrument import DQ
+from miricigale.reduction.rampfit import read_variance
 from miricigale.utils.options import check_that
 
 # pixels that are looked at, at most
@@ -158,8 +160,12 @@ def measure_noise(ramp):
             dark.append(_noise(_parts(ramp, k, blind)[1])[:2])
     m, v, v_err, s, s_err = np.array(rows).T
     read, _ = _mean(s, s_err)
-    rounding = 1 / 12 if ramp.data.dtype.kind == "u" else 0.0
-    read_noise = np.sqrt(max(read - rounding, 0.0))
+    rounded = ramp.data.dtype.kind == "u"
+    # of one read: the photons that neighbors share make the noise of averaged ones smaller
+    n_frames = ramp.exposure.n_frames
+    read += shared_photons(n_frames) * _mean(v, v_err)[0]
+    read -= read_variance(0.0, n_frames, rounded=rounded)
+    read_noise = np.sqrt(max(n_frames * read, 0.0))
     mean, mean_err = _mean(v, v_err)
     slow, slow_err = _mean(*np.array(dark).T) if dark else (0.0, 0.0)
     # v = m / gain and slow noise of the read-out, which does not go with the signal

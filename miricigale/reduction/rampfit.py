@@ -16,6 +16,7 @@ import dataclasses
 
 import numpy as np
 
+from miricigale.depth._core import shared_photons
 from miricigale.instrument import DQ
 from miricigale.reduction._core.lanes import fit_pixels
 from miricigale.reduction._core.pixel import own_charge
@@ -23,6 +24,7 @@ from miricigale.reduction.showers import find_showers
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_positive, check_that
 from miricigale.utils.parallel import chunks, parallel_map, threads
+from miricigale.utils.units import check_count
 
 # rows that one call of the kernel fits; the events come out in this order
 _ROWS = 32
@@ -126,6 +128,7 @@ def fit_groups(
     neighbor_threshold=10.0,
     shower_threshold=None,
     poisson_factor=1.0,
+    n_frames=1,
     n_threads=None,
     progress_bar=False,
 ):
@@ -163,6 +166,9 @@ def fit_groups(
     shower_threshold : float or None, optional
         Around tracks of jumps of 300 sigma together, differences are cut where the excess over the groups beside,
         smoothed over 4 pixels, is above so many sigma: showers. None for none.
+    n_frames : int, optional
+        Frames whose mean a group is. Then read noise is that of one frame, neighboring differences share photons,
+        a jump takes the differences beside it too, and a group whose last frame is saturated ends the ramp.
     poisson_factor : float, optional
         Variance of the photon noise of a pixel over that of independent electrons: below 1
         where neighbors share charge (interpixel capacitance), by the sum of the squared
@@ -214,6 +220,7 @@ def fit_groups(
         raise argument_error("first_group, last_group", wanted, f"{first_group}, {last_group}")
     for name, value in (("group_time", group_time), ("poisson_factor", poisson_factor)):
         check_that(np.isfinite(value) and value > 0, name, "positive", value)
+    n_frames = check_count(n_frames, "n_frames")
     jump = threshold(jump_threshold, "jump_threshold")
     neighbor = threshold(neighbor_threshold, "neighbor_threshold")
     shower = threshold(shower_threshold, "shower_threshold")
@@ -240,12 +247,14 @@ def fit_groups(
     group_dq = _plain(group_dq)
 
     data = _plain(data)
-    variance = np.square(read_noise) + (1 / 12 if data.dtype.kind in "iu" else 0.0)
+    variance = read_variance(read_noise, n_frames, rounded=data.dtype.kind in "iu")
     out = tuple(np.full((ny, nx), np.nan, np.float32) for _ in range(3))
     out += tuple(np.zeros((ny, nx), kind) for kind in (np.int16, np.int16, np.int64))
-    ramp = (data, (drift, bias, reset), (coef, saturation, dark))
+    rise = (n_frames - 1) / (2 * n_frames)
+    ramp = (data, (drift, bias, reset), (coef, saturation, dark, rise))
     # a trace of read noise keeps the closed forms finite
-    noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise))
+    shared = shared_photons(n_frames)
+    noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise), shared)
     fit = (first_group, last_group, noise, 1 / group_time, jump)
 
     def fit_part(part):
@@ -272,6 +281,30 @@ def fit_groups(
         parallel_map(fit_part, parts, executor=executor)
 
     return fit_result(*out, events, first_group)
+
+
+def read_variance(read_noise, n_frames, *, rounded):
+    """
+    Variance of the read-out of a group, DN^2: a read, or the mean of several that are independent.
+
+    Parameters
+    ----------
+    read_noise : float or `~numpy.ndarray`
+        Of one read, DN.
+    n_frames : int
+        Reads of a group.
+    rounded : bool
+        Whether reads are whole numbers, and their mean too.
+
+    Returns
+    -------
+    variance : float or `~numpy.ndarray`
+    """
+    variance = np.square(read_noise)
+    if not rounded:
+        return variance / n_frames
+    # a sum of whole numbers over M is rounded to one of M values
+    return (variance + 1 / 12) / n_frames + (1 - 1 / n_frames**2) / 12
 
 
 def _plain(array):

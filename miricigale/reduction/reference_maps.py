@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 
-from miricigale.instrument import DQ, READOUT_NAMES, aperture, joined_header
+from miricigale.instrument import DQ, READOUT_NAMES, aperture, frame_pattern, joined_header
 from miricigale.instrument.history import TYPES
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits
@@ -41,19 +41,28 @@ def _header(hdus, path, name, extension, exposure=None):
     check_data(extension in hdus, path, f"cannot be read as {_wanted(name, extension)}: {found}")
     header = joined_header(hdus, extension)
     wanted = {"REFTYPE": TYPES.get(name, name).upper(), "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE"}
+    patterns = _ANY
     if exposure is not None:
         wanted["READPATT"] = exposure.readout
+        # references of single frames serve groups that are their means
+        patterns = (frame_pattern(exposure.readout), *_ANY)
     if name == "flat" and exposure.filter is not None:
         wanted["FILTER"] = exposure.filter.rpartition(".")[2].upper()
     for key, value in wanted.items():
         stated = str(header.get(key, "")).strip().upper()
         stated = READOUT_NAMES.get(stated, stated)
-        if stated not in (value, *_ANY):
+        others = patterns if key == "READPATT" else _ANY
+        if stated not in (value, *others):
             raise _other(path, name, f"its {key} is {stated}, not {value}")
-    for key, value in {"NFRAMES": 1, "GROUPGAP": 0}.items():
-        if name in ("reset", "dark") and header.get(key, value) != value:
-            raise _other(path, name, f"its {key} is {header[key]}, not {value}")
+    for key, values in {"NFRAMES": _frame_counts(exposure), "GROUPGAP": (0,)}.items():
+        if name in ("reset", "dark") and header.get(key, values[0]) not in values:
+            raise _other(path, name, f"its {key} is {header[key]}, not {values[0]}")
     return header
+
+
+def _frame_counts(exposure):
+    """Frames in a group of references of groups: those of the exposure, or one."""
+    return (1,) if exposure is None else (exposure.n_frames, 1)
 
 
 def _cut(path, name, array, header, exposure):
@@ -100,6 +109,12 @@ def _flags(path, name, hdus, header, exposure):
 
 def _read(path, exposure, name, extension="SCI"):
     """Array and flags of a reference."""
+    array, flags, _ = _read_with_header(path, exposure, name, extension)
+    return array, flags
+
+
+def _read_with_header(path, exposure, name, extension="SCI"):
+    """Array, flags and keywords of a reference."""
     wanted = _wanted(name, extension)
     with open_fits(path, wanted=wanted) as hdus:
         header = _header(hdus, path, name, extension, exposure)
@@ -109,7 +124,7 @@ def _read(path, exposure, name, extension="SCI"):
         check_memory(n_bytes, f"the {name} reference {path}", advice="use one with fewer groups")
         array = _cut(path, name, hdus[extension].data, header, exposure)
         array = np.ascontiguousarray(array, np.float32)
-        return array, _flags(path, name, hdus, header, exposure)
+        return array, _flags(path, name, hdus, header, exposure), header
 
 
 def _read_values(path, exposure, name):
@@ -152,13 +167,31 @@ def _read_linearity(path, exposure):
 
 def _read_groups(path, exposure, name):
     """DN of each group, (integrations, groups, ny, nx)."""
-    array, flags = _read(path, exposure, name)
+    array, flags, header = _read_with_header(path, exposure, name)
     if array.ndim == 3:
         array = array[None]
     wanted = "must hold groups (integrations, groups, ny, nx)"
     check_data(array.ndim == 4, path, f"{wanted}, got shape {array.shape}")
     # what is not known is not subtracted, as in the pipeline
-    return np.nan_to_num(array, copy=False, posinf=0.0, neginf=0.0), flags
+    array = np.nan_to_num(array, copy=False, posinf=0.0, neginf=0.0)
+    if exposure.n_frames > header.get("NFRAMES", 1):
+        array = _averaged_groups(array, exposure.n_frames, complete=name == "dark")
+    return array, flags
+
+
+def _averaged_groups(array, n_frames, *, complete):
+    """
+    Means of so many frames, (integrations, groups, ny, nx), as the pipeline makes them of a dark.
+
+    A ``complete`` reference has no value beyond its frames, so that a last part of a group is left out; else
+    there is no signal in the frames beyond.
+    """
+    n_int, n_all, *shape = array.shape
+    if not complete:
+        array = np.pad(array, ((0, 0), (0, -n_all % n_frames), (0, 0), (0, 0)))
+    n_groups = array.shape[1] // n_frames
+    frames = array[:, : n_groups * n_frames]
+    return frames.reshape(n_int, n_groups, n_frames, *shape).mean(axis=2, dtype=np.float32)
 
 
 #: Readers of the references of slopes, in the order of their use: each gives values (or None) and flags.

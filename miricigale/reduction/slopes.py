@@ -83,6 +83,7 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
             ramp.data,
             maps,
             group_time=ramp.group_time,
+            n_frames=exposure.n_frames,
             drift=_drift(reducer, ramp, maps, reference, drift),
             usable=usable,
             # those of a simulated ramp are the truth, until a pipeline has found its own
@@ -184,4 +185,7 @@ def _anomaly(reducer, ramp, maps, first):
         warn(msg, ReductionWarning)
     if anomaly is None:
         return 0.0
-    return anomaly.offsets(first + exposure.n_integrations, exposure.n_groups)[first:]
+    # of each frame, and then the means of groups
+    shape = (exposure.n_integrations, exposure.n_groups, exposure.n_frames)
+    offsets = anomaly.offsets(first + shape[0], shape[1] * shape[2])[first:]
+    return offsets.reshape(shape).mean(axis=2)

@@ -144,13 +144,13 @@ def test_normalizes_and_freezes():
     ("options", "error", "message"),
     [
         ({"n_groups": 1}, ValueError, "'n_groups' must be an integer >= 2, got 1"),
-        ({"readout": "FAST"}, KeyError, "no readout pattern 'FAST'; known: FASTR1, SLOWR1"),
+        ({"readout": "FAST"}, KeyError, "no readout pattern 'FAST'; known: FASTGRPAVG, FASTG"),
         ({"subarray": "SUB1"}, KeyError, "no sub-array 'SUB1'"),
         (SLOW_SUBARRAY, KeyError, "no sub-array of SLOWR1 'SUB256'; known: FULL"),
         ({"filter": "wfc3.f160w"}, KeyError, "no imaging filter 'wfc3.f160w'; known: miri.f1000w"),
         ({"n_groups": None}, ValueError, "'n_groups, time' must be one of them given, got neither"),
         ({"time": 1 * u.h}, ValueError, "'n_groups, time' must be one of them given, got both"),
-        ({"time": 3 * u.s, "n_groups": None}, ValueError, "'time' must be at least two frames"),
+        ({"time": 3 * u.s, "n_groups": None}, ValueError, "'time' must be at least two groups"),
         ({"pointing": 3}, ValueError, "'pointing' must be one SkyCoord"),
     ],
 )

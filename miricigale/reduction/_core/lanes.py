@@ -18,6 +18,7 @@ from miricigale.reduction._core.pixel import (
     no_slope,
     store,
     weights,
+    widen,
 )
 from miricigale.utils.compilation import njit
 
@@ -26,7 +27,8 @@ LANES = 32
 
 # rows of what is known of the pixels in the lanes
 _S, _INV_GAIN, _SLOW, _SUM, _SLOPE, _TOTAL, _SQUARES, _V, _USED, _WORST, _T2, _SIGN, _D = range(13)
-_N_VALUES = 20
+_SHARED = 20
+_N_VALUES = 21
 
 # columns of what becomes of them
 _Y, _X, _JUMPS, _FLAGS = range(4)
@@ -42,7 +44,7 @@ def fitting_lanes(n_int, n_diff):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_lane(lanes, b, d, cut, valid, s, inv_gain, slow, y, x, jumps, flags):
+def fill_lane(lanes, b, d, cut, valid, s, inv_gain, slow, shared, y, x, jumps, flags):
     """Put a pixel into a lane: its differences, which are cut, and how many each integration has."""
     values, pixels = lanes[5], lanes[6]
     n_int = valid.size
@@ -62,6 +64,7 @@ def fill_lane(lanes, b, d, cut, valid, s, inv_gain, slow, y, x, jumps, flags):
     values[_S, b] = s
     values[_INV_GAIN, b] = inv_gain
     values[_SLOW, b] = slow
+    values[_SHARED, b] = shared
     pixels[b, _Y] = y
     pixels[b, _X] = x
     pixels[b, _JUMPS] = jumps
@@ -78,12 +81,15 @@ def fit_lanes(lanes):
     worst, worst_t2, sign, worst_d = values[_WORST], values[_T2], values[_SIGN], values[_D]
     lam, eps, inv_d, inv_v = values[13], values[14], values[15], values[16]
     swd, f, acc = values[17], values[18], values[19]
+    shared = values[_SHARED]
     # start with the plain mean, then twice the weights of the last slope
     for b in range(LANES):
         slope[b] = values[_SUM, b] / used[b]
     for last in range(2):
         for b in range(LANES):
-            v[b], lam[b], eps[b], inv_d[b] = weights(slope[b], s[b], inv_gain[b], slow[b])
+            v[b], lam[b], eps[b], inv_d[b] = weights(
+                slope[b], s[b], inv_gain[b], slow[b], shared[b]
+            )
             inv_v[b] = 1.0 / v[b]
         total[:] = squares[:] = swd[:] = f[:] = acc[:] = 0.0
         for i in range(n):
@@ -170,6 +176,13 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
             events[n_event, 3] = i % each
             events[n_event, 4] = np.sqrt(t2) if values[_SIGN, b] > 0.0 else -np.sqrt(t2)
             n_event += 1
+            if values[_SHARED, b] > 0.0:
+                for j in (i - 1, i + 1):
+                    # those beside it, as long as a difference is left
+                    if 0 <= j < keep.shape[0] and keep[j, b] > 0.0 and values[_USED, b] > 1.0:
+                        keep[j, b] = 0.0
+                        values[_USED, b] -= 1.0
+                        values[_SUM, b] -= lanes[0][j, b]
             continue
         if y >= 0:
             jumps, flags = pixels[b, _JUMPS], pixels[b, _FLAGS]
@@ -177,8 +190,8 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
                 no_slope(out, y, x)
             else:
                 total, squares = values[_TOTAL, b], values[_SQUARES, b]
-                slope, v, slow = values[_SLOPE, b], values[_V, b], values[_SLOW, b]
-                store(out, y, x, slope, v, slow, total, squares, scale)
+                noise = values[_V, b], values[_SLOW, b], values[_S, b], values[_SHARED, b]
+                store(out, y, x, values[_SLOPE, b], noise, total, squares, scale)
             out[3][y, x] = used
             out[4][y, x] = jumps
             out[5][y, x] = flags | (JUMP if jumps > 0 else 0)
@@ -203,10 +216,12 @@ def fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out):
 
     ``response``: coefficients (ascending, each a map) of the polynomial that makes them linear;
     saturation (map): a group from it (raw DN) and all after it are dropped; dark signal
-    (integrations, groups, ny, nx), subtracted last. Anomaly and dark of no groups are none.
+    (integrations, groups, ny, nx), subtracted last; and the part of a difference by which the last of averaged
+    frames is above their mean, 0 for single reads. Anomaly and dark of no groups are none.
 
     ``noise``: variance of one read in DN^2, what times the slope is the Poisson variance of a
-    difference, and what slow noise of the read-out adds to it (maps).
+    difference, what slow noise of the read-out adds to it (maps), and what neighbors share of the Poisson
+    variance (0 for single reads).
 
     ``scale`` is the inverse group time, and jumps are cut above ``threshold`` sigma. Pixel i is cut at
     ``cuts[start[i]:start[i + 1]]`` too, each the index of a difference: integration times number of differences
@@ -219,7 +234,7 @@ def fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out):
     """
     data, levels, response = ramp
     g0, g1, noise, scale, threshold = fit
-    variance, inv_gain, slow = noise
+    variance, inv_gain, slow, shared = noise
     n_int = data.shape[0]
     n_diff = g1 - g0 - 1
     d = np.empty(n_int * n_diff)
@@ -241,17 +256,19 @@ def fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out):
         x = xs[i]
         saturated = gather(data, levels, response, y, x, g0, g1, d, valid)
         cut[:] = False
-        full, jumped = cut_by_flags(group_dq, y, x, g0, g1, cut, valid)
+        full, jumped = cut_by_flags(group_dq, y, x, g0, g1, cut, valid, shared > 0.0)
         flags = SATURATED if saturated or full else 0
         if jumped:
             flags |= JUMP
         for j in range(start[i], start[i + 1]):
             cut[cuts[j]] = True
+            if shared > 0.0:
+                widen(cut, cuts[j], n_diff)
             flags |= JUMP | JUMP_NEIGHBOR
         n_free -= 1
         fill_lane(
             lanes, free[n_free], d, cut, valid, at(variance, y, x), at(inv_gain, y, x), at(slow, y, x),
-            y, x, out[4][y, x], flags,
+            shared, y, x, out[4][y, x], flags,
         )  # fmt: skip
         i += 1
     return events[:n_event].copy()

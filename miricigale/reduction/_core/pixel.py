@@ -16,6 +16,22 @@ X_MIN = 1e-8
 #: Share of the charge of a hit that each of the four neighbors holds at most (about 0.03 in flight).
 LEAK = 0.05
 
+#: Least size of the variance of averaged reads over the Poisson variance, to keep the closed forms finite.
+S_MIN = 1e-6
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def averaged_variance(s, v, shared):
+    """
+    Variance s of a read, less what neighboring differences of averaged groups share of their photons, v.
+
+    Means of M frames have the covariance v I + (s - shared v) tridiag(-1, 2, -1) with shared = (M^2 - 1) / (6 M^2)
+    (`shared_photons`): that of single reads with another s, which is negative where the photons count more.
+    """
+    total = s - shared * v
+    least = S_MIN * v
+    return least if shared > 0.0 and abs(total) < least else total
+
 
 @njit(cache=True, error_model="numpy", inline="always")
 def at(values, y, x):
@@ -24,22 +40,38 @@ def at(values, y, x):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def weights(slope, s, inv_gain, slow):
+def weights(slope, s, inv_gain, slow, shared):
     """Variance v of a difference, l and 1 - l of the weights, and 1 / (s (1/l - l))."""
     v = slope * inv_gain
     low = X_MIN * s
-    v = (v if v > low else low) + slow
+    v = v if v > low else low
+    s = averaged_variance(s, v, shared)
+    v += slow
     x = v / s
-    q = 0.5 * x + np.sqrt(x + 0.25 * x * x)
+    root = np.sqrt(x + 0.25 * x * x)
+    # of the two roots that with |l| < 1
+    q = 0.5 * x + (root if s > 0.0 else -root)
     lam = 1.0 / (1.0 + q)
     return v, lam, q * lam, (1.0 + q) / (s * q * (2.0 + q))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def store(out, y, x, slope, v, slow, total, squares, scale):
-    """Slope of a pixel and the two parts of its variance, from the sums of weights and their squares."""
+def store(out, y, x, slope, noise, total, squares, scale):
+    """
+    Slope of a pixel and the two parts of its variance, from the sums of weights and their squares.
+
+    ``noise`` is the variance of a difference, what of it is slow noise, the variance of a read, and the share of
+    `averaged_variance`.
+    """
+    v, slow, s, shared = noise
     var = 1.0 / total
-    photon = (v - slow) * squares * var * var
+    photon = v - slow
+    if shared > 0.0:
+        # photons of averaged groups: v (I - shared T); the weights have w^T T w = (total - v squares) / s
+        steps = (total - v * squares) / averaged_variance(s, photon, shared)
+        photon *= (squares - shared * steps) * var * var
+    else:
+        photon *= squares * var * var
     out[0][y, x] = slope * scale
     out[1][y, x] = photon * scale * scale
     out[2][y, x] = max(var - photon, 0.0) * scale * scale
@@ -82,7 +114,7 @@ def own_charge(jumps, nx, n_diff):
 def gather(data, levels, response, y, x, g0, g1, d, valid):
     """Linear differences of one pixel, and how many are usable in each integration."""
     drift, bias, reset = levels
-    coefficients, limits, dark = response
+    coefficients, limits, dark, rise = response
     n_int = data.shape[0]
     n_diff = g1 - g0 - 1
     # of all groups
@@ -101,7 +133,11 @@ def gather(data, levels, response, y, x, g0, g1, d, valid):
         signal = dark[min(k, dark.shape[0] - 1), :, y, x]
         for g in range(g0, g1):
             raw = float(reads[g])
-            if raw >= saturation and valid[k] == n_diff:
+            last = raw
+            if rise > 0.0 and g > 0:
+                # the last of the frames whose mean a group is
+                last += rise * max(raw - float(reads[g - 1]), 0.0)
+            if last >= saturation and valid[k] == n_diff:
                 valid[k] = max(g - g0 - 1, 0)
                 saturated = True
             level = raw - (shift[g] + start)
@@ -124,13 +160,21 @@ def gather(data, levels, response, y, x, g0, g1, d, valid):
 
 
 @njit(cache=True, error_model="numpy")
-def cut_by_flags(group_dq, y, x, g0, g1, cut, valid):
+def widen(cut, i, n_diff):
+    """Cut difference ``i`` and those beside it in its integration: a hit amid averaged frames shows in two."""
+    k = i // n_diff
+    for j in range(max(i - 1, k * n_diff), min(i + 2, (k + 1) * n_diff)):
+        cut[j] = True
+
+
+@njit(cache=True, error_model="numpy")
+def cut_by_flags(group_dq, y, x, g0, g1, cut, valid, averaged):
     """
     Cut the differences of one pixel that the flags of its groups forbid.
 
     A group that is not to be used takes both of its differences, a jump the one before it, and
-    a saturated group ends its integration. ``group_dq`` of no groups has no flags. Returns whether
-    a group was saturated and whether a jump was flagged.
+    a saturated group ends its integration; a jump in ``averaged`` groups takes those beside it too.
+    ``group_dq`` of no groups has no flags. Returns whether a group was saturated and whether a jump was flagged.
     """
     n_diff = g1 - g0 - 1
     saturated, jumped = False, False
@@ -151,4 +195,6 @@ def cut_by_flags(group_dq, y, x, g0, g1, cut, valid):
                 cut[i] = True
             if flag & JUMP:
                 jumped = True
+                if averaged and g > g0:
+                    widen(cut, i - 1, n_diff)
     return saturated, jumped
