@@ -7,8 +7,10 @@ import warnings
 import numpy as np
 
 from miricigale.instrument.asdf_extension import asdf_wcs, read_gwcs
-from miricigale.utils.exceptions import PhotometryWarning, warn
+from miricigale.utils.exceptions import PhotometryWarning, data_error, warn
 
+#: Kinds of exposures of JWST by their instruments.
+_KIND_OF_JWST = re.compile("(?:MIR|NRC|NRS|NIS|FGS)_")
 #: Keywords of distortions in the convention SIP.
 _SIP = re.compile(r"(?:A|B|AP|BP)_(?:ORDER|DMAX|\d+_\d+)")
 #: Pixels by which the header and the gwcs of one image may be apart.
@@ -132,6 +134,32 @@ def image_wcs(header, hdus):
         return distorted
     _compare_with_gwcs(wcs, hdus, shape, file)
     return wcs
+
+
+def check_kind_of_exposure(get, path):
+    """
+    Refuse exposures of JWST that are no images of the sky: acquisitions, coronagraphs, spectra.
+
+    Parameters
+    ----------
+    get : callable
+        Value of a keyword, or None.
+    path : path-like
+        Of the file, for the message.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If EXP_TYPE says so.
+    """
+    kind = str(get("EXP_TYPE") or "").strip().upper()
+    if get("TELESCOP") not in ("JWST", None) or kind in ("", "N/A", "ANY"):
+        return
+    if _KIND_OF_JWST.match(kind) and not kind.endswith("IMAGE"):
+        wanted = (
+            "must be an image of the sky (EXP_TYPE MIR_IMAGE, NRC_IMAGE, NIS_IMAGE or their like)"
+        )
+        raise data_error(path, f"{wanted}, got {kind}")
 
 
 def is_exposure(get):

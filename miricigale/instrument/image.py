@@ -17,6 +17,30 @@ _PRODUCT = re.compile(
     r"_(?:uncal|ramp|rate|rateints|cal|calints|crf|crfints|i2d|blot|median)\.fits(?:\.gz)?$"
 )
 
+#: What writes files in their layout.
+WRITER = "miricigale.reduction.write_image(image, path)"
+
+
+def check_product_name(path, writer):
+    """
+    Refuse a name of a product of JWST, whose tools would not find the image in another layout.
+
+    Parameters
+    ----------
+    path : path-like or other
+        Where an image is written; what is no path has no name.
+    writer : str
+        What writes JWST's layout, for the message.
+
+    Raises
+    ------
+    ValueError
+        If the name is one of a product.
+    """
+    if isinstance(path, (str, os.PathLike)) and _PRODUCT.search(os.fspath(path).lower()):
+        wanted = f"a name that is not one of JWST's products, whose layout {writer} writes"
+        raise argument_error("path", wanted, repr(os.fspath(path)))
+
 
 def standard_deviation(image):
     """
@@ -112,13 +136,7 @@ class Image(Interactive, CCDData):
         ValueError
             If the name is one of a product of JWST.
         """
-        is_path = isinstance(path, (str, os.PathLike))
-        if is_path and _PRODUCT.search(os.fspath(path).lower()):
-            wanted = (
-                "a name that is not one of JWST's products, whose layout "
-                "miricigale.reduction.write_image(image, path) writes"
-            )
-            raise argument_error("path", wanted, repr(os.fspath(path)))
+        check_product_name(path, WRITER)
         if overwrite:
             kwargs["overwrite"] = True
         super().write(path, *args, **kwargs)

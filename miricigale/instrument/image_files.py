@@ -8,7 +8,7 @@ from astropy.io import fits
 
 from miricigale.instrument import dq_planes, read_dq, with_own_bits
 from miricigale.instrument.header_wcs import header_wcs
-from miricigale.instrument.image import Image, standard_deviation
+from miricigale.instrument.image import WRITER, Image, check_product_name, standard_deviation
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, replacing, write_fits
 from miricigale.utils.meta import plain_value, undated
@@ -62,7 +62,8 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
         Its WCS (with distortion) goes to the SCI header, its meta as JSON to the keyword
         META, so that names and types survive.
     path : path-like
-        The file.
+        The file. Names of JWST's products (``_rate.fits``, ``_cal.fits``) are refused, for JWST's tools would
+        miss its keywords: `miricigale.reduction.write_image` writes their layout.
     planes : dict of str to `~numpy.ndarray`, optional
         Further image extensions by name; ``dq`` holds flags (`~miricigale.instrument.DQ`).
     rounded : bool, optional
@@ -76,7 +77,7 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     OSError
         If the file exists and ``overwrite`` is False.
     ValueError
-        If the uncertainty is of unknown kind.
+        If the uncertainty is of unknown kind, or the name is one of a product of JWST.
 
     Examples
     --------
@@ -87,6 +88,7 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     >>> image = CCDData(np.ones((4, 4)), unit="MJy/sr", uncertainty=error)
     >>> write_image(image, "image.fits", planes={"dq": np.zeros((4, 4), np.int64)})  # doctest: +SKIP
     """
+    check_product_name(path, WRITER)
     if image.wcs is not None:
         header = image.wcs.to_header(relax=True)
     else:

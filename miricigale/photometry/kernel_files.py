@@ -8,6 +8,7 @@ import numpy as np
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.utils.exceptions import argument_error, data_error, file_errors
 from miricigale.utils.files import file_place, open_fits, split_extension
+from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, to_array
 
 _log = logging.getLogger(__name__)
@@ -42,7 +43,16 @@ def _read_psf(file, argument):
         # its axes are those of the detector
         turn = float(np.ravel(header.pa_aper.to_value(u.deg))[0])
     own = _grid(header)
-    cell, turn = own[0] if cell is None else cell, own[1] if turn is None else turn
+    if cell is None:
+        # the model PSF tells if the pixel is another one
+        wanted = f"given: {path} does not state its pixel, and no model PSF is there to test that of the image"
+        check_that(known, argument + "_scale", wanted, None)
+        cell = own[0]
+        _log.info(
+            "%s does not state its pixel: that of the image, %.4g arcsec, is taken", path, cell
+        )
+    if turn is None:
+        turn = own[1]
     form = {"pixel_scale": cell * ANGLE, "frame": "sky", "angle": turn * u.deg}
     kept = []
     for data in planes:

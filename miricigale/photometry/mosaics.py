@@ -15,7 +15,7 @@ from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from miricigale.filters.band_names import find_filter
 from miricigale.instrument.data_models import is_data_model, read_data_model
 from miricigale.instrument.dq_schemes import bad_pixels
-from miricigale.instrument.header_wcs import image_wcs, is_exposure
+from miricigale.instrument.header_wcs import check_kind_of_exposure, image_wcs, is_exposure
 from miricigale.instrument.image import Image
 from miricigale.instrument.image_planes import (
     NOISE_MAPS,
@@ -153,7 +153,8 @@ class MosaicFile:
         That of MIRI, NIRCam's wide filters and WFC3/IR is compared with the model
         (`~miricigale.psf.checked_psf`), which is taken where none is given (`~miricigale.psf.filter_psf`).
     psf_scale, psf_angle : `~astropy.units.Quantity`, optional
-        Pixel of the PSF and position angle of its +y; by default those of its header, or else of the image.
+        Pixel of the PSF and position angle of its +y; by default those of its header. Else the angle is that of
+        the image, and so is the pixel where the filter has a model PSF that tests it; else it must be given.
     pa_aper : `~astropy.units.Quantity`, optional
         Position angle of the detector's +y axis, if the header does not state it.
     section : tuple of slice, optional
@@ -221,6 +222,7 @@ class MosaicFile:
         def get(key):
             return header.get(key, first.get(key))
 
+        check_kind_of_exposure(get, self.path)
         meta = {}
         # of another program it may be no JSON
         with contextlib.suppress(json.JSONDecodeError):

@@ -174,7 +174,8 @@ def read_catalog(catalog, wcs=None, epoch=None):
     """
     Ids and positions of a catalog in any of the usual forms; see ``catalog`` of `read_prior`.
 
-    Proper motions bring positions to an epoch (`~miricigale.utils.positions.at_epoch`).
+    Proper motions, of a `~astropy.coordinates.SkyCoord` or in columns, bring positions to an epoch
+    (`~miricigale.utils.positions.at_epoch`).
     With a WCS positions may be pixels ``x`` and ``y``. A position that is missing is NaN; other columns are kept.
 
     Raises
@@ -189,7 +190,7 @@ def read_catalog(catalog, wcs=None, epoch=None):
     if isinstance(catalog, SkyCoord):
         catalog = QTable({"sky": catalog.reshape(-1)})
     table = QTable(as_table(catalog, "catalog"), copy=False)
-    table["sky"] = as_positions(table, name, wcs, missing=True, epoch=epoch)
+    table["sky"] = as_positions(table, name, wcs, missing=True, epoch=epoch, motions=True)
     if "id" not in table.colnames:
         # labels are the ids of files, and in tables those of segments
         theirs = id_column(table.colnames, name, labels=isinstance(catalog, (str, os.PathLike)))

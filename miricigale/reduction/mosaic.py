@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import drizzle
 import numpy as np
 from astropy.nddata import CCDData
 from astropy.wcs import NoConvergence
@@ -27,6 +28,9 @@ from miricigale.utils.options import check_that
 
 # pixels of the boxes by which the variance that gives weights is smoothed
 _WEIGHT_BOX = 32
+# share of the area of a map of pixels that is covered at least, but for so many pixels of the grid
+_LEAST_COVERED = 0.7
+_FEW_PIXELS = 25
 # nodes of the grid on which a distorted WCS is evaluated; between them bicubic splines
 _NODES = 49
 
@@ -281,7 +285,8 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     ------
     ValueError
         If there are no images, they are not surface brightness of one unit and filter, or
-        the output has no shape or lies elsewhere on the sky.
+        the output has no shape or lies elsewhere on the sky; or if drizzle covers less than 0.7 of the area of
+        an image's map of pixels.
 
     Examples
     --------
@@ -343,7 +348,9 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
         parts = [np.square(np.asarray(sigma(im), float)), *(own[name] for name in names)]
         parts = [np.where(weight > 0, plane, 0.0).astype(np.float32) for plane in parts]
         add_image(sink, im, weight, (x, y), wcs, pixfrac, data2=parts)
-        n_images[part] += sink.out_wht[part] > before[part]
+        touched = sink.out_wht[part] > before[part]
+        _check_covered(touched, (x, y), weight > 0, shape, pixfrac)
+        n_images[part] += touched
         before[part] = sink.out_wht[part]
 
     if n_images.any():
@@ -373,6 +380,38 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     )
     weight = (weight * np.float32(unit_weight)).astype(np.float32)
     return Mosaic(out, weight, n_images, dict(zip(names, parts[1:], strict=True)))
+
+
+def _check_covered(touched, pixel_map, used, shape, pixfrac):
+    """
+    Refuse a mosaic in which the area of an image is not that of its map of pixels.
+
+    Versions of drizzle have left out half of an image, or all of it, for one pixel of a map. ``touched`` are the
+    pixels of the grid that got some light, ``used`` those of the image that have a weight.
+    """
+    x, y = pixel_map
+    ny, nx = shape
+    if min(x.shape) < 2:
+        return
+    area = _pixel_area(x, y)
+    # whole pixels within the grid
+    reach = 0.5 * np.sqrt(area)
+    inside = used & (x > reach) & (x < nx - 1 - reach) & (y > reach) & (y < ny - 1 - reach)
+    expected = np.count_nonzero(inside) * area * pixfrac**2
+    covered = np.count_nonzero(touched)
+    if covered < _LEAST_COVERED * expected - _FEW_PIXELS:
+        wanted = f"a map that drizzle {drizzle.__version__} follows"
+        got = f"one of {expected:.0f} pixels of the grid, of which {covered} are covered"
+        raise argument_error("pixel_maps", wanted, got)
+
+
+def _pixel_area(x, y):
+    """Typical area of a pixel of an image in pixels of the grid, by its map."""
+    rows = np.arange(0, x.shape[0] - 1, 16)[:, None]
+    columns = np.arange(0, x.shape[1] - 1, 16)
+    along = x[rows, columns + 1] - x[rows, columns], y[rows, columns + 1] - y[rows, columns]
+    across = x[rows + 1, columns] - x[rows, columns], y[rows + 1, columns] - y[rows, columns]
+    return float(np.median(np.abs(along[0] * across[1] - along[1] * across[0])))
 
 
 def _filled(values, nowhere):

@@ -1,10 +1,13 @@
 """Exposures that are given twice: by their data, or by their keywords at two stages."""
 
+import contextlib
 import hashlib
+import json
 
 import numpy as np
 
-from miricigale.instrument import joined_header
+from miricigale.instrument import ExposureHistory, joined_header
+from miricigale.instrument.history import ORIGIN
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import open_fits
 
@@ -19,9 +22,9 @@ class ExposureRecord:
     """
     Exposures that were seen so far.
 
-    Two are the same if their data are, bit for bit, or if their keywords are and their stages (ramp, slopes,
-    brightness) differ: one is made of the other. At one stage keywords alone do not tell, for simulations with
-    other seeds share them. Data of one single value, which have no noise, are never the same.
+    Two are the same if their data are, bit for bit, or if their keywords are: one is made of the other, or they
+    are two versions of it. Simulations with other seeds share their keywords, so that of these at one stage (ramp,
+    slopes, brightness) the data alone tell. Data of one single value, which have no noise, are never the same.
     """
 
     def __init__(self):
@@ -56,7 +59,7 @@ class ExposureRecord:
         words = tuple(str(header.get(key)) for key in _NAMES)
         if header.get("EXPSTART") is not None and header.get("PROGRAM") is not None:
             other, before = self._keywords.setdefault(words, (name, stage))
-            if before != stage and same in (None, name):
+            if (not _is_simulated(header) or before != stage) and same in (None, name):
                 same = other
         return None if same == name else same
 
@@ -84,7 +87,20 @@ class ExposureRecord:
         header = {key: card[0] if isinstance(card, list) else card for key, card in kept.items()}
         if getattr(exposure, "observed", False):
             header = exposure.header
+        if ExposureHistory.of(exposure).origin != "other":
+            header["ORIGIN"] = ORIGIN
         stage = f"{np.ndim(data)} {getattr(exposure, 'unit', None)}"
         same = self.add(name, np.asarray(data), header, stage)
         if same is not None:
             raise argument_error("ramps", "exposures that differ", f"{name}, the same as {same}")
+
+
+def _is_simulated(header):
+    """Whether a header is that of a simulation of the package, or of what was made of one."""
+    if header.get("ORIGIN") == ORIGIN:
+        return True
+    meta = {}
+    # of another program it may be no JSON
+    with contextlib.suppress(json.JSONDecodeError, TypeError):
+        meta = json.loads(header.get("META", "{}"))
+    return bool(meta.get("simulated")) or meta.get("origin") == "unrecorded"

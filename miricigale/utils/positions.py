@@ -5,6 +5,7 @@ import re
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
+from astropy.time import Time
 
 from miricigale.utils.exceptions import CatalogWarning, argument_error, units_error, warn
 from miricigale.utils.missing import floats, plain_floats, without_codes
@@ -19,6 +20,10 @@ _PAIRS = (
     ("raj2000", "dej2000"),
     ("raj2000", "decj2000"),
 )
+#: Columns of proper motions, in lower case, and of the time of positions.
+_MOTIONS = (("pmra", "pmdec"), ("pm_ra_cosdec", "pm_dec"), ("pm_ra", "pm_dec"), ("pmra", "pmde"))
+_EPOCHS = ("ref_epoch", "refepoch", "obstime", "epoch")
+_MOTION = u.mas / u.yr
 
 
 def as_position(value, argument):
@@ -135,7 +140,7 @@ def at_epoch(sky, epoch, argument):
     return SkyCoord(np.where(still, ra, new_ra), np.where(still, dec, new_dec), unit="rad")
 
 
-def as_positions(table, argument, wcs=None, *, missing=False, epoch=None):
+def as_positions(table, argument, wcs=None, *, missing=False, epoch=None, motions=False):
     """
     Positions of the rows of a table, by whichever of its columns have them.
 
@@ -152,6 +157,9 @@ def as_positions(table, argument, wcs=None, *, missing=False, epoch=None):
         Whether positions may be missing, which are then NaN.
     epoch : `~astropy.time.Time`, optional
         Time of the image that they are for, to which proper motions bring them (`at_epoch`).
+    motions : bool, optional
+        Whether columns of proper motions count beside ``ra`` and ``dec`` (`sky_with_motions`), as those of a
+        `~astropy.coordinates.SkyCoord` do. A scene, which has no time, does without.
 
     Returns
     -------
@@ -174,6 +182,8 @@ def as_positions(table, argument, wcs=None, *, missing=False, epoch=None):
     elif pair is not None:
         angles = [_degrees(table, name, argument) for name in pair]
         sky = SkyCoord(*angles, unit="deg")
+        if motions:
+            sky = at_epoch(sky_with_motions(table, sky, columns, argument), epoch, argument)
     elif wcs is not None and {"x", "y"} <= set(columns):
         pixels = [plain_floats(table[columns[name]], columns[name], argument) for name in "xy"]
         sky = wcs.pixel_to_world(*pixels).icrs
@@ -188,6 +198,79 @@ def as_positions(table, argument, wcs=None, *, missing=False, epoch=None):
         wanted = "a table of finite positions"
         raise argument_error(argument, wanted, f"{bad.size} that are not, first in row {bad[0]}")
     return SkyCoord(*angles, unit="deg")
+
+
+def sky_with_motions(table, sky, columns, argument):
+    """
+    Positions with the proper motions that columns of their table state.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        ``pmra`` and ``pmdec`` in any case and unit of an angle by time (mas / yr without one), that of right
+        ascension with the cosine of the declination, as Gaia has it; also ``pm_ra_cosdec`` and ``pmRA`` with
+        ``pmDE``. The time of the positions is ``ref_epoch``, in years (J2016.0 as 2016.0) or a
+        `~astropy.time.Time`.
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        Positions, ICRS.
+    columns : dict of str to str
+        Names of the columns by their names in lower case.
+    argument : str
+        What the table is called in messages.
+
+    Returns
+    -------
+    sky : `~astropy.coordinates.SkyCoord`
+        With ``obstime``; as it was where no row moves.
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`
+        If a motion has another unit.
+    ValueError
+        If a row moves and the time of its position is not there.
+    """
+    names = [pair for pair in _MOTIONS if set(pair) <= set(columns)]
+    if not names:
+        return sky
+    east, north = (_motion(table, columns[name], argument) for name in names[0])
+    moving = np.nan_to_num(np.hypot(east, north)) > 0
+    if not moving.any():
+        return sky
+    epoch = next((columns[name] for name in _EPOCHS if name in columns), None)
+    wanted = "a table with 'ref_epoch', the time of its positions, where it has proper motions"
+    if epoch is None:
+        got = f"the columns {table.colnames}; without {columns[names[0][0]]} positions count as they are"
+        raise argument_error(argument, wanted, got)
+    years = table[epoch]
+    years = years.jyear if isinstance(years, Time) else _plain_years(years, epoch, argument)
+    lost = np.flatnonzero(moving & ~((years > 1800) & (years < 2200)))
+    if lost.size:
+        wanted = f"years such as 2016.0 in {epoch!r} where there are proper motions"
+        raise argument_error(argument, wanted, f"{years[lost[0]]} in row {lost[0]}")
+    # a row without motion needs no time
+    years = np.where(moving, years, 2000.0)
+    motions = {"pm_ra_cosdec": east * _MOTION, "pm_dec": north * _MOTION}
+    return SkyCoord(sky.ra, sky.dec, obstime=Time(years, format="jyear"), **motions)
+
+
+def _motion(table, name, argument):
+    """Proper motions, mas / yr, NaN where they are missing."""
+    column = table[name]
+    unit = u.Unit(getattr(column, "unit", None) or _MOTION)
+    if not unit.is_equivalent(_MOTION):
+        raise units_error(argument, "a proper motion", unit, column=name)
+    values = plain_floats(column, name, argument)
+    values[without_codes(values)[0] | np.isinf(values)] = np.nan
+    return values * unit.to(_MOTION)
+
+
+def _plain_years(column, name, argument):
+    """Years as plain floats, NaN where they are missing."""
+    unit = u.Unit(getattr(column, "unit", None) or u.yr)
+    if not unit.is_equivalent(u.yr):
+        raise units_error(argument, "years", unit, column=name)
+    return plain_floats(column, name, argument) * unit.to(u.yr)
 
 
 def _degrees(table, name, argument):

@@ -291,6 +291,23 @@ def test_errors_of_0_are_refused_by_the_reduction(write):
 def test_names_of_products_of_jwst_are_left_to_their_layout(name, tmp_path):
     image = Image(noise(), unit="MJy/sr")
     refuses("whose layout miricigale.reduction.write_image", image.write, tmp_path / name)
+    refuses("whose layout miricigale.reduction.write_image", write_image, image, tmp_path / name)
     assert not list(tmp_path.iterdir())
     image.write(tmp_path / "calibrated.fits")
     np.testing.assert_array_equal(CCDData.read(tmp_path / "calibrated.fits").data, noise())
+
+
+@pytest.mark.parametrize("kind", ["MIR_TACQ", "MIR_4QPM", "MIR_LYOT", "NRC_GRISM", "NIS_AMI"])
+def test_exposures_that_are_no_images_of_the_sky_are_refused(write, kind):
+    path = write(noise(), primary={"TELESCOP": "JWST", "EXP_TYPE": kind, "FILTER": "F770W"})
+    wanted = f"must be an image of the sky .* got {kind}"
+    refuses(wanted, read_mosaic, path, error=DataError)
+    refuses(wanted, lambda: MosaicFile(path).header, error=DataError)
+
+
+@pytest.mark.parametrize("kind", ["MIR_IMAGE", "NRC_IMAGE", "NRC_TSIMAGE", "ANY", None])
+def test_images_of_the_sky_are_read_whatever_their_telescope(write, kind):
+    primary = {"EXP_TYPE": kind} if kind else {"TELESCOP": "HST", "EXP_TYPE": "SPECTRUM"}
+    path = write(noise(), primary=primary)
+    with pytest.warns(PhotometryWarning, match="no map of the noise"):
+        assert read_mosaic(path).shape == SHAPE

@@ -66,10 +66,10 @@ def files(tmp_path_factory):
                         INSTRUME="NIRCAM"),
         "highres-error": save("rms.fits", np.full(high, 2.0)),
         "segmentation": save("seg.fits", labels, prior_wcs),
-        "psf": save("psf.fits", gaussian_image(41, WIDE / COARSE)),
+        "psf": save("psf.fits", gaussian_image(41, WIDE / COARSE), PIXSCALE=COARSE),
         # a cube of PSFs that are off their middle
-        "highres-psf": save("hipsf.fits", [gaussian_image(61, SHARP / FINE, *s) for s in [(1.3, -0.6), (0, 0.4)]])
-        + "[0,mean]",
+        "highres-psf": save("hipsf.fits", [gaussian_image(61, SHARP / FINE, *s) for s in [(1.3, -0.6), (0, 0.4)]],
+                            PIXSCALE=FINE) + "[0,mean]",
     }  # fmt: skip
     return types.SimpleNamespace(
         folder=folder, paths=paths, sky=sky, flux=flux, ids=ids, save=save, wcs=prior_wcs

@@ -6,13 +6,14 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.io import fits
 from astropy.table import Table
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.exposures import exposure_of, sky_of
 from miricigale.cli import main
-from miricigale.detector import Detector
+from miricigale.detector import Detector, Ramp
 from miricigale.instrument import background_level
 from miricigale.reduction import (
     BackgroundSettings,
@@ -23,6 +24,7 @@ from miricigale.reduction import (
     write_image,
 )
 from miricigale.reduction.images import sigma
+from miricigale.reduction.repeats import ExposureRecord
 from miricigale.utils.exceptions import MiricigaleWarning
 
 
@@ -177,6 +179,30 @@ def test_slopes_of_each_integration_on_demand(tmp_path):
     assert np.median(ratio) == pytest.approx(np.sqrt(2), rel=0.02)
     assert main(arguments) == 0
     assert Table.read(out / "files.ecsv")["status"][0] == "reduced"
+
+
+@pytest.mark.filterwarnings("ignore:slopes without references")
+def test_two_versions_of_an_observed_exposure_count_once(tmp_path):
+    """Two deliveries of the archive have other data; simulations with other seeds have the same keywords."""
+    exposure = exposure_of(n_groups=6, subarray="SUB64")
+    detector = Detector.miri_imager()
+    names = {}
+    for seed in (1, 2):
+        ramp = detector.expose(sky_of(exposure, 5.0), exposure, seed=seed)
+        path = ramp.write(tmp_path / f"sim{seed}_uncal.fits")
+        names[path.name] = path
+        with fits.open(path) as hdus:
+            hdus[0].header["ORIGIN"] = "STSCI"
+            del hdus["SIM_META"]
+            hdus.writeto(tmp_path / f"jw{seed}_uncal.fits")
+    record = ExposureRecord()
+    assert record.add_file(tmp_path / "jw1_uncal.fits") is None
+    assert record.add_file(tmp_path / "jw2_uncal.fits") == str(tmp_path / "jw1_uncal.fits")
+    record = ExposureRecord()
+    assert [record.add_file(path) for path in names.values()] == [None, None]
+    ramps = [Ramp.read(tmp_path / f"jw{seed}_uncal.fits") for seed in (1, 2)]
+    reducer = Reducer(references="none")
+    refuses("exposures that differ, got exposure 2, the same as exposure 1", reducer.run, ramps)
 
 
 def test_copies_and_ramps_with_their_slopes_are_left_out(tmp_path):

@@ -19,6 +19,7 @@ from miricigale.reduction import (
     reject_outliers,
     weight_map,
 )
+from miricigale.reduction.mosaic import add_image
 
 FULL = (1024, 1032)
 
@@ -301,6 +302,23 @@ def test_a_place_that_is_not_finite_loses_its_own_pixel_alone():
     good = mosaic.weight > 1e-6 * np.median(mosaic.weight)
     assert {tuple(place) for place in np.argwhere(~good)} == {(20, 31), (40, 7)}
     assert_allclose(mosaic.image.data[good], whole.image.data[good], atol=1e-4)
+
+
+def test_an_area_far_from_that_of_the_map_is_refused(monkeypatch):
+    """As drizzle 2.2.0 and 3.0.0 lose half of an image, or all of it, for one NaN of some places of a map."""
+
+    def lose_half(sink, im, weight, *args, **planes):
+        weight = np.where(np.arange(len(weight))[:, None] < 30, 0, weight)
+        return add_image(sink, im, weight, *args, **planes)
+
+    wcs = north_up_wcs(SkyCoord(53, -27, unit="deg"), 0.11 * u.arcsec, (60, 60))
+    image = make(np.random.default_rng(3).normal(5, 1, (60, 60)), wcs, filter="miri.f770w")
+    monkeypatch.setattr("miricigale.reduction.mosaic.add_image", lose_half)
+    for pixfrac in (1.0, 0.9):
+        wanted = (
+            r"'pixel_maps' must be a map that drizzle .* follows, got one of .* 18\d\d are covered"
+        )
+        refuses(wanted, drizzle_images, [image], wcs, pixfrac=pixfrac)
 
 
 def test_a_dead_exposure_has_no_exposure_time():

@@ -73,3 +73,57 @@ def test_a_column_of_a_table_is_moved_too():
     refuses("time of the image is not known", as_positions, table, "catalog")
     moved = as_positions(table, "catalog", epoch=NOW)
     assert_allclose(moved.separation(moving()).arcsec[0], 8.5 * 0.15, rtol=1e-4)
+
+
+def as_columns(**changes):
+    """The stars with the columns of Gaia's archive."""
+    stars = moving()
+    columns = {
+        "id": [1, 2, 3, 4],
+        "ra": stars.ra,
+        "dec": stars.dec,
+        "pmra": stars.pm_ra_cosdec,
+        "pmdec": stars.pm_dec,
+        "ref_epoch": [2016.0] * 4,
+    }
+    return QTable(columns | changes)
+
+
+def test_columns_of_motions_count_as_those_of_a_sky_column():
+    right = at_epoch(moving(), NOW, "catalog")
+    options = {"epoch": NOW, "motions": True}
+    plain = {"pmra": [120.0, -900.0, 0.0, 3000.0], "pmdec": [-90.0, 400.0, 0.0, -2000.0]}
+    for table in (
+        as_columns(),
+        as_columns(**plain),
+        as_columns(pmra=moving().pm_ra_cosdec.to(u.deg / u.Myr)),
+        as_columns(ref_epoch=THEN + np.zeros(4) * u.day),
+    ):
+        moved = as_positions(table, "catalog", **options)
+        assert np.all(moved.separation(right).to_value(u.mas) < 0.01)
+    table = as_columns()
+    table.rename_columns(["pmra", "pmdec", "ref_epoch"], ["pmRA", "pmDE", "Epoch"])
+    assert np.all(as_positions(table, "catalog", **options).separation(right).arcsec < 1e-5)
+    # a scene has no time
+    still = as_positions(as_columns(), "catalog")
+    assert_allclose(still.ra.deg, moving().ra.deg, rtol=1e-12)
+
+
+def test_columns_of_motions_that_cannot_be_used():
+    options = {"epoch": NOW, "motions": True}
+    table = as_columns()
+    refuses("time of the image is not known, got 3 with", as_positions, table, "c", motions=True)
+    table.remove_column("ref_epoch")
+    refuses(
+        "a table with 'ref_epoch', .*without pmra positions", as_positions, table, "c", **options
+    )
+    late = as_columns(ref_epoch=[2016.0, np.nan, np.nan, 2016.0])
+    refuses(
+        r"years such as 2016\.0 in 'ref_epoch' .*nan in row 1", as_positions, late, "c", **options
+    )
+    wrong = as_columns(pmra=[1.0, 2.0, 3.0, 4.0] * u.km / u.s)
+    refuses("'pmra'", as_positions, wrong, "c", error=u.UnitsError, **options)
+    # galaxies of a catalog have none
+    motions = dict.fromkeys(("pmra", "pmdec"), [np.nan] * 4 * u.mas / u.yr)
+    galaxies = as_columns(**motions, ref_epoch=[np.nan] * 4)
+    assert_allclose(as_positions(galaxies, "c", **options).dec.deg, moving().dec.deg, rtol=1e-12)
