@@ -168,6 +168,28 @@ def _state(products, parameters, mean, precision):
 
 
 @njit(cache=True, nogil=True)
+def _step(matrix, slope, parameters, limits, damping):
+    """
+    Damped Newton step of light and parameters, (n (1 + m),), and half of the gain in chi^2 without the damping.
+
+    Parameters that are at a limit, and would go beyond it, stay there (Bertsekas 1982, SIAM J. Control Optim. 20, 221).
+    """
+    n, m = parameters.shape
+    damped, free = matrix + np.diag(damping * np.diag(matrix)), slope.copy()
+    for s in range(n):
+        for j in range(m):
+            k = s * (1 + m) + 1 + j
+            beyond = slope[k] < 0.0 if parameters[s, j] <= limits[0, j] else slope[k] > 0.0
+            if beyond and not limits[0, j] < parameters[s, j] < limits[1, j]:
+                damped[k, :] = 0.0
+                damped[:, k] = 0.0
+                damped[k, k] = 1.0
+                free[k] = 0.0
+    step = np.linalg.solve(damped, free)
+    return step, step @ free
+
+
+@njit(cache=True, nogil=True)
 def minimum(plan, table, white, inverse, corners, start, mean, precision, limits, steps, gain):
     """
     Levenberg-Marquardt for the light and the first parameters of sources, with Gaussian priors.
@@ -227,8 +249,8 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
             damping *= 10.0
             if damping >= 1e6:
                 break
-        step = np.linalg.solve(matrix + np.diag(damping * np.diag(matrix)), slope)
-        trial, gained = parameters.copy(), step @ slope
+        step, gained = _step(matrix, slope, parameters[:, :m], limits, damping)
+        trial = parameters.copy()
         for s in range(n):
             for j in range(m):
                 moved = trial[s, j] + min(max(step[s * k + 1 + j], -1.0), 1.0)
