@@ -298,10 +298,7 @@ class _Stamp:
 
     def minimum(self, start, mean, precision, steps=_STEPS):
         """As `~miricigale.photometry._core.shape_fits.minimum`; None if nothing is found."""
-        try:
-            found = minimum(*self.pixels, start, mean, precision, self.limits, steps, _GAIN)
-        except np.linalg.LinAlgError:
-            return None
+        found = minimum(*self.pixels, start, mean, precision, self.limits, steps, _GAIN)
         return found if np.isfinite(found[0]) else None
 
     def misfit(self, parameters):

@@ -4,8 +4,17 @@ import collections
 
 import numpy as np
 
+from miricigale.photometry._core.dense import (
+    cholesky,
+    inverse_of,
+    log_determinant,
+    solve_factor,
+)
 from miricigale.photometry._core.shapes import FAST, fill_curves
 from miricigale.utils.compilation import njit
+
+#: Shapes of a source whose images are drawn at once: as many as stay near the processor.
+_TOGETHER = 7
 
 #: How square images are made from transforms, by products of small matrices: frequencies kx and ky (rad per pixel)
 #: at ky >= 0, then at ky <= 0, (2 ny nx,), what their squares count in the sum over all pixels; the PSF's
@@ -54,47 +63,55 @@ def make_plan(size, transform, passed):
 
 
 @njit(cache=True, nogil=True)
-def _placed(plan, xy):
-    """The PSF's transform, moved to places, (n, 2)."""
+def _placed(plan, x, y):
+    """The PSF's transform moved to a place, (4, ny, nx): its two parts, the real and the imaginary one of each."""
     _, ny, nx = plan.response.shape
-    found = np.empty((len(xy), 2, ny, nx), np.complex64)
-    for s, (x, y) in enumerate(xy):
-        along = np.exp(-1j * x * plan.kx[:nx]).astype(np.complex64)
-        for i in range(ny):
-            turn = np.complex64(np.exp(-1j * y * plan.ky[i * nx]))
-            found[s, 0, i] = plan.response[0, i] * along * turn
-            found[s, 1, i] = plan.response[1, i] * along * np.conj(turn)
-    return found
+    along = np.empty(nx, np.complex64)
+    for j in range(nx):
+        along[j] = np.exp(-1j * x * plan.kx[j])
+    placed = np.empty((4, ny, nx), np.float32)
+    for i in range(ny):
+        turn = np.complex64(np.exp(-1j * y * plan.ky[i * nx]))
+        for j in range(nx):
+            above = plan.response[0, i, j] * along[j] * turn
+            below = plan.response[1, i, j] * along[j] * np.conj(turn)
+            placed[0, i, j] = above.real
+            placed[1, i, j] = above.imag
+            placed[2, i, j] = below.real
+            placed[3, i, j] = below.imag
+    return placed
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _images(plan, curves, placed, n_moved):
     """
-    Draw images, (size, n + 2 n_moved, size), of transforms, (n, 2, ny, nx).
+    Draw images, (size, n, size), of transforms, (n, 2, ny, nx).
 
-    The first ``n_moved`` are followed by their derivatives to x, those to y, and the others.
+    After them come the derivatives of the first ``n_moved`` to x and to y, (size, n_moved, size) each.
     """
     (n, _, ny, nx), size = curves.shape, plan.inner.shape[1]
     # sums and differences of the two at +-ky, real and imaginary parts
     right = np.empty((2 * ny, n, 2 * nx), np.float32)
-    for c in range(n):
-        for i in range(ny):
+    for i in range(ny):
+        for c in range(n):
             for j in range(nx):
-                above = curves[c, 0, i, j] * placed[0, i, j]
-                below = curves[c, 1, i, j] * placed[1, i, j]
-                right[i, c, j] = above.real + below.real
-                right[i, c, nx + j] = above.imag + below.imag
-                right[ny + i, c, j] = below.imag - above.imag
-                right[ny + i, c, nx + j] = above.real - below.real
+                above, below = curves[c, 0, i, j], curves[c, 1, i, j]
+                above_real, above_imag = above * placed[0, i, j], above * placed[1, i, j]
+                below_real, below_imag = below * placed[2, i, j], below * placed[3, i, j]
+                right[i, c, j] = above_real + below_real
+                right[i, c, nx + j] = above_imag + below_imag
+                right[ny + i, c, j] = below_imag - above_imag
+                right[ny + i, c, nx + j] = above_real - below_real
     middle = np.dot(plan.inner[0], right.reshape(2 * ny, -1)).reshape(size, n, 2 * nx)
-    images = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0])
-    middle = np.ascontiguousarray(middle[:, :n_moved])
+    images = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0]).reshape(size, n, size)
+    if n_moved < n:
+        middle = middle[:, :n_moved].copy()
+        right = right[:, :n_moved].copy()
     along_x = np.dot(middle.reshape(-1, 2 * nx), plan.outer[1])
-    middle = np.dot(plan.inner[1], np.ascontiguousarray(right[:, :n_moved]).reshape(2 * ny, -1))
+    middle = np.dot(plan.inner[1], right.reshape(2 * ny, -1))
     along_y = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0])
-    images, form = images.reshape(size, n, size), (size, n_moved, size)
-    moved = along_x.reshape(form), along_y.reshape(form)
-    return np.concatenate((images[:, :n_moved], *moved, images[:, n_moved:]), axis=1)
+    form = (size, n_moved, size)
+    return images, along_x.reshape(form), along_y.reshape(form)
 
 
 @njit(cache=True, nogil=True)
@@ -118,27 +135,41 @@ def draw_curves(plan, curves, x, y, more):
     images : float32 `~numpy.ndarray`, shape (size, n + more, size)
     """
     _, ny, nx = plan.response.shape
-    placed = _placed(plan, np.array([[x, y]]))[0]
-    return _images(plan, curves.reshape(-1, 2, ny, nx), placed, more // 2)
+    placed, n_moved = _placed(plan, x, y), more // 2
+    images, along_x, along_y = _images(plan, curves.reshape(-1, 2, ny, nx), placed, n_moved)
+    return np.concatenate((images[:, :n_moved], along_x, along_y, images[:, n_moved:]), axis=1)
 
 
 @njit(cache=True, nogil=True)
-def _products(plan, table, inverse, corners, shapes, placed, columns):
+def _whiten(images, k, inverse, y, x, column):
+    """Write image k of (size, n, size) over the noise into a column: the pixels of a rectangle, from (y, x) on."""
+    size, width = len(images), inverse.shape[1]
+    # by pixel: expressions of short pieces of arrays take longer than their pixels
+    for row in range(size):
+        for i in range(size):
+            noise = inverse[y + row, x + i]
+            column[(y + row) * width + x + i] = images[row, k, i] * noise
+
+
+@njit(cache=True, nogil=True)
+def _products(plan, table, inverse, corners, parameters, columns):
     """Write whitened models and derivatives into all columns but the last; products of all columns."""
-    k, (_, ny, nx), width = (len(columns) - 1) // len(shapes), plan.response.shape, inverse.shape[1]
+    k, (_, ny, nx) = (len(columns) - 1) // len(parameters), plan.response.shape
     left, top = corners[:, 0].min(), corners[:, 1].min()
     curves = np.empty((5 if k == 7 else 1, 2, ny, nx), np.float32)
-    for s in range(len(shapes)):
-        x, y = corners[s]
-        fill_curves(plan.kx, plan.ky, shapes[s], table, curves.reshape(len(curves), -1))
-        images = _images(plan, curves, placed[s], min(k - 1, 1))
-        for row in range(len(images)):
-            first = (y - top + row) * width + x - left
-            for j in range(k):
-                # by pixel: expressions of short pieces of arrays take longer than their pixels
-                for i in range(len(images)):
-                    noise = inverse[y - top + row, x - left + i]
-                    columns[s * k + j, first + i] = images[row, j, i] * noise
+    n_moved = min(k - 1, 1)
+    for s in range(len(parameters)):
+        shape, first = parameters[s, 2:], s * k
+        fill_curves(plan.kx, plan.ky, shape, table, curves.reshape(len(curves), -1))
+        placed = _placed(plan, parameters[s, 0] - corners[s, 0], parameters[s, 1] - corners[s, 1])
+        images, along_x, along_y = _images(plan, curves, placed, n_moved)
+        x, y = corners[s, 0] - left, corners[s, 1] - top
+        _whiten(images, 0, inverse, y, x, columns[first])
+        if n_moved:
+            _whiten(along_x, 0, inverse, y, x, columns[first + 1])
+            _whiten(along_y, 0, inverse, y, x, columns[first + 2])
+        for j in range(3, k):
+            _whiten(images, j - 2, inverse, y, x, columns[first + j])
     return np.dot(columns, columns.T)
 
 
@@ -147,46 +178,63 @@ def _state(products, parameters, mean, precision):
     """Chi^2 with the prior, best light, and half of the second and (negative) first derivatives."""
     n, m = precision.shape[:2]
     k = 1 + m
-    matrix, seen = products[:-1, :-1].copy(), products[:-1, -1].copy()
-    power = matrix[::k, ::k].copy()
-    # those without light have none
-    power += np.diag(1e-12 * np.diag(power) + 1e-300)
-    flux = np.linalg.solve(power, seen[::k].copy())
-    light, scale = np.zeros(n * k), np.repeat(flux, k)
-    light[::k], scale[::k] = flux, 1.0
-    slope = seen - matrix @ light
-    chi2 = products[-1, -1] - light @ (seen + slope)
-    matrix *= scale * scale.reshape(-1, 1)
-    slope *= scale
+    last, power = n * k, np.empty((n, n))
     for s in range(n):
-        off, block = (parameters[s] - mean[s])[:m], slice(s * k + 1, (s + 1) * k)
-        pull = np.sum(precision[s] * off, axis=1)
-        chi2 += np.sum(off * pull)
-        slope[block] -= pull
-        matrix[block, block] += precision[s]
+        for t in range(n):
+            power[s, t] = products[s * k, t * k]
+        # those without light have none
+        power[s, s] += 1e-12 * power[s, s] + 1e-300
+    flux = solve_factor(cholesky(power), products[last, :last:k])
+    matrix, slope = np.empty((last, last)), np.empty(last)
+    chi2 = products[last, last]
+    for i in range(last):
+        seen = products[i, last]
+        slope[i] = seen
+        for s in range(n):
+            slope[i] -= products[i, s * k] * flux[s]
+        if i % k == 0:
+            chi2 -= flux[i // k] * (seen + slope[i])
+    for i in range(last):
+        scale = flux[i // k] if i % k else 1.0
+        slope[i] *= scale
+        for j in range(last):
+            matrix[i, j] = products[i, j] * scale * (flux[j // k] if j % k else 1.0)
+    for s in range(n):
+        for i in range(m):
+            pull, row = 0.0, s * k + 1 + i
+            for j in range(m):
+                pull += precision[s, i, j] * (parameters[s, j] - mean[s, j])
+                matrix[row, s * k + 1 + j] += precision[s, i, j]
+            chi2 += (parameters[s, i] - mean[s, i]) * pull
+            slope[row] -= pull
     return chi2, flux, matrix, slope
 
 
 @njit(cache=True, nogil=True)
 def _step(matrix, slope, parameters, limits, damping):
     """
-    Damped Newton step of light and parameters, (n (1 + m),), and half of the gain in chi^2 without the damping.
+    Damped Newton step of light and parameters, (n (1 + m),), and the gain in chi^2 without the damping.
 
     Parameters that are at a limit, and would go beyond it, stay there (Bertsekas 1982, SIAM J. Control Optim. 20, 221).
     """
     n, m = parameters.shape
-    damped, free = matrix + np.diag(damping * np.diag(matrix)), slope.copy()
+    damped, free = matrix.copy(), slope.copy()
+    for k in range(len(slope)):
+        damped[k, k] += damping * matrix[k, k]
     for s in range(n):
         for j in range(m):
-            k = s * (1 + m) + 1 + j
-            beyond = slope[k] < 0.0 if parameters[s, j] <= limits[0, j] else slope[k] > 0.0
-            if beyond and not limits[0, j] < parameters[s, j] < limits[1, j]:
+            k, value = s * (1 + m) + 1 + j, parameters[s, j]
+            below, above = value <= limits[0, j], value >= limits[1, j]
+            if (below and slope[k] < 0.0) or (above and slope[k] > 0.0):
                 damped[k, :] = 0.0
                 damped[:, k] = 0.0
                 damped[k, k] = 1.0
                 free[k] = 0.0
-    step = np.linalg.solve(damped, free)
-    return step, step @ free
+    step = solve_factor(cholesky(damped), free)
+    gained = 0.0
+    for k in range(len(slope)):
+        gained += step[k] * free[k]
+    return step, gained
 
 
 @njit(cache=True, nogil=True)
@@ -224,11 +272,6 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
         Of ln flux and the free parameters of each.
     matrix : `~numpy.ndarray`, shape (n (1 + m), n (1 + m))
         Inverse of the covariance of flux and free parameters of all.
-
-    Raises
-    ------
-    `~numpy.linalg.LinAlgError`
-        If a step is not determined.
     """
     n, m = precision.shape[:2]
     k = 1 + m
@@ -237,8 +280,7 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     flux, matrix, slope = np.zeros(n), np.eye(n * k), np.zeros(n * k)
     trial, parameters, chi2, damping = start, start, np.inf, 0.1
     while True:
-        placed = _placed(plan, trial[:, :2] - corners)
-        products = _products(plan, table, inverse, corners, trial[:, 2:], placed, columns)
+        products = _products(plan, table, inverse, corners, trial, columns)
         state = _state(products, trial, mean, precision)
         if state[0] <= chi2:
             parameters, (chi2, flux, matrix, slope) = trial, state
@@ -259,13 +301,14 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
             # so near the minimum everything is linear
             flux, parameters, chi2 = flux + step[::k], trial, chi2 - gained
             break
-    sign, log_det = np.linalg.slogdet(matrix)
-    evidence, covariance = -0.5 * (chi2 + log_det), np.empty((n, k, k))
-    if not (sign > 0 and np.isfinite(chi2) and flux.min() > 0):
+    factor = cholesky(matrix)
+    evidence, covariance = -0.5 * (chi2 + log_determinant(factor)), np.empty((n, k, k))
+    # without a positive matrix the evidence is no number
+    if not (np.isfinite(evidence) and flux.min() > 0):
         return np.inf, flux, parameters, evidence, covariance, matrix
-    whole = np.linalg.inv(matrix)
+    whole = inverse_of(factor)
     for s in range(n):
-        evidence += 0.5 * np.linalg.slogdet(precision[s])[1]
+        evidence += 0.5 * log_determinant(cholesky(precision[s]))
         covariance[s] = whole[s * k : (s + 1) * k, s * k : (s + 1) * k]
         covariance[s, 0] /= flux[s]
         covariance[s, :, 0] /= flux[s]
@@ -273,14 +316,13 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _center_products(images, s, inverse, white, products):
+def _center_products(images, along_x, along_y, s, inverse, white, products):
     """Products, (3, 4), of a whitened model and its derivatives to the center, with these and the data."""
     aa = ab = ac = ad = bb = bc = bd = cc = cd = 0.0
-    n = images.shape[1] // 3
     for row in range(len(images)):
         for i in range(len(images)):
             noise, d = inverse[row, i], white[row, i]
-            a, b, c = images[row, s, i], images[row, n + s, i], images[row, 2 * n + s, i]
+            a, b, c = images[row, s, i], along_x[row, s, i], along_y[row, s, i]
             a, b, c = a * noise, b * noise, c * noise
             aa, ab, ac, ad = aa + a * a, ab + a * b, ac + a * c, ad + a * d
             bb, bc, bd, cc, cd = bb + b * b, bc + b * c, bd + b * d, cc + c * c, cd + c * d
@@ -314,37 +356,51 @@ def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, 
     _, ny, nx = plan.response.shape
     # the best one first
     shapes = np.concatenate((best[:, 2:], shapes))
-    curves = np.empty((len(shapes), 2, ny, nx), np.float32)
-    for s in range(len(shapes)):
-        fill_curves(plan.kx, plan.ky, shapes[s], table, curves[s].reshape(1, -1))
-    images = _images(plan, curves, _placed(plan, best[:, :2] - corners)[0], len(shapes))
+    placed = _placed(plan, best[0, 0] - corners[0, 0], best[0, 1] - corners[0, 1])
+    curves = np.empty((_TOGETHER, 2, ny, nx), np.float32)
     found, known = np.zeros((len(shapes), 2)), np.zeros(len(beside))
     products, columns, data = np.empty((3, 4)), np.empty((3, white.size)), np.sum(white**2)
-    log_prior, off = np.linalg.slogdet(precision[0])[1], (best - mean)[0, :2]
-    pull = precision[0] @ off
-    for s in range(len(shapes)):
-        _center_products(images, s, inverse, white, products)
-        if len(beside):
-            # neighbors' light that was taken off is the best together with this one's
-            for j in range(3):
-                columns[j] = (images[:, j * len(shapes) + s] * inverse).reshape(-1)
-            shared = columns @ beside.T
-            if s == 0:
-                known = flux * shared[0]
-                data -= known @ known
-            products[:, :3] -= shared @ shared.T
-            products[:, 3] -= shared @ known
-        found[s, 0] = -1e9
-        power, seen = products[0, 0], products[0, 3]
-        if power > 0 and seen > 0:
-            # the center: changes of the pixels are in proportion to the light
-            light, own = seen / power, products[1:, 0]
-            slope = light * (products[1:, 3] - light * own) - pull
-            matrix = precision[0] + light**2 * (products[1:, 1:3] - np.outer(own, own) / power)
-            step = np.linalg.solve(matrix, slope)
-            chi2 = data - light * seen + off @ pull
-            log_det = np.linalg.slogdet(matrix)[1] + np.log(power)
-            evidence = slope @ step - chi2 - log_det + log_prior
-            found[s, 1] = np.log(light * max(1 - np.sum(own * step) / power, 0.1))
-            found[s, 0] = 0.5 * evidence - found[s, 1]
+    center, off = precision[0], best[0, :2] - mean[0, :2]
+    log_prior = np.log(center[0, 0] * center[1, 1] - center[0, 1] ** 2)
+    pull_x = center[0, 0] * off[0] + center[0, 1] * off[1]
+    pull_y = center[0, 1] * off[0] + center[1, 1] * off[1]
+    for first in range(0, len(shapes), _TOGETHER):
+        n = min(_TOGETHER, len(shapes) - first)
+        for s in range(n):
+            fill_curves(plan.kx, plan.ky, shapes[first + s], table, curves[s].reshape(1, -1))
+        images, along_x, along_y = _images(plan, curves[:n], placed, n)
+        for s in range(n):
+            _center_products(images, along_x, along_y, s, inverse, white, products)
+            if len(beside):
+                # neighbors' light that was taken off is the best together with this one's
+                _whiten(images, s, inverse, 0, 0, columns[0])
+                _whiten(along_x, s, inverse, 0, 0, columns[1])
+                _whiten(along_y, s, inverse, 0, 0, columns[2])
+                shared = np.dot(columns, beside.T)
+                if first + s == 0:
+                    known = flux * shared[0]
+                    data -= np.sum(known * known)
+                for i in range(3):
+                    for j in range(3):
+                        products[i, j] -= np.sum(shared[i] * shared[j])
+                    products[i, 3] -= np.sum(shared[i] * known)
+            found[first + s, 0] = -1e9
+            power, seen = products[0, 0], products[0, 3]
+            if power > 0 and seen > 0:
+                # the center: changes of the pixels are in proportion to the light
+                light, own_x, own_y = seen / power, products[1, 0], products[2, 0]
+                slope_x = light * (products[1, 3] - light * own_x) - pull_x
+                slope_y = light * (products[2, 3] - light * own_y) - pull_y
+                xx = center[0, 0] + light**2 * (products[1, 1] - own_x * own_x / power)
+                xy = center[0, 1] + light**2 * (products[1, 2] - own_x * own_y / power)
+                yy = center[1, 1] + light**2 * (products[2, 2] - own_y * own_y / power)
+                det = xx * yy - xy * xy
+                step_x = (yy * slope_x - xy * slope_y) / det
+                step_y = (xx * slope_y - xy * slope_x) / det
+                chi2 = data - light * seen + off[0] * pull_x + off[1] * pull_y
+                gained = slope_x * step_x + slope_y * step_y
+                evidence = gained - chi2 - np.log(abs(det)) - np.log(power) + log_prior
+                moved = (own_x * step_x + own_y * step_y) / power
+                found[first + s, 1] = np.log(light * max(1.0 - moved, 0.1))
+                found[first + s, 0] = 0.5 * evidence - found[first + s, 1]
     return found[1:]
