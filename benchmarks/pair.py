@@ -6,9 +6,9 @@ What a user waits for, of two versions of the package side by side.
     python benchmarks/pair.py OLD NEW --catalog FILE --z-spec z fit known
 
 OLD and NEW are checkouts, which the Python that runs this script imports. Jobs alternate between them, so that
-other work on the machine slows both. Medians of processor seconds (of all processes of a job), the ratio of the new
-to the old ones, and the largest memory of a process. Jobs of the kernels begin with an empty cache, the others with
-a run that is not counted.
+other work on the machine slows both. Medians of processor seconds (of all processes of a job), the ratio of the
+new to the old ones, and the largest memory of a process. Jobs of the kernels begin with an empty cache, the
+others with a run that is not counted.
 """
 
 import argparse
@@ -143,7 +143,7 @@ def main():
     )
     parser.add_argument("--z-spec", default="z_spec", help="its column of redshifts")
     parser.add_argument("--rounds", type=int, default=3, help="how often each is measured")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     jobs = commands(options)
     unknown = set(options.jobs) - jobs.keys()
     if unknown:
