@@ -313,7 +313,8 @@ class _Lights:
         for one in together:
             free |= usable & (labels == one)
         weight = 1.0 / np.sqrt(np.where(free, self.variance[around], np.inf), dtype=float)
-        looser = weight / np.hypot(1.0, _MISFIT * np.maximum(self.light[around], 0.0) * weight)
+        misfit = _MISFIT * np.maximum(self.light[around], 0.0) * weight
+        looser = weight / np.sqrt(1.0 + misfit * misfit)
         return weight, looser, own
 
     def _draft(self, label, xy, nodes):

@@ -1,6 +1,7 @@
 """Sizes and indices of the sources of a field: the prior of each shape, measured on all of them."""
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -36,7 +37,10 @@ class Population:
     def at(self, brightness):
         """The distribution at one ln brightness."""
         mean = self.line[0] + self.off(brightness) * self.line[1]
-        return dataclasses.replace(self, line=np.array([mean, np.zeros(2)]))
+        found = dataclasses.replace(self, line=np.array([mean, np.zeros(2)]))
+        # the class is frozen; the spread about the line is the same
+        found.__dict__["_inverse"] = self._inverse
+        return found
 
     def off(self, brightness):
         """How far ln brightness is from the middle; lines do not go on for ever."""
@@ -54,6 +58,16 @@ class Population:
         found[:2, :2] = self.covariance
         return found
 
+    @functools.cached_property
+    def _inverse(self):
+        """Inverse of the covariance of the four, and ln of the determinant of 2 pi times it."""
+        return np.linalg.inv(self.spread), np.linalg.slogdet(2 * np.pi * self.spread)[1]
+
+    @property
+    def precision(self):
+        """Inverse of the covariance of the four."""
+        return self._inverse[0]
+
     def odds(self, nodes, points, brightness=None):
         """
         Probabilities of what sources may be: their nodes, (n, k), and points, (n,).
@@ -70,8 +84,8 @@ class Population:
         off = np.broadcast_to(self.off(brightness), len(nodes))
         z = nodes[..., 2:] - self.mean
         z[..., :2] -= off[:, None, None] * self.line[1]
-        chi2 = np.einsum("nki,ij,nkj->nk", z, np.linalg.inv(self.spread), z)
-        chi2 += np.linalg.slogdet(2 * np.pi * self.spread)[1]
+        inverse, log_det = self._inverse
+        chi2 = np.sum((z @ inverse) * z, axis=-1) + log_det
         galaxy = nodes[..., 0] - 0.5 * chi2 + np.log((1.0 - self.point) / nodes.shape[1])
         every = np.concatenate([galaxy, (points + np.log(self.point))[:, None]], axis=1)
         every = np.exp(every - every.max(axis=1, keepdims=True))

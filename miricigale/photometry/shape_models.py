@@ -22,7 +22,7 @@ class ShapeModels:
         self._psf = floats(psf)
         #: Half-width of the PSF (pixels).
         self.reach = self._psf.shape[0] / 2
-        self._transforms, self._plans = {}, {}
+        self._transforms, self._plans, self._responses = {}, {}, {}
 
     def _transform(self, size):
         if size not in self._transforms:
@@ -34,6 +34,13 @@ class ShapeModels:
             shifted = np.roll(padded, (-half, -half), axis=(0, 1))
             self._transforms[size] = scipy.fft.rfft2(shifted)
         return self._transforms[size]
+
+    def _response(self, size):
+        """What light that is integrated over pixels is multiplied with: samples of the PSF are integrated too."""
+        if size not in self._responses:
+            response = self._transform(size) / box_response((size, size), np.eye(2))
+            self._responses[size] = response.astype(np.complex64)
+        return self._responses[size]
 
     def plan(self, size):
         """The `~miricigale.photometry._core.shape_fits.Plan` of squares of a size."""
@@ -80,9 +87,7 @@ class ShapeModels:
             to.append(slice(low, high))
             of.append(slice(low - begin - rim, high - begin - rim))
         padded[tuple(to)] = images[tuple(of)]
-        # the samples of the PSF are integrated over pixels too
-        response = self._transform(size) / box_response((size, size), np.eye(2))
-        spectra = scipy.fft.rfft2(padded) * response.astype(np.complex64)
+        spectra = scipy.fft.rfft2(padded) * self._response(size)
         found = scipy.fft.irfft2(spectra, s=(size, size), overwrite_x=True)
         return found[:, rims[0] : rims[0] + shape[0], rims[1] : rims[1] + shape[1]]
 

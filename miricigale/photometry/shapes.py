@@ -349,7 +349,7 @@ class _Stamp:
 def _known(xy, population):
     """What is known of the parameters of a source at a position: mean, and inverse of the covariance."""
     precision = np.zeros((6, 6))
-    precision[:2, :2], precision[2:, 2:] = _CENTER, np.linalg.inv(population.spread)
+    precision[:2, :2], precision[2:, 2:] = _CENTER, population.precision
     return np.concatenate([xy, population.mean]), precision
 
 

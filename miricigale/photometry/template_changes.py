@@ -120,7 +120,7 @@ class TemplateChanges:
         images = np.where(core, 0.0, fitted["light"] * images)
         # the full profile's light, of which that in the core is replaced by the image's
         light = images.sum(axis=(1, 2))
-        template, *derivatives = (self._blurred(one) for one in (image, *images))
+        template, *derivatives = self._blurred(np.stack([image, *images]))
         power = np.sum(template**2)
         changes = [
             Change(Cutout(np.tensordot(step, derivatives, 1), rest.origin), float(step @ light))
@@ -139,8 +139,9 @@ class TemplateChanges:
         each = cutout.noise / max(np.count_nonzero(core), 1)
         return changes, float(each * np.sum(weight[core] ** 2))
 
-    def _blurred(self, image):
-        return scipy.ndimage.gaussian_filter(image, self._blur, mode="constant")
+    def _blurred(self, images):
+        """Images, (..., ny, nx), as blurred as the image is beside the high-resolution one."""
+        return scipy.ndimage.gaussian_filter(images, self._blur, mode="constant", axes=(-2, -1))
 
 
 def _root(covariance):

@@ -218,6 +218,11 @@ def floats(values):
     -------
     array : `~numpy.ndarray` of float
     """
+    # plain numbers and arrays of them, of which nothing is masked, are by far the most
+    if type(values) is np.ndarray and values.dtype.kind in "fiu":
+        return values.astype(float, copy=False)
+    if isinstance(values, float):
+        return np.array(values, dtype=float)
     values, mask = without_mask(values)
     array = np.asarray(getattr(values, "value", values), dtype=float)
     if mask is None:

@@ -215,7 +215,8 @@ def _step(matrix, slope, parameters, limits, damping):
     """
     Damped Newton step of light and parameters, (n (1 + m),), and the gain in chi^2 without the damping.
 
-    Parameters that are at a limit, and would go beyond it, stay there (Bertsekas 1982, SIAM J. Control Optim. 20, 221).
+    Parameters that are at a limit, and would go beyond it, stay there (Bertsekas 1982, SIAM J. Control Optim. 20,
+    221).
     """
     n, m = parameters.shape
     damped, free = matrix.copy(), slope.copy()
