@@ -224,6 +224,11 @@ class RealGalaxies:
             position = wcs.pixel_to_world(x, y)
         return Cutout.from_image(CCDData(light, unit=self.image.unit, wcs=wcs), position)
 
+    @property
+    def labels(self):
+        """Labels of all sources of the image, from 1."""
+        return range(1, len(self._found[2]) + 1)
+
     @functools.cached_property
     def resolved(self):
         """
@@ -233,7 +238,7 @@ class RealGalaxies:
         ``major_axis``, the angle (deg) of the major axis from +y of the stamp, counter-clockwise.
         """
         rows = []
-        for label in range(1, len(self._found[2]) + 1):
+        for label in self.labels:
             stamp = self.cutout(label)
             if stamp is not None and stamp.half_light_radius.value >= MIN_RADIUS:
                 rows.append((stamp, stamp.half_light_radius.value, *_shape(stamp)))

@@ -424,11 +424,14 @@ def test_a_catalog_is_calibrated_by_its_known_redshifts(tmp_path, capsys, monkey
     monkeypatch.setattr("miricigale.fitting.survey.calibrate", None)
     assert main(argv) == 0
     kept = ["--calibration", str(tmp_path / "out" / "calibration.ecsv")]
-    assert main(fit(tmp_path / "cat.fits", *kept, out="again")) == 0
+    # of some of the sources
+    n_some = 30
+    table[:n_some].write(tmp_path / "some.fits")
+    assert main(fit(tmp_path / "some.fits", *kept, out="again")) == 0
     again = next(iter(open_results(tmp_path / "again").parts()))
-    assert_allclose(again.pdf["redshift"], first.pdf["redshift"])
+    assert_allclose(again.pdf["redshift"], first.pdf["redshift"][:n_some])
     # an error of the light of AGN widens what AGN are found
-    assert main(fit(tmp_path / "cat.fits", *kept, "--agn-error", "0.5", out="agn")) == 0
+    assert main(fit(tmp_path / "some.fits", *kept, "--agn-error", "0.5", out="agn")) == 0
     wide = next(iter(open_results(tmp_path / "agn").parts()))
     assert wide.meta["fit"]["agn_error"] == 0.5
     spread = [np.nanmean(some.std("frac_agn").value) for some in (again, wide)]

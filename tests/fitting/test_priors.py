@@ -1,16 +1,33 @@
 """Priors of a grid are densities: the posterior without data is the prior, on any nodes."""
 
+import dataclasses
+
+import astropy.units as u
 import numpy as np
 import pytest
 import scipy.stats
+from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
+from helpers.grids import make_grid
 from miricigale.fitting.posterior import cell_edges
-from miricigale.fitting.priors import _axis, density_log_prior
+from miricigale.fitting.priors import density_log_prior, grid_priors
 
 LEVELS = np.array([0.16, 0.5, 0.84])
 NODES = {"steps": np.linspace(0.1, 10, 100), "ratios": np.geomspace(0.1, 10, 100)}
+
+
+def weights_of(values, **priors):
+    """Prior weights of the values of tau, or of redshifts, of a grid that has these."""
+    n = values.size
+    if "redshift" in priors:
+        grid = dataclasses.replace(make_grid(n_z=n, n_tau=1, n_age=1), redshift=values)
+        return grid_priors(grid, priors).axes["redshift"].weights
+    grid = make_grid(n_z=1, n_tau=n, n_age=1)
+    table = QTable({"tau": values * u.Gyr, "age": grid.galaxy_parameters["age"]})
+    grid = dataclasses.replace(grid, galaxy_parameters=table)
+    return grid_priors(grid, priors).axes["tau"].weights
 
 
 def percentiles(values, weights):
@@ -34,8 +51,7 @@ def percentiles(values, weights):
 )
 def test_a_density_is_that_of_scipy_on_any_nodes(nodes, prior, truth):
     values = NODES[nodes]
-    axis = _axis("tau", values, 1, "galaxy", {"tau": prior}, (0.0, np.inf))
-    found = percentiles(values, axis.weights)
+    found = percentiles(values, weights_of(values, tau=prior))
     inside = truth.cdf([0.1, 10.0])
     expected = truth.ppf(inside[0] + LEVELS * (inside[1] - inside[0]))
     assert_allclose(found, expected, rtol=0.03, atol=0.08)
@@ -48,33 +64,27 @@ def test_one_density_of_redshift_is_one_prior_by_either_argument(nodes):
     density = fine**2 * np.exp(-fine)
     flags = np.zeros(1, dtype=int)
     log_prior = density_log_prior((fine, density), z, np.ones(z.size, bool), flags)
-    axis = _axis(
-        "redshift", z, 1, "redshift", {"redshift": lambda x: x**2 * np.exp(-x)}, (0.0, np.inf)
-    )
+    found = weights_of(z, redshift=lambda x: x**2 * np.exp(-x))
     weights = np.exp(log_prior[0])
-    assert_allclose(axis.weights, weights / weights.sum(), rtol=1e-4)
+    assert_allclose(found, weights / weights.sum(), rtol=1e-4)
 
 
 def test_without_a_prior_each_node_has_the_same_weight():
     for values in NODES.values():
-        assert_allclose(_axis("tau", values, 1, "galaxy", {}).weights, 1 / values.size)
+        assert_allclose(weights_of(values), 1 / values.size)
 
 
 def test_weights_of_nodes_are_taken_as_they_are():
-    axis = _axis("tau", np.array([1.0, 2.0, 10.0]), 1, "galaxy", {"tau": [1.0, 2.0, 1.0]})
-    assert_allclose(axis.weights, [0.25, 0.5, 0.25])
+    values = np.array([1.0, 2.0, 10.0])
+    assert_allclose(weights_of(values, tau=[1.0, 2.0, 1.0]), [0.25, 0.5, 0.25])
     masked = np.ma.MaskedArray([1.0, 2.0, 1.0], mask=[False, True, False])
-    refuses("finite", _axis, "tau", np.array([1.0, 2.0, 10.0]), 1, "galaxy", {"tau": masked})
+    refuses("finite", weights_of, values, tau=masked)
 
 
 def test_a_density_of_one_node_is_no_information():
-    assert _axis("tau", np.array([2.0]), 1, "galaxy", {"tau": scipy.stats.norm(2, 1)}).weights == [
-        1.0
-    ]
-    assert _axis("tau", np.array([2.0]), 1, "galaxy", {"tau": "log"}).weights == [1.0]
+    assert weights_of(np.array([2.0]), tau=scipy.stats.norm(2, 1)) == [1.0]
+    assert weights_of(np.array([2.0]), tau="log") == [1.0]
 
 
 def test_a_density_that_misses_the_nodes_is_refused():
-    refuses(
-        "not all 0", _axis, "tau", NODES["steps"], 1, "galaxy", {"tau": scipy.stats.uniform(20, 1)}
-    )
+    refuses("not all 0", weights_of, NODES["steps"], tau=scipy.stats.uniform(20, 1))

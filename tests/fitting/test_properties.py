@@ -1,5 +1,6 @@
 """What holds for any photometry: missing bands, limits, any S/N, any unit, negative fluxes."""
 
+import dataclasses
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 
@@ -128,7 +129,7 @@ def test_chi2_is_that_of_the_best_model(wild, settings):
 
 def without_sample(results):
     """Results without the flag that depends on the other objects."""
-    return results._changed(flags=results.flags & ~int(FitFlags.HIGH_CHI2))
+    return dataclasses.replace(results, flags=results.flags & ~int(FitFlags.HIGH_CHI2))
 
 
 def test_order_pieces_and_executors_change_nothing(wild):

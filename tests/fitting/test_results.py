@@ -64,7 +64,7 @@ def test_odds_of_redshifts_are_the_posterior_in_the_window_of_outliers(grid, pho
     pdf = np.array([[0.25] * 4, [0, 1, 0, 0], [0.3, 0, 0, 0.7], [np.nan] * 4])
     some = results[:4]
     axes, pdf = some.axes | {"redshift": axis}, some.pdf | {"redshift": pdf}
-    made = some._changed(axes=axes, pdf=pdf)
+    made = dataclasses.replace(some, axes=axes, pdf=pdf)
     # about medians of 2, 1.5 and 3.29, whose window holds all of the upper peak
     flat, narrow = (2.15 / 0.85 - 1.85 / 1.15) / 4, 1.65 / 0.85 - 1.35 / 1.15
     wanted = [flat, narrow, 0.7, np.nan]

@@ -124,7 +124,8 @@ def test_tables_files_and_views(results, tmp_path):
     draws = np.random.default_rng(0).random((1000, results.pdf["redshift"].shape[1]))
     draws /= draws.sum(axis=1, keepdims=True)
     draws = draws[np.cumsum(draws, axis=1)[:, -1] > 1][: len(results)]
-    lifted = results[: len(draws)]._changed(pdf=results[: len(draws)].pdf | {"redshift": draws})
+    few = results[: len(draws)]
+    lifted = dataclasses.replace(few, pdf=few.pdf | {"redshift": draws})
     assert lifted.cdf("redshift")[1].max() == 1
     results.write(tmp_path / "r.fits")
     again = FitResults.read(tmp_path / "r.fits")

@@ -94,7 +94,7 @@ def in_pieces(fitter, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("chunk_rows", [1, 7, 64, 100, 1000])
 def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalog, in_pieces, chunk_rows):
-    catalog = catalog[: 25 * chunk_rows]
+    catalog = catalog[: 8 * chunk_rows]
     whole, results = fitter.fit(catalog), in_pieces(catalog, chunk_rows=chunk_rows)
     assert len(results.paths) == -(-len(catalog) // chunk_rows)
     assert_joined(results.parts(), whole)

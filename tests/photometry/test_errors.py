@@ -9,7 +9,7 @@ from helpers.errors import refuses
 from helpers.mosaics import stamps_of
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MemorySettings
-from miricigale.photometry.error_curves import _scatter
+from miricigale.photometry.error_curves import measured_curve
 from miricigale.photometry.errors import (
     LinearFit,
     noise_correlation,
@@ -198,6 +198,8 @@ def test_white_noise_has_no_correlation():
 
 def test_scatter_of_faint_sources_is_absolute_of_bright_ones_relative():
     faint = np.array([0.1, 0.2, 0.3])
-    assert_allclose(_scatter(faint, faint + [1.0, -1.0, 1.0]), (0.2, 1.0))
+    curve = measured_curve("miri.f770w", faint, faint + [1.0, -1.0, 1.0], 3, "median_abs")
+    assert_allclose([curve.flux, curve.error], [[0.2], [1.0]])
     bright = np.array([1.0, 10.0, 100.0])
-    assert_allclose(_scatter(bright, bright * [1.02, 1.02, 0.99]), (10.0, 0.2))
+    curve = measured_curve("miri.f770w", bright, bright * [1.02, 1.02, 0.99], 3, "median_abs")
+    assert_allclose([curve.flux, curve.error], [[10.0], [0.2]])

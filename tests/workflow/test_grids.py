@@ -19,7 +19,7 @@ from miricigale.workflow.stages.grids import (
     shown_patch,
     study_patches,
 )
-from miricigale.workflow.stages.images import _shared_noise
+from miricigale.workflow.stages.images import patch_noise
 
 FINE, NATIVE = 0.06, 0.11
 #: Side of the cores (arcsec) of the study that is run.
@@ -93,7 +93,7 @@ def test_pixels_are_those_of_the_whole_grid(tiled, scale):
 def test_noise_of_patches_is_one_image(tiled):
     boxes = {name: patch.box for name, patch in study_patches(tiled).items()}
     one, other = list(boxes)[:2]
-    noise = {name: _shared_noise(tiled, name, 7) for name in (one, other)}
+    noise = {name: patch_noise(tiled, name, 7) for name in (one, other)}
     low, high = boxes[other][1].start, boxes[one][1].stop
     assert high - low > 300
     left = noise[one][:, low - boxes[one][1].start :]

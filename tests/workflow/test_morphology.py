@@ -305,8 +305,8 @@ def test_real_galaxies_of_an_image_with_its_psf(data_file):
         galaxies, plain = RealGalaxies.read(path, psf=psf), RealGalaxies.read(path)
     assert galaxies.psf.fwhm.to_value(u.arcsec) == pytest.approx(0.16, abs=0.02)
     assert plain.psf is None
-    every, both = range(1, len(plain._found[2]) + 1), (plain, galaxies)
-    labels = [label for label in every if all(one.cutout(label) is not None for one in both)]
+    both = (plain, galaxies)
+    labels = [label for label in plain.labels if all(one.cutout(label) is not None for one in both)]
     assert len(labels) > 15
     sums, radii = (
         np.transpose([[f(one.cutout(label)) for one in (plain, galaxies)] for label in labels])

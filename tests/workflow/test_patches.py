@@ -175,7 +175,7 @@ n, run, folder = int(sys.argv[1]), sys.argv[2], pathlib.Path(sys.argv[3])
 image = MosaicFile(folder / "image-noisy.fits", filter={BAND!r})
 with process_pool(n) as executor:
     measure_patches(image, folder / "prior-noisy.fits", run, kernel=folder / "kernel.fits",
-                    patch_size=300, overlap=4 * u.arcsec, pages=False, executor=executor, n_threads=n)
+                    patch_size=360, overlap=4 * u.arcsec, pages=False, executor=executor, n_threads=n)
 """
 
 
@@ -186,7 +186,7 @@ def test_killed_and_resumed_on_any_workers_to_the_same_bytes(mosaics, tmp_path):
         return subprocess.Popen(command, start_new_session=True)
 
     run, patches = begin(2), tmp_path / "killed" / "patches"
-    while run.poll() is None and len(list(patches.glob("y*.ecsv"))) < 3:
+    while run.poll() is None and len(list(patches.glob("y*.ecsv"))) < 2:
         time.sleep(0.02)
     os.killpg(run.pid, signal.SIGKILL)
     assert run.wait() == -signal.SIGKILL
@@ -194,14 +194,14 @@ def test_killed_and_resumed_on_any_workers_to_the_same_bytes(mosaics, tmp_path):
     assert begin(1).wait() == 0
     with ThreadPoolExecutor(2) as executor:
         measure_patches(
-            *mosaics.files("noisy"), tmp_path / "threads", patch_size=300, overlap=4 * u.arcsec,
+            *mosaics.files("noisy"), tmp_path / "threads", patch_size=360, overlap=4 * u.arcsec,
             kernel=mosaics.folder / "kernel.fits", pages=False, executor=executor, n_threads=2,
         )  # fmt: skip
     made = [
         {path.name: path.read_bytes() for kind in ("*.fits", "*/*.ecsv") for path in run.glob(kind)}
         for run in (tmp_path / "killed", tmp_path / "threads")
     ]
-    assert len(made[0]) >= 10
+    assert len(made[0]) >= 5
     assert made[0] == made[1]
 
 

@@ -49,7 +49,7 @@ def read_metrics(report):
 def reports(tmp_path_factory):
     """Reports of several kinds of run."""
     folder = tmp_path_factory.mktemp("reports")
-    truths = {"frac_agn": (0.0, 0.4, 0.99, FIELD), "sets": ("all", "none", "blue", "red")}
+    truths = {"frac_agn": (0.0, 0.4, FIELD), "sets": ("all", "none", "blue", "red")}
     options = {"one": {"mass": 1e4}, "four": {"points": True}, "truths": {"points": True, **truths}}
     return {
         kind: make_run(folder / kind, filters, **options[kind]) for kind, filters in FILTERS.items()

@@ -1,5 +1,6 @@
 """Compiling ahead: what is compiled, that it is enough, and what happens where it cannot be kept."""
 
+import json
 import os
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from miricigale.workflow import warmup
 
 ROOT = Path(miricigale.__file__).parent.parent
 
-#: Every kernel of the package that has code, with its number of signatures and cache misses.
+#: The signatures of every kernel of the package that has code.
 KERNELS = """
 import sys
 from numba.core.dispatcher import Dispatcher
@@ -23,8 +24,7 @@ def kernels(subpackage):
         if name.startswith(f"miricigale.{subpackage}"):
             for key, value in vars(module).items():
                 if isinstance(value, Dispatcher) and value.py_func.__module__ == name:
-                    misses = sum(value.stats.cache_misses.values())
-                    found[f"{name}.{key}"] = (len(value.signatures), misses)
+                    found[f"{name}.{key}"] = [str(one) for one in value.signatures]
     return found
 """
 FIT = "from miricigale.workflow import warmup\nwarmup.compile_job('fit')"
@@ -50,41 +50,44 @@ def with_cache(cache):
     return {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(cache)}
 
 
-def python(code, cache):
-    """Run code in a process of its own with a cache of its own."""
+def python(code, folder, environment=None):
+    """Run code in a process of its own, by default with the cache of the tests."""
     command = [sys.executable, "-W", "error::RuntimeWarning", "-c", KERNELS + code]
     options = {"capture_output": True, "text": True, "timeout": 900, "check": False}
-    done = subprocess.run(command, cwd=cache, env=with_cache(cache), **options)
+    environment = environment or {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, env=environment, **options)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    """A cache in which the job of the fit has run."""
-    folder = tmp_path_factory.mktemp("numba")
-    python(FIT, folder)
-    return folder
-
-
 @pytest.mark.slow
-def test_a_fit_after_its_job_compiles_nothing(cache):
-    """No kernel of the fit is compiled anew, none for two signatures, none of the limits at all."""
-    out = python(REAL + "print(kernels('fitting') | kernels('sed'))", cache)
-    found = eval(out.splitlines()[-1])
-    assert {name for name, (_, misses) in found.items() if misses} == set()
-    assert {name for name, (n, _) in found.items() if n > 1} == set()
-    assert found["miricigale.fitting._core.evaluate._evaluate_runs"][0] == 1
-    of_limits = [name for name in found if "_core.limit" in name]
+def test_a_fit_after_its_job_compiles_nothing(tmp_path):
+    """Whatever a fit calls the job has called: every signature, one of each kernel, none of the limits."""
+    shown = "\nimport json\nprint(json.dumps(kernels('fitting') | kernels('sed')))"
+    of_job, of_fit = (
+        json.loads(python(code + shown, tmp_path).splitlines()[-1]) for code in (FIT, REAL)
+    )
+    missing = {name for name, signatures in of_fit.items() if set(signatures) - {*of_job[name]}}
+    assert missing == set()
+    assert {name for name, signatures in of_fit.items() if len(signatures) > 1} == set()
+    called = [name for name, signatures in of_fit.items() if signatures]
+    assert len(called) > 10
+    of_limits = [name for name in of_fit if "_core.limit" in name]
     assert len(of_limits) > 5
-    assert [name for name in of_limits if found[name][0]] == []
+    assert [name for name in of_limits if of_fit[name]] == []
 
 
-@pytest.mark.slow
-def test_what_is_compiled_is_known(cache, monkeypatch):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
+def test_what_is_compiled_is_known(tmp_path, monkeypatch):
+    """A job of which the kernels are on disk, until somebody empties the cache."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    code = tmp_path / "kernel.nbi"
+    monkeypatch.setitem(warmup.JOBS, "fit", (code.touch, "a job that keeps one kernel", 1))
+    assert not warmup.is_compiled("fit")
+    assert warmup.compile_job("fit")
     assert warmup.is_compiled("fit")
     assert not warmup.is_compiled("photometry")
+    code.unlink()
+    assert not warmup.is_compiled("fit")
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
@@ -137,5 +140,5 @@ def test_kernels_run_where_nothing_can_be_kept(tmp_path):
         "import numpy as np\n"
         "print(psf.polygon_coverage.__name__)\n"
     )
-    out = python(code, tmp_path)
+    out = python(code, tmp_path, with_cache(tmp_path))
     assert out.count("NUMBA_CACHE_DIR") == 1

@@ -13,7 +13,7 @@ replace by your own.
 # ----------
 # A catalog is an astropy table with positions, redshifts, shapes, and fluxes in columns that have the names of
 # filters. The package brings a part of GOODS-S; your own table works in the same way. The exposure decides which
-# part is needed: two integrations of 100 groups at each of two dithers.
+# part is needed: two integrations of 60 groups at each of two dithers.
 
 import astropy.units as u
 import matplotlib.pyplot as plt
@@ -32,7 +32,7 @@ from miricigale.scene import Scene, highres_image, read_catalog
 from miricigale.sed import SEDModel
 
 options = {"subarray": "BRIGHTSKY", "pointing": "53.129 -27.842"}
-exposure = Exposure("F770W", n_groups=100, n_integrations=2, **options)
+exposure = Exposure("F770W", n_groups=60, n_integrations=2, **options)
 catalog = read_catalog("catalog.goodss")
 inside = exposure.wcs.footprint_contains(catalog["sky"])
 galaxies = catalog[inside & ~catalog["star"]]

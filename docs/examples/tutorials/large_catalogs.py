@@ -7,7 +7,7 @@ from file to file instead. `~miricigale.fitting.fit_file` reads some rows, fits 
 continues. The results are those that one call of ``fit`` gives, number for number. A call that was stopped
 resumes, and threads, processes or a cluster can share the work.
 
-This tutorial does all of it with a catalog of 600 simulated galaxies, in seconds: it makes the catalog, fits it,
+This tutorial does all of it with a catalog of 240 simulated galaxies, in seconds: it makes the catalog, fits it,
 looks at the results, breaks and repairs them, and checks the redshifts.
 """
 
@@ -48,7 +48,7 @@ grid
 # Models are counted from 0: ``grid.flux(z, model)`` are their fluxes for one solar mass.
 
 rng = np.random.default_rng(1)
-n = 600
+n = 240
 z, model = rng.integers(40, size=n), rng.integers(grid.n_galaxies, size=n)
 mass = 10 ** rng.uniform(9, 11, n)
 flux = mass[:, None] * grid.flux(z, model) * u.uJy
@@ -71,7 +71,7 @@ table
 # folder.
 
 fitter = BayesFitter(grid)
-results = fit_file(fitter, "catalog.fits", "fits", chunk_rows=150, resume=False)
+results = fit_file(fitter, "catalog.fits", "fits", chunk_rows=60, resume=False)
 results
 
 # %%
@@ -137,7 +137,7 @@ before = kept.stat().st_mtime_ns
 lost.unlink()
 with open(damaged, "r+b") as stream:
     stream.truncate(100_000)
-results = fit_file(fitter, "catalog.fits", "fits", chunk_rows=150)
+results = fit_file(fitter, "catalog.fits", "fits", chunk_rows=60)
 age = kept.stat().st_mtime_ns - before
 print(f"{len(results)} objects; part 3 is {age} ns younger")
 
@@ -151,7 +151,7 @@ sorted(manifest)
 # Parts of another fit are never mixed in. Here the redshifts are fixed, which is another fit:
 
 try:
-    fit_file(fitter, "catalog.fits", "fits", chunk_rows=150, redshift="z_spec")
+    fit_file(fitter, "catalog.fits", "fits", chunk_rows=60, redshift="z_spec")
 except ValueError as error:
     print(error)
 
@@ -170,7 +170,7 @@ except ValueError as error:
 # compiled functions release the interpreter's lock. Processes and machines get the grid once each, and with every
 # task the photometry of 64 objects. The answer does not depend on who did it.
 
-known = {"chunk_rows": 150, "redshift": "z_spec", "resume": False}
+known = {"chunk_rows": 60, "redshift": "z_spec", "resume": False}
 with ThreadPoolExecutor(2) as executor:
     shared = fit_file(fitter, "catalog.fits", "threads", executor=executor, **known)
 shared

@@ -245,7 +245,7 @@ def make_highres(context, patch):
     config = context.config
     truth = context.table(f"{context.plan['truth']}/truth.ecsv")
     wcs = grid_of(config, config.highres.pixel_scale, patch)
-    noise = _shared_noise(config, patch, context.seed) if patch else None
+    noise = patch_noise(config, patch, context.seed) if patch else None
     own = {"seed": context.seed, "noise": noise}
     image, segmentation, detected = prior_image(config, truth, wcs, **own)
     context.save_image(f"{of_patch('f160w', patch)}.fits", image)
@@ -254,7 +254,7 @@ def make_highres(context, patch):
     context.save_table(f"{of_patch('detections', patch)}.ecsv", detected)
 
 
-def _shared_noise(config, patch, seed):
+def patch_noise(config, patch, seed):
     """Standard normal numbers of a patch: a part of each row of the field, the same where patches overlap."""
     rows, columns = study_patches(config)[patch].box
     streams = (stream(seed, "highres", str(y)) for y in range(rows.start, rows.stop))

@@ -7,7 +7,7 @@ redshifts.
 """
 
 # %%
-# Forty simulated galaxies in eight bands; three in four have a spectroscopic redshift.
+# Forty simulated galaxies in seven bands; three in four have a spectroscopic redshift.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -16,7 +16,7 @@ from astropy.table import QTable
 from miricigale import BayesFitter, SEDModel
 
 bands = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w"]
-bands += ["irac.ch1", "miri.f770w", "miri.f1000w", "miri.f1500w"]
+bands += ["irac.ch1", "miri.f770w", "miri.f1500w"]
 rng = np.random.default_rng(11)
 n = 40
 truth = QTable({"id": np.arange(n), "redshift": rng.uniform(0.3, 2.5, n)})

@@ -7,7 +7,7 @@ it was stopped.
 """
 
 # %%
-# A catalog of 120 simulated galaxies at known redshifts, as a FITS file. Parquet is read by parts too, with
+# A catalog of 60 simulated galaxies at known redshifts, as a FITS file. Parquet is read by parts too, with
 # ``pip install miricigale[parquet]``.
 
 from pathlib import Path
@@ -27,9 +27,10 @@ bands = [
     "wfc3.f160w",
     "irac.ch1",
     "miri.f770w",
+    "miri.f1500w",
 ]
 rng = np.random.default_rng(12)
-n = 120
+n = 60
 truth = QTable({"id": np.arange(n), "redshift": rng.uniform(0.3, 3, n)})
 truth["mass"] = 10 ** rng.uniform(9, 11, n) * u.Msun
 truth["age"], truth["tau"] = rng.uniform(0.1, 2, n), rng.uniform(0.2, 3, n)
@@ -46,7 +47,7 @@ catalog.write("catalog.fits", overwrite=True)
 # and become one file of results. ``resume=False`` replaces what an earlier fit left in the folder.
 
 fitter = BayesFitter()
-options = {"chunk_rows": 30, "redshift": "z_spec"}
+options = {"chunk_rows": 15, "redshift": "z_spec"}
 results = fit_file(fitter, "catalog.fits", "fits", resume=False, **options)
 results
 
@@ -88,6 +89,6 @@ plt.show()
 #
 # .. code-block:: console
 #
-#    $ miricigale fit catalog.fits -o fits --redshift z_spec --threads 8 --chunk-rows 30
+#    $ miricigale fit catalog.fits -o fits --redshift z_spec --threads 8 --chunk-rows 15
 #
 # The tutorial :doc:`/tutorials/large_catalogs` has threads, processes and clusters.

@@ -7,7 +7,7 @@ error.
 """
 
 # %%
-# 200 galaxies with spectroscopic redshifts are simulated from models with emission lines and bursts, and fitted
+# 120 galaxies with spectroscopic redshifts are simulated from models with emission lines and bursts, and fitted
 # with models that have neither: the difference stands for that of real galaxies and models. Photometric errors are
 # 3 %.
 
@@ -28,7 +28,7 @@ bands += [
     "miri.f770w",
 ]
 rng = np.random.default_rng(9)
-n = 200
+n = 120
 truth = QTable({"id": np.arange(n), "redshift": rng.uniform(0.2, 2.5, n)})
 truth["mass"], truth["age"] = np.full(n, 1e10), rng.uniform(0.3, 2, n)
 truth["ebv"], truth["f_burst"] = rng.uniform(0.1, 0.6, n), rng.choice([0, 0.05], n)
@@ -47,7 +47,7 @@ model = SEDModel.yang2021(agn=False)
 grid = model.grid(SEDModel.yang2021_axes("galaxy"), bands)
 half = photometry[: n // 2]
 fitter = BayesFitter(grid, model_error=0.1)
-for _ in range(4):
+for _ in range(3):
     error = measure_template_error(fitter.fit(half, redshift="z_spec"))
     fitter = BayesFitter(grid, model_error=0, template_error=error)
 

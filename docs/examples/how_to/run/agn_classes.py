@@ -7,7 +7,7 @@ AGN is as a function of flux.
 """
 
 # %%
-# A mock catalog stands for yours: galaxies of which a third has an AGN, in 15 existing bands and three bands of
+# A mock catalog stands for yours: galaxies of which half have an AGN, in 15 existing bands and three bands of
 # MIRI.
 
 import warnings
@@ -30,9 +30,9 @@ model, existing = SEDModel.yang2021(), ErrorModel.yang2021()
 depths = {"miri.f770w": 25.5, "miri.f1000w": 25.0, "miri.f1500w": 24.0}
 miri = ErrorModel.from_depths({k: v * u.ABmag for k, v in depths.items()})
 rng = np.random.default_rng(1)
-n = 300
+n = 150
 truth = QTable({"id": np.arange(n), "redshift": rng.uniform(0.3, 3, n)})
-truth["frac_agn"] = rng.choice([0.0, 0.0, 0.0, 0.0, 0.2, 0.6], n)
+truth["frac_agn"] = rng.choice([0.0, 0.0, 0.2, 0.6], n)
 truth["mass"] = 10 ** rng.uniform(8, 10.5, n) * u.Msun
 light = model.fluxes(truth, [*existing.filters, *depths])
 photometry = existing.perturb(light["id", *existing.filters], seed=1)

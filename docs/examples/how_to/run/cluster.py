@@ -32,7 +32,7 @@ from miricigale import BayesFitter, ErrorModel, SEDModel
 
 model, errors = SEDModel.yang2021(), ErrorModel.yang2021()
 rng = np.random.default_rng(1)
-n = 200
+n = 60
 parameters = QTable({"id": np.arange(n), "redshift": rng.uniform(0.3, 3, n)})
 parameters["frac_agn"] = rng.choice([0.0, 0.4], n)
 parameters["mass"] = 3e10

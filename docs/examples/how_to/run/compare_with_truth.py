@@ -48,7 +48,7 @@ print(f"scatter {metrics.sigma_mad:.3f}")
 
 model, errors = SEDModel.yang2021(), ErrorModel.yang2021()
 rng = np.random.default_rng(1)
-n = 200
+n = 100
 truth = QTable({"id": np.arange(n), "redshift": rng.uniform(0.3, 3, n)})
 truth["mass"] = 10 ** rng.uniform(9.3, 11, n) * u.Msun
 light = model.fluxes(truth, list(errors.filters))
