@@ -11,6 +11,8 @@ command says in a sentence, no name of the file in it, too much time or memory.
 
 import argparse
 import contextlib
+import gzip
+import importlib.util
 import json
 import logging
 import multiprocessing
@@ -22,6 +24,7 @@ import tempfile
 import time
 import traceback
 import warnings
+import zipfile
 from collections import Counter
 from pathlib import Path
 
@@ -91,11 +94,12 @@ def make_files(folder):
     """One file of each kind: name to path, and how it is read."""
     from miricigale import ErrorModel, Filter, FitResults, SEDModel
     from miricigale.cigale import read_pcigale_ini
-    from miricigale.filters import read_catalog_photometry
+    from miricigale.filters import CatalogMap, read_catalog_photometry
     from miricigale.fitting import BayesFitter
     from miricigale.instrument import read_dithers
     from miricigale.photometry.kernel_files import read_kernel
     from miricigale.photometry.mosaics import read_mosaic
+    from miricigale.photometry.priors import read_prior
     from miricigale.planning import load_plan
     from miricigale.psf import filter_psf
     from miricigale.psf.files import read_psf
@@ -116,12 +120,17 @@ def make_files(folder):
     plain.remove_column("sky")
     for kind, name in (("ecsv", "c.ecsv"), ("fits table", "c.fits"), ("votable", "c.xml")):
         write_table(table, add(kind, name, read_catalog))
+    if importlib.util.find_spec("pyarrow"):
+        write_table(plain, add("parquet", "c.parquet", read_catalog))
     units = {"units": {"flux": "uJy"}}
     write_table(plain, add("csv", "c.csv", lambda path: read_catalog_photometry(path, **units)))
     for kind, name, text, read in (
         ("study", "s.toml", STUDY, load_config),
         ("plan", "p.toml", PLAN, load_plan),
         ("dithers", "d.ecsv", DITHERS, read_dithers),
+        ("apt pointings", "plan.pointing", POINTINGS, read_dithers),
+        ("column map", "map.toml", COLUMNS, CatalogMap.read),
+        ("eazy map", "own.translate", TRANSLATE, CatalogMap.read),
         (
             "filter",
             "f.dat",
@@ -143,6 +152,16 @@ def make_files(folder):
     fitter = BayesFitter(SEDModel.yang2021(agn=False, libraries="bundled"), bands, axes=axes)
     fitter.fit(table).write(add("results", "r.fits", FitResults.read))
     image_hdus().writeto(add("image", "i.fits", read_mosaic))
+    segments = image_hdus()["SCI"].copy()
+    segments.data = np.kron(np.arange(1, 17).reshape(4, 4), np.ones((16, 16))).astype(np.int32)
+    prior = read_mosaic(folder / "i.fits")
+    fits.HDUList([fits.PrimaryHDU(), segments]).writeto(
+        add("segmentation", "seg.fits", lambda path: read_prior(prior, segmentation=path))
+    )
+    packed = add("gzip image", "i.fits.gz", read_mosaic)
+    packed.write_bytes(gzip.compress((folder / "i.fits").read_bytes(), mtime=0))
+    with zipfile.ZipFile(add("zip table", "c.ecsv.zip", read_catalog), "w") as archive:
+        archive.write(folder / "c.ecsv", "c.ecsv")
     filter_psf("miri.f770w", pixel_scale=0.11 * u.arcsec, pa=0 * u.deg).write(
         add("psf", "psf.fits", read_psf)
     )
@@ -181,6 +200,32 @@ x_offset y_offset
 0.0 0.0
 1.1 -2.0
 -3.5 4.25
+"""
+
+#: APT's list of pointings of one observation, a column map and a translation of EAZY.
+POINTINGS = """# APT Output Product
+========================================
+* Deep field (Obs 1)
+** Visit 1:1
+Tar Tile Exp Dith Aperture Name Target RA Dec BaseX BaseY DithX DithY V2 V3 IdlX IdlY Level Type ExPar DkPar dDist
+1 1 1 1 MIRIM_FULL 1 FIELD +80.4 -69.4 +0.0 +0.0 +0.0 +0.0 -453.5 -373.8 +0.0 +0.0 TARGET SCIENCE 0 0 0.0
+1 1 1 2 MIRIM_FULL 1 FIELD +80.4 -69.4 +0.0 +0.0 +1.1 -2.0 -453.5 -373.8 +1.1 -2.0 DITHER SCIENCE 0 0 2.2
+"""
+COLUMNS = """
+[columns]
+id = "NUMBER"
+"wfc3.f160w" = "f_F160W"
+"wfc3.f160w_err" = "e_F160W"
+"miri.f770w" = "f_F770W"
+"miri.f770w_err" = "e_F770W"
+[units]
+flux = "uJy"
+"""
+TRANSLATE = """id id
+f_F160W F205
+e_F160W E205
+f_F606W F236
+e_F606W E236 1.2
 """
 
 _BIG = (

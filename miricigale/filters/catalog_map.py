@@ -132,8 +132,8 @@ class CatalogMap:
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
-            If the file is missing, not TOML, or has another key; if two columns of a translate file are one
-            filter.
+            If the file is missing, not TOML, has another key or a value that a map cannot have, such as an unknown
+            filter; if two columns of a translate file are one filter.
         """
         path = Path(path).expanduser()
         with file_errors(path, "cannot be read as a map of columns", OSError, RecursionError):
@@ -144,7 +144,8 @@ class CatalogMap:
         fields = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(values) - set(fields))
         check_data(not unknown, path, f"is no map of columns: it has {unknown}; known: {fields}")
-        return cls(**values)
+        with file_errors(path, "is no map of columns"):
+            return cls(**values)
 
     @classmethod
     def from_translate(cls, translate):

@@ -322,14 +322,15 @@ def _read_pointings(path, observation, exposure):
     """Offsets of the dithers of an exposure."""
     pointings = {}
     apertures = set()
-    for current, words in _rows(path):
-        apertures.add(words[4])
-        if not words[4].startswith("MIRIM") or words[18] not in _USED:
-            continue
-        target, tile, number, dither = (int(word) for word in words[:4])
-        places = pointings.setdefault(current, {}).setdefault(number, {})
-        offset = float(words[11]), float(words[12])
-        places.setdefault((target, tile), {}).setdefault(dither, offset)
+    with reading(path, "a list of pointings"):
+        for current, words in _rows(path):
+            apertures.add(words[4])
+            if not words[4].startswith("MIRIM") or words[18] not in _USED:
+                continue
+            target, tile, number, dither = (int(word) for word in words[:4])
+            places = pointings.setdefault(current, {}).setdefault(number, {})
+            offset = float(words[11]), float(words[12])
+            places.setdefault((target, tile), {}).setdefault(dither, offset)
     check_data(pointings, path, f"has no exposures of MIRIM apertures; it has {sorted(apertures)}")
     exposures = pointings[_chosen("observation", observation, pointings)]
     positions = {}

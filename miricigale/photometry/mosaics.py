@@ -325,7 +325,8 @@ class MosaicFile:
         else:
             negative = 0 if kind == "weight" else np.count_nonzero(values[usable] < 0)
             wanted = "a map of 0 (no data) or more"
-            check_that(not negative, kind, wanted, f"{negative} pixels below 0 in {source}")
+            got = f"{negative} pixels below 0 in {source}, for {self.path}"
+            check_that(not negative, kind, wanted, got)
             sigma = _sigma(kind, values)
             usable &= np.isfinite(sigma) & (sigma > 0)
             meta["noise"] = f"{kind} ({source})"

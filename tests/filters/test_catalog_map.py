@@ -201,6 +201,9 @@ def test_a_map_in_a_file(tmp_path):
     path.write_text("column = 1\n")
     match = r"it has \['column'\]; known: \['columns', 'units'"
     refuses(match, CatalogMap.read, path, error=DataError)
+    path.write_text('[columns]\n"miri.f707w" = "f"\n')
+    match = r"map\.toml is no map of columns: no filter 'miri\.f707w'; the nearest of"
+    refuses(match, CatalogMap.read, path, error=DataError)
     match = "cannot be read as a map of columns"
     refuses(match, CatalogMap.read, tmp_path / "none.toml", error=DataError)
 

@@ -203,6 +203,10 @@ def test_tiles_have_one_pattern_or_none(tmp_path):
     assert_allclose(read_dithers(path).value, [[58, 23.5], [0, 0], [-58, -23.5]], atol=1e-9)
     path.write_text("\n".join(lines).replace("+57.221", "+57.321"))
     refuses(r"plan\.pointing: tiles of the observation have dithers", read_dithers, path)
+    path.write_text("\n".join(lines).replace("+57.221", "+57.2{21"))
+    with pytest.raises(ValueError, match=r"could not convert .*57\.2\{21") as caught:
+        read_dithers(path)
+    assert caught.value.__notes__ == [f"in {path}"]
 
 
 def test_centers_of_a_list_have_the_target_where_the_list_has_it(tmp_path):
