@@ -6,9 +6,11 @@ import scipy.fft
 from scipy.ndimage import gaussian_filter
 
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
+from miricigale.instrument import Exposure
+from miricigale.instrument import frame_time as read_time
 from miricigale.psf import MIRI_PIXEL_SCALE, instrument_psf, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice, check_positive, check_that
+from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 #: Factors on the noise of the sky by name: what surveys in flight lose against an ideal fit, and nothing.
@@ -49,8 +51,8 @@ def fitted_noise(
     background=None,
     size=0.0 * u.arcsec,
     psf=None,
-    n_integrations=1,
-    frame_time=2.775 * u.s,
+    n_integrations=None,
+    frame_time=None,
     n_frames=1,
     n_dithers=1,
     residual=None,
@@ -75,9 +77,10 @@ def fitted_noise(
     psf : `~photutils.psf.ImagePSF`, optional
         PSF of the exposure; `~miricigale.psf.miri_psf` by default.
     n_integrations : int, optional
-        Ramps into which the time is divided (over all dithers).
+        Ramps into which the time is divided (over all dithers); those of an `~miricigale.instrument.Exposure` of
+        the time of one dither by default, as for `sensitivity`.
     frame_time : `~astropy.units.Quantity`, optional
-        Time of one frame.
+        Time of one frame; that of FASTR1 in the sub-array by default.
     n_frames : int, optional
         Frames that are averaged to one group.
     n_dithers : int, optional
@@ -131,6 +134,12 @@ def fitted_noise(
     error of a faint source, ideal: 0.0184 uJy
     """
     seconds = positive(time, u.s, "time")
+    if n_integrations is None:
+        check_least(n_dithers, "n_dithers", 1, whole=True)
+        exposure = Exposure(filter, time=seconds / n_dithers * u.s, subarray=subarray)
+        n_integrations = n_dithers * exposure.n_integrations
+    if frame_time is None:
+        frame_time = read_time(subarray=subarray)
     for name, value in (("n_integrations", n_integrations), ("n_dithers", n_dithers)):
         check_that(int(value) == value and value >= 1, name, "an integer of at least 1", value)
     n_frames = check_count(n_frames, "n_frames")

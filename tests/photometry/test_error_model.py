@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.depth import sensitivity
-from miricigale.instrument import background_level
+from miricigale.instrument import Exposure, background_level
 from miricigale.photometry import YANG2021_DEPTHS, ErrorModel
 from miricigale.psf import gaussian_psf
 from miricigale.utils.exceptions import DataError
@@ -177,6 +177,18 @@ def test_errors_of_an_exposure_are_those_of_surveys_in_flight():
     assert ideal - default == pytest.approx(2.5 * np.log10(1.4), abs=0.02)
     limit = sensitivity(BAND, 1054 * u.s, n_groups=95, n_dithers=4).to_value(u.ABmag)
     assert limit == pytest.approx(default, abs=0.005)
+
+
+@pytest.mark.parametrize("name", ["F770W", "F2550W"])
+def test_a_time_has_one_limit(name):
+    """The time alone, its exposure and the sensitivity are the same question."""
+    exposure = Exposure(name, time=1 * u.hour)
+    limits = [
+        ErrorModel.from_exposure(exposure).limiting_flux(name),
+        ErrorModel.from_exposure(name, exposure.exposure_time).limiting_flux(name),
+        sensitivity(name, exposure.exposure_time),
+    ]
+    assert_allclose(u.Quantity(limits), limits[0], rtol=1e-6)
 
 
 def test_what_an_exposure_cannot_be_is_named():
