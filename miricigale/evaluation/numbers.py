@@ -150,8 +150,9 @@ def selection_table(sky, *, limits=CLASS_LIMITS):
     sky : `TruthResults`
         A truth whose AGN have the numbers and luminosities of a real field.
     limits : tuple of float, optional
-        Sources whose true AGN fraction is at least this are wanted, and those with such a posterior mean are
-        selected. Sources that were not fitted are not selected.
+        Sources whose true AGN fraction is at least this are wanted. Selected are those whose fraction is at least
+        this with a probability of one half: the median of the posterior, ``frac_agn_p50``. Sources that were not
+        fitted are not selected.
 
     Returns
     -------
@@ -169,10 +170,9 @@ def selection_table(sky, *, limits=CLASS_LIMITS):
     >>> matched = QTable({"id": ids, "selection": zero, "n_detected": zero + 2})
     >>> fit = QTable({"id": ids, "redshift_mean": [1.0, 1.02, 0.98, 1.8]})
     >>> fit["frac_agn_mean"] = [0.01, 0.03, 0.02, 0.3]
-    >>> fit["frac_agn_std"] = 0.05
+    >>> fit["frac_agn_p50"] = fit["frac_agn_mean"]
     >>> field = np.ones(4, bool)
     >>> one = TruthResults("agn00", 0.0, truth, matched, {"all": fit}, field)
-    >>> study = StudyResults((one,), ("miri.f770w",))
     >>> from miricigale.evaluation import selection_table
     >>> table = selection_table(one, limits=[0.1])
     >>> print(table["band_set", "limit", "n_wanted", "n_selected", "purity"])
@@ -184,12 +184,12 @@ def selection_table(sky, *, limits=CLASS_LIMITS):
     columns = {"band_set": [], "limit": []}
     qualities = []
     for band_set in sky.fits:
-        mean = sky.of_catalog(sky.fitted(band_set, "frac_agn_mean"))[sky.field]
+        median = sky.of_catalog(sky.fitted(band_set, "frac_agn_p50"))[sky.field]
         for limit in limits:
             columns["band_set"].append(band_set)
             columns["limit"].append(limit)
             # NaN is below every limit
-            qualities.append(selection_quality(true >= limit, mean >= limit))
+            qualities.append(selection_quality(true >= limit, median >= limit))
     columns["n_wanted"] = [quality.completeness.n for quality in qualities]
     columns["n_selected"] = [quality.purity.n for quality in qualities]
     columns |= quality_columns(qualities)

@@ -208,7 +208,7 @@ def test_selection_in_a_realistic_field():
     found[100:180] = 0.7
     found[300:320] = 0.6
     sample = one.sample.copy()
-    one.fits["all"]["frac_agn_mean"] = found[sample]
+    one.fits["all"]["frac_agn_p50"] = found[sample]
     table = selection_table(one, limits=(0.4,))
     wanted, selected = one.field & (frac > 0.4), sample & one.field & (found > 0.4)
     assert (table["n_wanted"][0], table["n_selected"][0]) == (wanted.sum(), selected.sum())

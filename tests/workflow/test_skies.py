@@ -58,7 +58,7 @@ def test_completeness_and_purity_are_those_of_all_skies(folder):
             weight = 1 / 40 if one["frac_agn"] >= 0.1 else 1 / 2
             n_agn += agn
             all_agn += agn * weight
-            if one["selection"] == 0 and one["frac_agn_mean"] >= limit:
+            if one["selection"] == 0 and one["frac_agn_p50"] >= limit:
                 selected += weight
                 found += agn * weight
         assert (row["n_skies"], row["n_wanted"]) == (40, n_agn)
@@ -68,7 +68,7 @@ def test_completeness_and_purity_are_those_of_all_skies(folder):
         # two whole skies of the 24 galaxies, and AGN of the others
         assert np.count_nonzero(table["sky"] <= 2) == 48
         assert np.all(table["frac_agn"][table["sky"] > 2] >= 0.1)
-        assert np.all(np.isfinite(table["frac_agn_mean"]) == (table["selection"] == 0))
+        assert np.all(np.isfinite(table["frac_agn_p50"]) == (table["selection"] == 0))
 
 
 def test_skies_are_the_same_again_and_can_be_left_out(folder):

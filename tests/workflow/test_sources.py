@@ -80,7 +80,7 @@ def test_the_table_holds_what_the_tables_hold(run):
             if key not in at:
                 assert table[f"redshift_{chosen}"][k] is None
                 continue
-            row, names = fits[at[key]], ("redshift_mean", "frac_agn_mean", "reduced_chi2", "flags")
+            row, names = fits[at[key]], ("redshift_mean", "frac_agn_p50", "reduced_chi2", "flags")
             columns = [f"{name}_{chosen}" for name in ("redshift", "frac_agn", "chi2", "fit")]
             assert close([table[column][k] for column in columns], [row[name] for name in names])
 

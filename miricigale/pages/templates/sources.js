@@ -82,11 +82,11 @@
     columns.push({ key: "chi2_" + band.name, group: "χ²", label: band.label, title: "template-weighted mean of (residual / sigma)²", digits: 2 });
   }
   columns.sort((a, b) => (a.group > b.group) - (a.group < b.group));
-  for (const [key, group, digits] of [["redshift", "redshift", 3], ["frac_agn", "fracAGN", 2]]) {
+  for (const [key, group, digits, value] of [["redshift", "redshift", 3, "mean"], ["frac_agn", "fracAGN", 2, "median"]]) {
     if (study) columns.push({ key, group, label: "true", title: "injected", digits });
     for (const set of facts.compared) {
       if (!(key + "_" + set in table)) continue;
-      columns.push({ key: key + "_" + set, group, label: setOf[set].label, title: "posterior mean, " + setOf[set].label, digits, set });
+      columns.push({ key: key + "_" + set, group, label: setOf[set].label, title: "posterior " + value + ", " + setOf[set].label, digits, set });
     }
   }
   for (const band of miri) {

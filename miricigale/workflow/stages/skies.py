@@ -64,8 +64,9 @@ def fit_skies(context, unit):
     with without_warnings():
         results = fit_mock(context, given, plan["bands"], axes=plan["axes"])
     table = skies["sky", "redshift", "frac_agn"]
-    table["frac_agn_mean"], table["id"] = np.nan, truth["id"][rows]
-    table["frac_agn_mean"][sample] = results.mean("frac_agn").value
+    table["id"] = truth["id"][rows]
+    table["frac_agn_p50"] = np.nan
+    table["frac_agn_p50"][sample] = results.median("frac_agn").value
     table["n_detected"], table["selection"] = mock["n_detected"], mock["selection"]
     table["selection"].info.description = SampleFlags.describe()
     table.meta = {"n_skies": n_skies, "n_whole": whole}
@@ -144,7 +145,7 @@ def sky_numbers(context):
         weight = np.where(true >= CLASS_LIMITS[0], 1 / n, 1 / table.meta["n_whole"])
         for limit in CLASS_LIMITS:
             # NaN is below every limit
-            wanted, selected = true >= limit, np.asarray(table["frac_agn_mean"]) >= limit
+            wanted, selected = true >= limit, np.asarray(table["frac_agn_p50"]) >= limit
             qualities.append(sky_quality(table["id"], wanted, selected, weight))
             sums = np.sum(weight * wanted), np.sum(weight * selected)
             rows.append((unit.split("/")[1], limit, n, np.count_nonzero(wanted), *sums))

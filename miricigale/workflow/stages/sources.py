@@ -26,6 +26,8 @@ from miricigale.workflow.truths import truth_names
 N_WAVE = 240
 #: Parameters whose posteriors are drawn.
 DRAWN = ("redshift", "frac_agn")
+#: What the table of sources has of each: AGN are selected by the median.
+_VALUES = {"redshift": "mean", "frac_agn": "p50"}
 #: The flags that the page explains, by what it calls them.
 FLAGS = {
     "selection": SampleFlags,
@@ -154,7 +156,8 @@ class _Sources(StudyTables):
         for unit in self.compared:
             fits = self.fits[unit]
             for parameter in DRAWN:
-                columns[f"{parameter}_{unit}"] = self.of_sources(fits[f"{parameter}_mean"])
+                value = fits[f"{parameter}_{_VALUES[parameter]}"]
+                columns[f"{parameter}_{unit}"] = self.of_sources(value)
             columns[f"chi2_{unit}"] = self.of_sources(fits["reduced_chi2"])
         for band in self.miri:
             flux, error = self._measured(band)
