@@ -114,7 +114,8 @@ shown
 # 5. Find the AGN
 # ---------------
 # A source is selected if its AGN fraction is at least 0.4 with a probability of one half: if the median of the
-# posterior is. This is the rule of plans and studies, too. The redshifts and fractions are compared with the truth, since it is known here.
+# posterior is. This is the rule of plans and studies, too. The redshifts and fractions are compared with the truth,
+# since it is known here.
 
 selected = table["frac_agn_p50"] >= 0.4
 order = [list(truth["id"]).index(key) for key in table["id"]]
@@ -134,8 +135,8 @@ right.legend()
 plt.show()
 
 # %%
-# The numbers of this small sample. The fractions are below the true ones, since the fitter counts that AGN as strong
-# as these are rare; in this field every fourth galaxy has one.
+# The numbers of this small sample. The fractions are below the true ones, since the fitter counts that AGN as
+# strong as these are rare; in this field every fourth galaxy has one.
 
 quality = selection_quality(f_true > 0, selected)
 metrics = photoz_metrics(z_true, table["redshift_mean"])
