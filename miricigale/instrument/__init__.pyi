@@ -22,6 +22,7 @@ from .exposure import frame_time as frame_time
 from .exposure import frames_per_group as frames_per_group
 from .exposure import readout_patterns as readout_patterns
 from .figures import imager_filters as imager_filters
+from .header_wcs import as_wcs as as_wcs
 from .history import REFERENCES as REFERENCES
 from .history import ExposureHistory as ExposureHistory
 from .history import epoch_of as epoch_of

@@ -5,9 +5,11 @@ import re
 import warnings
 
 import numpy as np
+from astropy.io import fits
 
 from miricigale.instrument.asdf_extension import asdf_wcs, read_gwcs
 from miricigale.utils.exceptions import PhotometryWarning, data_error, warn
+from miricigale.utils.options import check_that
 
 #: Kinds of exposures of JWST by their instruments.
 _KIND_OF_JWST = re.compile("(?:MIR|NRC|NRS|NIS|FGS)_")
@@ -72,6 +74,54 @@ def header_wcs(header, hdus=None, *, where):
     if header.get("NAXIS", 2) > 2:
         # parts are cut by it, and of two axes it must have two
         wcs.pixel_shape = header["NAXIS1"], header["NAXIS2"]
+    return wcs
+
+
+def as_wcs(given, argument="wcs"):
+    """
+    World coordinates of whatever holds some.
+
+    Parameters
+    ----------
+    given : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or image with ``wcs``
+        A header has those of its image, with the shape of the pixels if it states it.
+    argument : str, optional
+        The argument's name, for messages.
+
+    Returns
+    -------
+    wcs : `~astropy.wcs.WCS`
+
+    Raises
+    ------
+    ValueError
+        If it is nothing of these, or without celestial axes.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from miricigale.instrument import as_wcs, north_up_wcs
+    >>> wcs = north_up_wcs(SkyCoord(53.1, -27.8, unit="deg"), 0.1 * u.arcsec, (20, 30))
+    >>> as_wcs(wcs.to_header()).wcs.ctype[0]
+    'RA---TAN'
+    """
+    from astropy.wcs import WCS
+
+    wcs = given
+    if isinstance(given, fits.Header):
+        wcs = header_wcs(given, where=f"'{argument}'")
+        if wcs is not None and "NAXIS2" in given:
+            wcs.pixel_shape = given["NAXIS1"], given["NAXIS2"]
+    elif not isinstance(given, WCS):
+        shape = getattr(given, "shape", None)
+        wcs = getattr(given, "wcs", None)
+        if isinstance(wcs, WCS) and wcs.pixel_shape is None and shape is not None:
+            wcs = wcs.deepcopy()
+            wcs.pixel_shape = shape[::-1]
+    celestial = isinstance(wcs, WCS) and wcs.has_celestial
+    wanted = "an astropy WCS with celestial axes, or a header or an image with one"
+    check_that(celestial, argument, wanted, type(given).__name__)
     return wcs
 
 

@@ -3,14 +3,21 @@
 import os
 import re
 
+import astropy.units as u
 import numpy as np
 from astropy.io import fits
-from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.nddata import CCDData, Cutout2D, NoOverlapError, StdDevUncertainty
+from astropy.wcs.utils import proj_plane_pixel_scales
 
+from miricigale.filters import find_filter
 from miricigale.instrument.dq import dq_planes
+from miricigale.instrument.header_wcs import as_wcs
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import fits_meta
+from miricigale.utils.options import check_that
+from miricigale.utils.positions import as_position
+from miricigale.utils.units import ANGLE
 
 #: How files of products of JWST are called.
 _PRODUCT = re.compile(
@@ -75,23 +82,95 @@ class Image(Interactive, CCDData):
     data are the primary HDU, with uncertainty (as standard deviation) and mask as extensions, as astropy has
     them, and flags as JWST has them (``DQ``).
 
+    Parameters
+    ----------
+    *args, **kwargs
+        As for `~astropy.nddata.CCDData`.
+    filter : str or `~miricigale.filters.Filter`, optional
+        Filter of the image, kept as ``meta["filter"]``.
+    wcs : `~astropy.wcs.WCS` or `~astropy.io.fits.Header`, optional
+        World coordinates; those of a header are read from it.
+
     Examples
     --------
     >>> import numpy as np
     >>> from miricigale.instrument import Image
-    >>> image = Image(np.ones((4, 4)), unit="MJy/sr", meta={"dithers": [0, 1, 2]})
+    >>> image = Image(np.ones((4, 4)), unit="MJy/sr", filter="F770W", meta={"dithers": [0, 1]})
+    >>> image
+    <Image 4 x 4, MJy / sr, miri.f770w>
     >>> image.write("image.fits")  # doctest: +SKIP
     >>> image.meta["dithers"]
-    [0, 1, 2]
+    [0, 1]
     """
+
+    def __init__(self, *args, filter=None, wcs=None, **kwargs):
+        if isinstance(wcs, fits.Header):
+            wcs = as_wcs(wcs)
+        super().__init__(*args, wcs=wcs, **kwargs)
+        if filter is not None:
+            name = str(getattr(filter, "name", filter))
+            # a filter of the user's own has its own name
+            self.meta["filter"] = find_filter(name) or name
+
+    def __repr__(self):
+        facts = [f"{self.shape[0]} x {self.shape[1]}" if self.ndim == 2 else str(self.shape)]
+        facts += [str(self.unit), str(self.meta.get("filter") or "")]
+        if self._has_sky:
+            facts.append(self._center.to_string("hmsdms", precision=1))
+        return f"<Image {', '.join(one for one in facts if one)}>"
+
+    __str__ = __repr__
+
+    @property
+    def _has_sky(self):
+        return self.ndim == 2 and self.wcs is not None and self.wcs.has_celestial
+
+    @property
+    def _center(self):
+        ny, nx = self.shape
+        return self.wcs.pixel_to_world(nx / 2 - 0.5, ny / 2 - 0.5)
+
+    @property
+    def pixel_scale(self):
+        """Side of a pixel, arcsec: the mean of the two axes."""
+        check_that(self._has_sky, "image", "one with celestial world coordinates", repr(self))
+        scales = proj_plane_pixel_scales(self.wcs.celestial)
+        return (np.sqrt(np.prod(scales)) * u.deg).to(ANGLE)
+
+    def cutout(self, position, size):
+        """
+        Cut a rectangle out, with its world coordinates, uncertainty and mask.
+
+        Parameters
+        ----------
+        position : `~astropy.coordinates.SkyCoord`, pair or str
+            Center on the sky; text such as ``"150.1 +2.2"`` or a pair is right ascension and declination.
+        size : `~astropy.units.Quantity` or pair
+            Side, or sides along y and x, as angles or in pixels. At the edge of the image the part that is on it
+            is cut out.
+
+        Returns
+        -------
+        image : `Image`
+
+        Raises
+        ------
+        ValueError
+            If the image has no celestial world coordinates, or the rectangle is not on it.
+        """
+        check_that(self._has_sky, "image", "one with celestial world coordinates", repr(self))
+        position = as_position(position, "position")
+        try:
+            part = Cutout2D(self.data, position, size, wcs=self.wcs)
+        except NoOverlapError:
+            raise argument_error("position", "one on the image", position.to_string()) from None
+        return self[part.slices_original]
 
     def _facts(self):
         ny, nx = self.shape
         known = {} if self.mask is None else {"masked": f"{100 * np.mean(self.mask):.3g} %"}
-        if self.wcs is not None and self.wcs.has_celestial:
-            known["center"] = self.wcs.pixel_to_world(nx / 2 - 0.5, ny / 2 - 0.5).to_string(
-                "hmsdms"
-            )
+        if self._has_sky:
+            known["center"] = self._center.to_string("hmsdms")
         shown = ("filter", "subarray", "n_exposures", "exposure_time", "background", "steps")
         known |= {name.replace("_", " "): self.meta[name] for name in shown if name in self.meta}
         return {"pixels": f"{ny} x {nx}", "unit": self.unit, **known}

@@ -9,7 +9,7 @@ from astropy.coordinates import SkyCoord
 from photutils.psf import ImagePSF
 from photutils.segmentation import SegmentationImage
 
-from miricigale.instrument import epoch_of
+from miricigale.instrument import as_wcs, epoch_of
 from miricigale.photometry.arrays import image_arrays, nearest_values, pixel_scale, same_grid
 from miricigale.photometry.catalogs import OPTIONAL, catalog_sources, joined_sky, sersic_rows
 from miricigale.photometry.cutouts import Cutout, own_segments, saturated_cores
@@ -213,7 +213,7 @@ class SourceTemplates:
             which it is not ``"sersic"`` are points.
         template : {"psf", "sersic"}, optional
             Which of the two.
-        wcs : `~astropy.wcs.WCS`, optional
+        wcs : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or image, optional
             A grid on which profiles are drawn; by default one that is north up about the
             middle of each image that is measured.
 
@@ -230,7 +230,8 @@ class SourceTemplates:
         known = catalog_sources(catalog)
         rows = sersic_rows(catalog) if template == "sersic" else None
         meta = provenance(template=template)
-        return cls(**known, light=(None,) * len(known["id"]), sersic=rows, wcs=wcs, meta=meta)
+        grid = None if wcs is None else as_wcs(wcs)
+        return cls(**known, light=(None,) * len(known["id"]), sersic=rows, wcs=grid, meta=meta)
 
     @classmethod
     def from_arrays(cls, arrays, corners, catalog, *, wcs, convolved=True):
@@ -245,7 +246,7 @@ class SourceTemplates:
             Pixel (y, x) of the grid, from 0, on which the first pixel of each array lies.
         catalog : `~astropy.table.QTable`
             As for `from_images`, without labels.
-        wcs : `~astropy.wcs.WCS`
+        wcs : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or image
             The grid, whose pixels are those of the matching kernels.
         convolved : bool or array_like of bool, shape (n,), optional
             Whether arrays show the sources through the high-resolution PSF (as that image does)
@@ -278,7 +279,7 @@ class SourceTemplates:
                 at = tuple(int(c) for c in corners[k])
                 data = Cutout(data / total, at, convolved=bool(convolved[k]))
             light.append(data)
-        return cls(**known, light=light, wcs=wcs, meta=provenance(template="arrays"))
+        return cls(**known, light=light, wcs=as_wcs(wcs), meta=provenance(template="arrays"))
 
     @classmethod
     def concatenate(cls, parts):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.instrument import ImageFacts
+from miricigale.instrument import ImageFacts, as_wcs
 from miricigale.reduction.align import align_images
 from miricigale.reduction.background import (
     BackgroundFlags,
@@ -87,6 +87,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
         images, _ = align_images(images, None if isinstance(align, str) else align)
     if wcs is None:
         wcs = own_grid(images, pixel_scale)
+    wcs = as_wcs(wcs)
     notes = []
     if reducer.mosaics.outlier_threshold is not None and len(images) < 3:
         number = "a single dither" if len(images) == 1 else "two dithers"

@@ -6,7 +6,13 @@ from dataclasses import field
 from astropy.nddata import CCDData
 
 from miricigale.detector import Charge, Ramp, ResetAnomaly
-from miricigale.instrument import DetectorProperties, ExposureHistory, ImageFacts, miri_detector
+from miricigale.instrument import (
+    DetectorProperties,
+    ExposureHistory,
+    ImageFacts,
+    as_wcs,
+    miri_detector,
+)
 from miricigale.reduction.align import align_images, visit_of
 from miricigale.reduction.assumed import brightness_of, maps_of
 from miricigale.reduction.background import estimate_background, remove_background, subtractable
@@ -293,7 +299,7 @@ class Reducer(Interactive):
         images : iterable of `~astropy.nddata.CCDData`
             Calibrated, background-subtracted images. Outliers are masked first, if there
             are three or more images and that was not done before.
-        wcs : `~astropy.wcs.WCS`, optional
+        wcs : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or image, optional
             Of the output, with ``pixel_shape``; by default as of `run`.
 
         Returns
@@ -311,7 +317,7 @@ class Reducer(Interactive):
             or lies elsewhere on the sky.
         """
         images = [opened(image) for image in several(images)]
-        wcs = own_grid(images, _SCALE) if wcs is None else wcs
+        wcs = own_grid(images, _SCALE) if wcs is None else as_wcs(wcs)
         return self.drizzle(images, wcs)[0].image
 
     def drizzle(self, images, wcs):

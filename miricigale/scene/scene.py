@@ -5,11 +5,11 @@ from operator import attrgetter
 
 import astropy.units as u
 import numpy as np
-from astropy.wcs import WCS
 
 from miricigale.depth import sky_background
 from miricigale.filters.band_names import find_filter
 from miricigale.instrument import Exposure, aperture, pixel_area_map
+from miricigale.instrument.header_wcs import as_wcs
 from miricigale.instrument.image import Image
 from miricigale.profiles import ellipse_to_pixels
 from miricigale.psf import InstrumentPSF, PSFGrid, as_psf, miri_psf
@@ -68,8 +68,9 @@ class Scene(Interactive):
         What the image is exposed by: gives ``filter`` and ``wcs``.
     filter : str or `~miricigale.filters.Filter`, optional
         Any name of the filter of the fluxes, such as ``"F770W"``.
-    wcs : `~astropy.wcs.WCS`, optional
-        World coordinates of the image with their ``pixel_shape``, distorted or not.
+    wcs : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or image, optional
+        World coordinates of the image with their ``pixel_shape``, distorted or not: as such, or those of a header
+        or of another image.
     psf : `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel` or other, optional
         PSF on the image's pixels with the pixel response in it (see `~miricigale.psf.as_psf`), or PSFs over
         the field (see `~miricigale.psf.miri_psf_grid`); `~miricigale.psf.miri_psf` by default. The pixel of an
@@ -151,7 +152,7 @@ class Scene(Interactive):
                 wcs = exposure.wcs
         for name, value in (("filter", filter), ("wcs", wcs)):
             check_that(value is not None, name, "given, or an exposure", "None")
-        check_that(isinstance(wcs, WCS), "wcs", "an astropy WCS", type(wcs).__name__)
+        wcs = as_wcs(wcs)
         check_that(wcs.pixel_shape is not None, "wcs", "a WCS with its pixel_shape", "one without")
         name = str(getattr(filter, "name", filter))
         self._wcs = wcs

@@ -2,11 +2,13 @@
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 
-from miricigale.instrument import Image
+from helpers.errors import refuses
+from miricigale.instrument import Image, as_wcs, north_up_wcs
 from miricigale.utils.meta import full_meta
 
 
@@ -33,3 +35,36 @@ def test_an_image_is_written_and_read_by_astropy(tmp_path):
     assert image.meta["exposure"]["time"] == 1.5
     assert isinstance(image[:2], Image)
     assert fits.getheader(tmp_path / "a.fits")["BUNIT"] == "MJy / sr"
+
+
+def test_an_image_of_a_header_and_a_filter_in_one_line():
+    center = SkyCoord(53.1, -27.8, unit="deg")
+    wcs = north_up_wcs(center, 0.1 * u.arcsec, (60, 80))
+    error = StdDevUncertainty(np.full((60, 80), 0.1))
+    options = {"unit": "MJy/sr", "uncertainty": error, "filter": "JWST/MIRI.F770W"}
+    image = Image(np.arange(4800.0).reshape(60, 80), wcs=wcs.to_header(), **options)
+    text = "<Image 60 x 80, MJy / sr, miri.f770w, 03h32m24.0s -27d48m00.0s>"
+    assert repr(image) == text
+    np.testing.assert_allclose(image.pixel_scale.to_value(u.arcsec), 0.1)
+    part = image.cutout(center.directional_offset_by(0 * u.deg, 1 * u.arcsec), 1 * u.arcsec)
+    # ten pixels further north, five to either side
+    np.testing.assert_array_equal(part.data, image.data[35:45, 35:45])
+    assert part.uncertainty.array.shape == (10, 10)
+    assert part.wcs.pixel_to_world(4.5, 4.5).separation(center) < 1.01 * u.arcsec
+    refuses("'position' must be one on the image", image.cutout, "10 10", 1 * u.arcsec)
+    plain = Image(np.zeros((4, 4)), unit="MJy/sr", filter="own")
+    assert repr(plain) == "<Image 4 x 4, MJy / sr, own>"
+    refuses("'image' must be one with celestial", plain.cutout, center, 1 * u.arcsec)
+
+
+def test_world_coordinates_of_a_header_or_an_image():
+    wcs = north_up_wcs(SkyCoord(53.1, -27.8, unit="deg"), 0.1 * u.arcsec, (60, 80))
+    header = fits.PrimaryHDU(np.zeros((60, 80)), wcs.to_header()).header
+    image = CCDData(np.zeros((60, 80)), unit="MJy/sr", wcs=WCS(wcs.to_header()))
+    for given in (wcs, header, image):
+        found = as_wcs(given)
+        assert found.pixel_shape == (80, 60)
+        np.testing.assert_allclose(
+            found.pixel_to_world(3, 4).ra.deg, wcs.pixel_to_world(3, 4).ra.deg
+        )
+    refuses("'grid' must be an astropy WCS with celestial axes", as_wcs, fits.Header(), "grid")

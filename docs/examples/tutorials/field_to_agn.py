@@ -114,8 +114,8 @@ shown
 # 5. Find the AGN
 # ---------------
 # A source is selected if its AGN fraction is at least 0.4 with a probability of one half: if the median of the
-# posterior is. This is the rule of plans and studies, too. The redshifts and fractions are compared with the truth,
-# since it is known here.
+# posterior is. This is the rule of plans and studies, too. Redshifts and fractions are compared with the truth,
+# which is known here.
 
 selected = table["frac_agn_p50"] >= 0.4
 order = [list(truth["id"]).index(key) for key in table["id"]]
