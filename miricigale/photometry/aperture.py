@@ -5,12 +5,14 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 from astropy.nddata import CCDData, StdDevUncertainty
-from photutils.aperture import ApertureStats, CircularAperture
+from photutils.aperture import ApertureStats, CircularAperture, PixelAperture, SkyAperture
 from photutils.background import LocalBackground, SExtractorBackground
 from photutils.segmentation import SourceCatalog
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.detection import detect_sources
+from miricigale.photometry.mosaics import as_mosaic
+from miricigale.utils.options import check_that
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, FNU, positive, to_array
@@ -22,18 +24,18 @@ _KRON, _BACKGROUND, _RING, _DIAMETER = (2.5, 3.5), (64, 6), 40, 1.86
 _AUTO_FRACTION, _APERTURE_FRACTION = 0.94, 0.8
 
 
-def aperture_photometry(image, sky, diameter):
+def aperture_photometry(image, sky, diameter=None):
     """
-    Sum light in circles.
+    Sum light in circles, or in other apertures.
 
     Parameters
     ----------
-    image : `~astropy.nddata.CCDData`
+    image : `~astropy.nddata.CCDData`, path-like or other (see `as_mosaic`)
         In units of surface brightness, with WCS.
-    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
-        Positions.
-    diameter : `~astropy.units.Quantity`
-        Of the aperture.
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,), or `~photutils.aperture.Aperture`
+        Positions of circles; or an aperture of photutils, on the sky or in pixels of the image.
+    diameter : `~astropy.units.Quantity`, optional
+        Of the circles.
 
     Returns
     -------
@@ -45,7 +47,7 @@ def aperture_photometry(image, sky, diameter):
     Raises
     ------
     ValueError
-        If the diameter is not positive.
+        If the diameter is not positive, positions are without one, or an aperture has one.
 
     Examples
     --------
@@ -66,12 +68,20 @@ def aperture_photometry(image, sky, diameter):
     >>> print(f"{table['flux'][0]:.2f} +- {table['flux_err'][0]:.2f}")
     1.58 uJy +- 0.05 uJy
     """
-    arrays = image_arrays(image, "image")
-    size = positive(diameter, ANGLE, "diameter")
-    xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
-    flux, flux_err, coverage = circle_sums(arrays, xy, size / 2 / pixel_scale(image.wcs))
+    arrays = image_arrays(as_mosaic(image), "image")
+    if isinstance(sky, (PixelAperture, SkyAperture)):
+        check_that(diameter is None, "diameter", "left out with an aperture", diameter)
+        aperture = sky.to_pixel(arrays.wcs) if isinstance(sky, SkyAperture) else sky
+        flux, flux_err, coverage = aperture_sums(arrays, aperture)
+        shape = type(sky).__name__
+    else:
+        check_that(diameter is not None, "diameter", "given with positions", "None")
+        size = positive(diameter, ANGLE, "diameter")
+        xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
+        flux, flux_err, coverage = circle_sums(arrays, xy, size / 2 / pixel_scale(arrays.wcs))
+        shape = f"a circle of {size:.4g} arcsec diameter"
     columns = {
-        "flux": (flux * FNU, f"Light in a circle of {size:.4g} arcsec diameter"),
+        "flux": (flux * FNU, f"Light in {shape}"),
         "flux_err": (flux_err * FNU, "1-sigma error, if the noise is not correlated"),
         "coverage": (coverage, "Fraction of the aperture on usable pixels"),
     }
@@ -83,7 +93,11 @@ def circle_sums(arrays, xy, radius):
     n = len(xy)
     if n == 0:
         return np.empty(0), np.empty(0), np.empty(0)
-    aperture = CircularAperture(np.nan_to_num(xy, nan=-1e6), radius)
+    return aperture_sums(arrays, CircularAperture(np.nan_to_num(xy, nan=-1e6), radius))
+
+
+def aperture_sums(arrays, aperture):
+    """Flux, error and usable fraction in apertures of photutils in pixels, exact in the pixels that they cut."""
     variance = np.where(arrays.usable, arrays.sigma, 0.0) ** 2
     sums = [
         np.atleast_1d(ApertureStats(image, aperture).sum)

@@ -10,7 +10,7 @@ import os
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
-from astropy.nddata import CCDData, NDData, StdDevUncertainty
+from astropy.nddata import CCDData, Cutout2D, NDData, StdDevUncertainty
 
 from miricigale.filters.band_names import find_filter
 from miricigale.instrument.data_models import is_data_model, read_data_model
@@ -78,8 +78,8 @@ def as_mosaic(image, argument="image"):
 
     Parameters
     ----------
-    image : `~astropy.nddata.NDData`, path-like, `~astropy.io.fits.HDUList`, HDU or data model of ``jwst``
-        Files, HDUs and data models are read as by `read_mosaic`.
+    image : `~astropy.nddata.NDData`, `~astropy.nddata.Cutout2D`, path-like, HDU, HDUs or data model of ``jwst``
+        Files, HDUs and data models are read as by `read_mosaic`. A cutout has the unit of its data.
     argument : str, optional
         The argument's name for messages.
 
@@ -113,6 +113,11 @@ def as_mosaic(image, argument="image"):
         image = fits.HDUList([image])
     if isinstance(image, fits.HDUList):
         return read_mosaic(Opened(image))
+    if isinstance(image, Cutout2D):
+        wanted = "a Cutout2D of a Quantity, or CCDData(cutout.data, unit=..., wcs=cutout.wcs)"
+        is_quantity = isinstance(image.data, u.Quantity)
+        check_that(is_quantity, argument, wanted, "a Cutout2D without unit")
+        return CCDData(image.data.value, unit=image.data.unit, wcs=image.wcs)
     wanted = "a CCDData, an NDData with unit and WCS, HDUs or the path of a FITS file"
     if not isinstance(image, NDData) or image.unit is None:
         raise argument_error(argument, wanted, type(image).__name__)

@@ -3,7 +3,9 @@ import numpy as np
 import pytest
 import sep
 from astropy.convolution import Gaussian2DKernel
+from astropy.nddata import Cutout2D
 from numpy.testing import assert_allclose
+from photutils.aperture import SkyCircularAperture
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
@@ -35,6 +37,16 @@ def test_circles_hold_the_light_of_a_gaussian(tools, stars):
     assert np.abs(pull).max() < 4
     assert_allclose(table["flux_err"].value, 0.02 * np.sqrt(np.pi) * 0.6 / 0.06, rtol=1e-6)
     assert_allclose(table["coverage"], 1.0)
+    # apertures of photutils, on the sky and in pixels, and on a cutout
+    circles = SkyCircularAperture(sky, 0.6 * u.arcsec)
+    for aperture in (circles, circles.to_pixel(image.wcs)):
+        same = aperture_photometry(image, aperture)
+        assert_allclose(same["flux"].value, table["flux"].value, rtol=1e-6)
+    part = Cutout2D(image.data * image.unit, sky[12], 4 * u.arcsec, wcs=image.wcs)
+    alone = aperture_photometry(part, circles)
+    assert_allclose(alone["flux"].value[12], table["flux"].value[12], rtol=1e-6)
+    refuses("'diameter' must be given with positions", aperture_photometry, image, sky)
+    refuses("'diameter' must be left out", aperture_photometry, image, circles, 1 * u.arcsec)
     off = aperture_photometry(image, tools.places([3600.0]), 1 * u.arcsec)
     assert np.isnan(off["flux"][0])
     assert off["coverage"][0] == 0
