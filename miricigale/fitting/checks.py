@@ -7,6 +7,7 @@ import numpy as np
 from astropy.stats import mad_std
 from astropy.table import QTable
 
+from miricigale.filters.band_names import known_filter
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.likelihood import FitFlags, flux_column
 from miricigale.fitting.posterior import randomized_ranks
@@ -260,8 +261,8 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
         How to fit, on a grid that has the bands, or a sampler that predicts them (``predict``).
     photometry : `~astropy.table.QTable`
         The catalog.
-    bands : list of str
-        Bands to leave out.
+    bands : list of str or `~miricigale.filters.Filter`
+        Bands to leave out, by any usual name.
     separately : bool, optional
         Whether one at a time (a fit for each), rather than all at once.
     **options
@@ -297,10 +298,9 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     check_that(isinstance(fitter, BayesFitter), "fitter", "a BayesFitter", type(fitter).__name__)
     if isinstance(bands, str) or not len(bands):
         raise argument_error("bands", "a list of one or more names", repr(bands))
-    bands = tuple(bands)
     fitter = fitter.for_photometry(photometry)
+    bands = tuple(known_filter(name, fitter.bands, "filter of the models") for name in bands)
     check_that(len(set(bands)) == len(bands), "bands", "different names", list(bands))
-    check_names(bands, "filter of the models", fitter.bands)
     data = fitter._read_bands(photometry, bands)
     groups = [(name,) for name in bands] if separately else [bands]
     fitted = [f for f in fitter.filters or fitter.bands if f in photometry.colnames]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.filters import FilterSet
+from miricigale.filters import FilterSet, find_filter
 from miricigale.sed import SEDModel
 from miricigale.sed.presets import GRIDS, grid_axes
 from miricigale.utils.caching import cached
@@ -37,9 +37,21 @@ def models_and_bands(model, filters, axes):
         wanted = "left out where 'model' is a list of bands"
         check_that(filters is None, "filters", wanted, filters)
         filters, model = model, None
+    if filters is not None and not isinstance(filters, (str, FilterSet)):
+        filters = list(filters)
+        if not all(isinstance(name, str) for name in filters):
+            # curves of one's own among names
+            filters = FilterSet(filters)
     if model is None:
         model = SEDModel.for_axes(axes if isinstance(axes, str) else "survey")
     return model, filters
+
+
+def own_curves(filters):
+    """Filters of a `FilterSet` that are not those of the library, as a tuple."""
+    if not isinstance(filters, FilterSet):
+        return ()
+    return tuple(one for one in filters if find_filter(one.name) is None)
 
 
 def axes_of(model, axes):

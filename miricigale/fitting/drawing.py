@@ -84,6 +84,14 @@ def best_sed(results, model=None, **changes):
     return sed * float(nearer**2)
 
 
+def fitted_curves(results):
+    """The bands of results as a `~miricigale.filters.FilterSet`, with curves of one's own where they are known."""
+    from miricigale.filters import FilterSet
+
+    own = {one.name: one for one in results.curves}
+    return FilterSet([own.get(name, name) for name in results.filters])
+
+
 def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
     """
     Draw photometry, upper limits (as arrows), best model and residuals of a single object.
@@ -105,12 +113,11 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
     -------
     axes : `~matplotlib.axes.Axes` or pair of them
     """
-    from miricigale.filters import FilterSet
     from miricigale.plotting.axes import plain_text
     from miricigale.plotting.posteriors import plot_sed_fit
 
     results._one("plot_sed")
-    filters = FilterSet.from_names(results.filters) if filters is None else filters
+    filters = fitted_curves(results) if filters is None else filters
     order = [filters.names.index(name) for name in results.filters]
     if model is not None or results.model is not None:
         sed = results.best_sed(model)

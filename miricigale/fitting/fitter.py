@@ -14,6 +14,7 @@ from miricigale.fitting.defaults import (
     chosen_calibration,
     errors_and_priors,
     models_and_bands,
+    own_curves,
 )
 from miricigale.fitting.grid_fit import GridFit
 from miricigale.fitting.likelihood import (
@@ -235,6 +236,7 @@ class BayesFitter(Interactive):
         on_grid = engine == "grid"
         axes = grid_name(axes) if isinstance(axes, str) else axes
         model, filters = models_and_bands(model, filters, axes)
+        self.curves = own_curves(filters)
         self._given = {name: value for name, value in locals().items() if name in _OPTIONS}
         kind = GridSettings if on_grid else SamplerSettings
         settings = settings or kind()
@@ -529,6 +531,7 @@ class BayesFitter(Interactive):
             fitted_filters=tuple(settings["filters"]),
             redshift_fixed=fixed,
             model=self.model,
+            curves=self.curves,
             meta=provenance(fit=settings, **self.backend.provenance()),
         )
 

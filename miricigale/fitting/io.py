@@ -197,7 +197,7 @@ def part_chi2(path):
     return np.divide(chi2, free, out=np.full(chi2.shape, np.nan), where=free > 0)
 
 
-def open_results(path, *, partial=False, model=None):
+def open_results(path, *, partial=False, model=None, curves=()):
     """
     Open the results that `fit_file` wrote.
 
@@ -209,6 +209,8 @@ def open_results(path, *, partial=False, model=None):
         Whether a folder in which parts are missing is opened too.
     model : `~miricigale.sed.SEDModel`, optional
         The model the grid was made from, for spectra of the best fits.
+    curves : iterable of `~miricigale.filters.Filter`, optional
+        Curves of bands that are not of the library, for drawings.
 
     Returns
     -------
@@ -225,7 +227,7 @@ def open_results(path, *, partial=False, model=None):
     >>> results = open_results("fits")  # doctest: +SKIP
     >>> results.to_table(["id", "mass_p50"])  # doctest: +SKIP
     """
-    results = FitResultsFiles(path, model=model)
+    results = FitResultsFiles(path, model=model, curves=curves)
     if not (partial or results.complete):
         what = "fit_file with the same arguments resumes; partial=True opens what is there"
         raise data_error(path, f"holds {len(results.paths)} of {results.n_parts} parts: {what}")
@@ -246,6 +248,8 @@ class FitResultsFiles:
         The folder.
     model : `~miricigale.sed.SEDModel`, optional
         The model the grid was made from.
+    curves : iterable of `~miricigale.filters.Filter`, optional
+        Curves of bands that are not of the library.
 
     Examples
     --------
@@ -255,9 +259,10 @@ class FitResultsFiles:
     ...     print(len(part), part.reduced_chi2.mean())
     """
 
-    def __init__(self, path, *, model=None):
+    def __init__(self, path, *, model=None, curves=()):
         self.path = Path(path)
         self.model = model
+        self.curves = tuple(curves)
         folder = FitFolder(path)
         check_data(folder.facts, path, "holds no results of fit_file (no manifest)")
         #: What was fitted, and how.
@@ -289,7 +294,7 @@ class FitResultsFiles:
         return len(self.paths) == self.n_parts
 
     def _read(self, path, rows=None):
-        results = read_results(path, rows=rows)._changed(model=self.model)
+        results = read_results(path, rows=rows)._changed(model=self.model, curves=self.curves)
         return results if self._chi2_limit is None else with_high_chi2(results, self._chi2_limit)
 
     def parts(self):

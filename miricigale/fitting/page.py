@@ -7,11 +7,12 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.evaluation import photoz_metrics
-from miricigale.filters import Filter, FilterSet
+from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting import FitFlags
 from miricigale.fitting.catalog_rows import open_catalog
 from miricigale.fitting.classes import classes_of, classes_section
+from miricigale.fitting.drawing import fitted_curves
 from miricigale.fitting.likelihood import unused_bands
 from miricigale.fitting.page_numbers import fit_numbers, known_redshifts
 from miricigale.pages import Page, SectionWriter
@@ -28,8 +29,8 @@ _COLOR, _SECOND = "#1d4ed8", "#c2410c"
 _FEW = 5
 #: Letters of a setting that are shown.
 _LONG = 200
-#: AGN fraction above which an object counts as one with an AGN.
-_SOME_AGN = 0.2
+#: Least AGN fraction, by the posterior's median, of a selected AGN.
+_AGN = CLASS_LIMITS[1]
 #: Reduced chi2 of a poor fit, and part of the objects with it, or at an end of the redshifts, from which that is a
 #: notice.
 _POOR, _WIDESPREAD = 10.0, 0.1
@@ -94,9 +95,10 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
         classes_section(page, columns, list(classes), every["ids"])
     _redshifts(page, with_redshift, "classes" if others else "text")
     _calibration(page, measured_calibration(results))
-    _goodness(page, found)
+    curves = fitted_curves(next(iter(results.parts())))
+    _goodness(page, found, curves)
     _physics(page, found)
-    _examples(page, results, every, step)
+    _examples(page, results, every, step, curves)
     _left_out(page, rows, every)
     _settings(page, results)
     return page.report
@@ -142,8 +144,8 @@ def _summary(page, found):
         low, z, high = good["z"].T
         values |= {"z": _median(z), "width": _median((high - low) / 2 / (1 + z))}
     if np.isfinite(found["frac"]).any():
-        values["agn"] = _mean(good["frac"][:, 0] > _SOME_AGN)
-    page.items(values, some_agn=_SOME_AGN)
+        values["agn"] = _mean(good["frac"][:, 1] >= _AGN)
+    page.items(values, agn_limit=_AGN)
 
 
 def _median(values):
@@ -211,7 +213,7 @@ def _step(n):
     return max(1, n // _POINTS)
 
 
-def _goodness(page, found):
+def _goodness(page, found, curves):
     page.section("goodness")
     figure, ((ax, of_bands),) = new_figure(1, 2, size=(WIDTH / 2, 3.6))
     chi2, bins = found["chi2"][found["good"]], np.geomspace(1e-2, 1e3, 51)
@@ -222,12 +224,13 @@ def _goodness(page, found):
         ax.axvline(np.median(chi2), color=_COLOR, lw=1, label="median")
         ax.legend(frameon=False)
     rows = []
-    for name, ratio, pull in sorted(_bands(found), key=lambda band: _pivot(band[0])):
+    pivots = {one.name: float(one.pivot.value) for one in curves}
+    for name, ratio, pull in sorted(_bands(found), key=lambda band: pivots[band[0]]):
         low, middle, high = np.percentile(ratio, [16, 50, 84]) if ratio.size else [np.nan] * 3
         if ratio.size >= _FEW:
             limits = [[middle - low], [high - middle]]
             of_bands.errorbar(len(rows), middle, limits, fmt="o", color=_COLOR, ms=4, lw=1)
-        row = {"band": name, "um": _pivot(name), "n": ratio.size}
+        row = {"band": name, "um": pivots[name], "n": ratio.size}
         row |= {"low": low, "middle": middle, "high": high}
         rows.append(row | {"pull": _median(pull), "beyond": _mean(np.abs(pull) > 3)})
     of_bands.axhline(1.0, color="0.6", lw=0.8)
@@ -238,11 +241,6 @@ def _goodness(page, found):
     page.table("table", rows)
 
 
-def _pivot(name):
-    """Pivot wavelength of a filter of the library in um."""
-    return float(Filter.from_name(name).pivot.value)
-
-
 def _physics(page, found):
     found = found[found["good"] & (found["mass"][:, 1] > 0)]
     with_agn = np.isfinite(found["frac"]).any()
@@ -251,9 +249,9 @@ def _physics(page, found):
     page.section("physics", and_agn=" and AGN" if with_agn else "")
     figure, axes = new_figure(1, 1 + with_agn, size=(WIDTH / 2, 3.6))
     drawn, ax = found[:: _step(len(found))], axes[0, 0]
-    mass, strong = np.log10(drawn["mass"][:, 1]), drawn["frac"][:, 0] > _SOME_AGN
+    mass, strong = np.log10(drawn["mass"][:, 1]), drawn["frac"][:, 1] >= _AGN
     groups = {"others": (~strong, "0.6" if with_agn else _COLOR)}
-    groups |= {f"84 % above fracAGN {_SOME_AGN:g}": (strong, _SECOND)} if with_agn else {}
+    groups |= {f"fracAGN at least {_AGN:g}": (strong, _SECOND)} if with_agn else {}
     for label, (rows, color) in groups.items():
         ax.plot(drawn["z"][rows, 1], mass[rows], ".", ms=4, color=color, label=label)
     low, high = np.percentile(mass, [0.5, 99.5])
@@ -268,16 +266,15 @@ def _physics(page, found):
         page.text("agn")
 
 
-def _examples(page, results, found, step):
+def _examples(page, results, found, step, curves):
     chosen = _choose(found)
     if not chosen:
         return
     page.section("examples")
-    filters = FilterSet(next(iter(results.parts())).filters)
     figure, axes = new_figure(-(-len(chosen) // 2), 2, size=(WIDTH / 2, 3.3))
     picked = results[np.array([step * row for row, _ in chosen])]
     for ax, (_, what), one in zip(axes.ravel(), chosen, picked, strict=False):
-        one.plot_sed(ax, filters=filters)
+        one.plot_sed(ax, filters=curves)
         z = "" if found.meta["fixed"] else f"z = {one.best['redshift'].value:.2f}, "
         title = f"{plain_text(one.ids)}: {z}reduced chi2 {one.reduced_chi2:.2f} ({what})"
         ax.set_title(title, fontsize="small")
@@ -297,9 +294,11 @@ def _choose(found):
     chosen = {}
     for place, what in places.items():
         chosen.setdefault(int(order[int(place * (order.size - 1))]), what)
-    fraction = np.nan_to_num(some["frac"][:, 0], nan=-1.0)
-    if fraction.max() > _SOME_AGN:
-        chosen.setdefault(int(rows[np.argmax(fraction)]), "surest AGN")
+    selected = some["frac"][:, 1] >= _AGN
+    if selected.any():
+        # the one whose fraction is highest for certain
+        surest = np.where(selected, some["frac"][:, 0], -1.0)
+        chosen.setdefault(int(rows[np.argmax(surest)]), "surest AGN")
     high = np.where(some["flags"] == 0, some["z"][:, 0], -1.0)
     if high.max() > 0 and not found.meta["fixed"]:
         chosen.setdefault(int(rows[np.argmax(high)]), "highest redshift without a flag")

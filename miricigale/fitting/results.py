@@ -109,6 +109,8 @@ class FitResults(FitRows):
         Part of the mean below which no standard deviation is given (CIGALE: 0.05).
     model : `~miricigale.sed.SEDModel`, optional
         The model that was fitted; not written to files.
+    curves : tuple of `~miricigale.filters.Filter`, optional
+        Curves of the bands that are not of the library; not written to files.
     meta : dict, optional
         Provenance and the settings of the fit, for people.
 
@@ -170,6 +172,7 @@ class FitResults(FitRows):
     constants: dict = field(default_factory=dict)
     least_std: float = 0.0
     model: object = None
+    curves: tuple = ()
     meta: dict = field(default_factory=dict)
 
     read, write = read_write("results (FITS: all but the model; ECSV: their table, not read back)")

@@ -169,7 +169,7 @@ def fit_file(
         # which depends on all of the sample
         folder.facts["chi2_limit"] = _chi2_limit(folder, rows.n_chunks)
         folder.write_manifest()
-    return open_results(path_out, model=fitter.model)
+    return open_results(path_out, model=fitter.model, curves=fitter.curves)
 
 
 def _chi2_limit(folder, n_parts):

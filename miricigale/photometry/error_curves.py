@@ -8,8 +8,9 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters import as_photometry
+from miricigale.filters.band_names import known_filter
 from miricigale.utils.declared import declared
-from miricigale.utils.options import check_names, check_that
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_columns, error_column, require_columns
 from miricigale.utils.units import FNU, to_array
 
@@ -165,16 +166,17 @@ def same_rows(truth, measured):
 
 def flux_table(photometry, filters, known):
     """A copy of a table with fluxes in uJy, and the bands: those of ``known`` that it has by default."""
-    if filters is None and not set(known) & set(getattr(photometry, "colnames", ())):
-        photometry = as_photometry(photometry, known)
+    if filters is not None:
+        filters = [known_filter(name, known, "band of this error model") for name in filters]
+    names = known if filters is None else filters
+    if names and not set(names) & set(getattr(photometry, "colnames", ())):
+        photometry = as_photometry(photometry, names)
     require_columns(photometry, [], "photometry")
     if filters is None:
         filters = [name for name in known if name in photometry.colnames]
-    filters = list(filters)
     wanted = f"a table with at least one of the columns {list(known)}"
     check_that(filters, "photometry", wanted, f"columns {photometry.colnames}")
     require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
-    check_names(filters, "band of this error model", known)
     table = QTable(photometry, copy=True)
     for name in filters:
         table[name] = to_array(table[name], FNU, name) * FNU

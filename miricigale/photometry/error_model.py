@@ -33,8 +33,9 @@ from miricigale.utils.units import FNU, ab_quantity, to_array
 
 
 def _band(name):
-    """Our name of a band, or its own where it is none of ours."""
-    return find_filter(str(name)) or str(name)
+    """Our name of a band or filter, or its own where it is none of ours."""
+    name = str(getattr(name, "name", name))
+    return find_filter(name) or name
 
 
 def add_noise(photometry, name, sigma, seed):
@@ -96,7 +97,7 @@ class ErrorModel(Interactive):
 
     def _curve(self, name):
         try:
-            return self.curves[_band(getattr(name, "name", name))]
+            return self.curves[_band(name)]
         except KeyError:
             raise unknown_name("band of this error model", name, self.curves) from None
 
@@ -327,7 +328,7 @@ class ErrorModel(Interactive):
         ----------
         photometry : `~astropy.table.QTable`
             With flux columns by filter name.
-        filters : iterable of str, optional
+        filters : iterable of str or `~miricigale.filters.Filter`, optional
             Bands; those of the model that the table has by default.
         noise : dict of str to `~numpy.ndarray`, optional
             As in `from_tables`: by filter name, a factor for each row. Where it is not positive and

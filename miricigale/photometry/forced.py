@@ -24,7 +24,7 @@ from miricigale.photometry.settings import ErrorSettings, MemorySettings
 from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.photometry.stars import with_stars
-from miricigale.psf import KernelField, MatchingKernel
+from miricigale.psf import KernelField, MatchingKernel, as_kernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_choice, check_that
@@ -42,14 +42,15 @@ class ForcedPhotometer(Interactive):
 
     Parameters
     ----------
-    kernel : `~miricigale.psf.MatchingKernel`, its file or `~miricigale.psf.KernelField`, optional
+    kernel : `~miricigale.psf.MatchingKernel`, `~miricigale.psf.KernelField` or other, optional
         From the high-resolution image's PSF (``source``) to the image's (``target``), on the
         pixels of the high-resolution image. ``target`` must be the PSF of the image that is
         measured: that of a drizzled mosaic for a drizzled mosaic. With kernels of several places
         each source has that of its own; shapes are fitted with the mean of the sources. Of a kernel
         without PSFs sources are the segments as they are (``template="cutout"``, ``wings=False``),
-        which a warning says; those without a segment are not measured. For exposures that are fitted together
-        a list of kernels, or `ExposureKernels`, one for each.
+        which a warning says; those without a segment are not measured. Files, and arrays with their pixel scale
+        (``(array, 0.03 * u.arcsec)``), are taken by `~miricigale.psf.as_kernel`. For exposures that are fitted
+        together a list of kernels, or `ExposureKernels`, one for each.
     psf, highres_psf : `~photutils.psf.ImagePSF`, str or other, optional
         In place of the kernel the PSFs of the image and of the high-resolution image, in the forms of
         `~miricigale.psf.MatchingKernel.from_psfs`, which makes the kernel. Of an image without a
@@ -163,8 +164,8 @@ class ForcedPhotometer(Interactive):
     def __post_init__(self, psf, highres_psf):
         got = "neither" if psf is None else "both"
         check_that((self.kernel is None) != (psf is None), "kernel, psf", "one of them given", got)
-        if isinstance(self.kernel, (str, os.PathLike)):
-            object.__setattr__(self, "kernel", MatchingKernel.read(self.kernel))
+        if self.kernel is not None:
+            object.__setattr__(self, "kernel", _as_kernels(self.kernel))
         if self.kernel is not None and highres_psf is not None:
             wanted = "given with 'psf', not with 'kernel'"
             raise argument_error("highres_psf", wanted, "a kernel too")
@@ -175,11 +176,6 @@ class ForcedPhotometer(Interactive):
             template = "psf" if template == "auto" else template
         elif kernel is None:
             kernel = MatchingKernel.from_psfs(highres_psf, psf)
-        if isinstance(kernel, (list, tuple)):
-            kernel = ExposureKernels(kernel)
-        if not isinstance(kernel, (MatchingKernel, KernelField, ExposureKernels)):
-            wanted = "a MatchingKernel, a KernelField or a list of them (or give 'psf')"
-            raise argument_error("kernel", wanted, type(kernel).__name__)
         # the kernel that all have in common: the mean, with PSFs in any case
         mean = kernel if isinstance(kernel, MatchingKernel) else kernel.mean
         bare = mean.source is None or mean.target is None
@@ -443,3 +439,13 @@ class ForcedPhotometer(Interactive):
                     f"kernel is from one whose peak holds {peaks[1]:.3g}: is it of the same image?"
                 )
                 warn(msg, PhotometryWarning)
+
+
+def _as_kernels(kernel):
+    """Kernel of an image, or those of exposures, of anything that stands for them."""
+    if isinstance(kernel, ExposureKernels):
+        return kernel
+    of_kernels = (MatchingKernel, KernelField)
+    if isinstance(kernel, (list, tuple)) and all(isinstance(each, of_kernels) for each in kernel):
+        return ExposureKernels(kernel)
+    return as_kernel(kernel)

@@ -15,9 +15,18 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.commands import command
 from helpers.errors import refuses
-from miricigale.fitting import BayesFitter, SurveyCalibration, TemplateError, fit_catalog, fit_file
+from miricigale.filters import Filter
+from miricigale.fitting import (
+    BayesFitter,
+    SurveyCalibration,
+    TemplateError,
+    fit_catalog,
+    fit_file,
+    leave_out,
+)
 from miricigale.fitting.class_names import chosen_classes
 from miricigale.fitting.defaults import statement
+from miricigale.photometry import ErrorModel
 from miricigale.sed import SEDModel, presets
 from miricigale.utils.exceptions import FitWarning
 
@@ -243,3 +252,23 @@ def test_the_command_of_the_how_to_gives_the_table_of_its_python(tmp_path, monke
     found = QTable.read(tmp_path / "fits" / "table.fits")
     for name in ("redshift_p50", "mass_p50", "frac_agn_p50", "chi2_best"):
         assert_allclose(u.Quantity(found[name]).value, u.Quantity(wanted[name]).value, rtol=1e-6)
+
+
+def test_curves_of_ones_own_stand_among_names():
+    model = SEDModel.yang2021(agn=False)
+    box = Filter([7, 7.1, 9, 9.1] * u.um, [0, 1, 1, 0], "box")
+    bands = ["F160W", "IRAC1", box]
+    truth = {"id": ["a"], "redshift": [0.5], "age": [1.0], "mass": [1e10]}
+    errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    photometry = errors.perturb(model.fluxes(truth, bands), seed=1, filters=bands)
+    axes = {"redshift": [0.4, 0.5, 1.0], "age": [0.5, 1.0]}
+    fitter = BayesFitter(model, bands, axes=axes, model_error=0.02)
+    results = fitter.fit(photometry)
+    assert results.filters == ("wfc3.f160w", "irac.ch1", "box")
+    assert results["redshift"].value == pytest.approx(0.5, abs=0.05)
+    # drawn at its wavelength
+    lines = results[0].plot_sed()[0].get_lines()
+    assert any(np.isclose(line.get_xdata(), box.pivot.value).any() for line in lines)
+    plt.close("all")
+    for name, band in ((box, "box"), ("F160W", "wfc3.f160w")):
+        assert leave_out(fitter, photometry, [name]).bands == (band,)

@@ -126,7 +126,9 @@ def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
     refuses("one of them given, got both", ForcedPhotometer, kernel, psf=psfs["psf"])
     sharp = {"highres_psf": psfs["psf"]}
     refuses("'highres_psf' must be given with 'psf'", ForcedPhotometer, kernel, **sharp)
-    refuses("'kernel' must be a MatchingKernel or a KernelField", ForcedPhotometer, psfs["psf"])
+    refuses(
+        "'kernel' must be a MatchingKernel, a KernelField, a file", ForcedPhotometer, psfs["psf"]
+    )
     refuses("'angle' must be given to 'MatchingKernel.identity'", ForcedPhotometer, psf="F770W")
     refuses("'psf' must be a PSF on pixels of known size", ForcedPhotometer, psf=np.ones((9, 9)))
     points = ForcedPhotometer(psf=psfs["psf"])

@@ -3,7 +3,10 @@ import functools
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.convolution import Gaussian2DKernel
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
+from astropy.nddata import CCDData
 from numpy.testing import assert_allclose
 from photutils.psf_matching import make_wiener_kernel
 from scipy.signal import fftconvolve
@@ -11,8 +14,10 @@ from scipy.signal import fftconvolve
 from helpers.cases import cases_of
 from helpers.errors import refuses
 from helpers.light import gaussian_image
+from miricigale.instrument import north_up_wcs
 from miricigale.psf import (
     MatchingKernel,
+    as_kernel,
     gaussian_psf,
     hst_psf,
     miri_psf,
@@ -55,6 +60,24 @@ def test_kernel_is_photutils_wiener_kernel():
     # and the error that goes into the choice is that of the linear convolution
     error = np.abs(kernel.encircled_energy_error(np.arange(1, 33.1, 0.5) * 0.06 * u.arcsec)).max()
     assert kernel.meta["max_error"] == pytest.approx(error, rel=1e-6)
+
+
+def test_arrays_with_a_scale_and_images_are_kernels():
+    array = Gaussian2DKernel(2.0)
+    scale = 0.03 * u.arcsec
+    wcs = north_up_wcs(SkyCoord(53.1, -27.8, unit="deg"), scale, array.array.shape)
+    image = CCDData(array.array, unit="", wcs=wcs)
+    for given in ((array, scale), [array.array, scale], image):
+        kernel = as_kernel(given)
+        assert_allclose(kernel.array, array.array / array.array.sum(), rtol=1e-6)
+        assert_allclose(kernel.pixel_scale.to_value(u.arcsec), 0.03)
+        assert as_kernel(kernel) is kernel
+    refuses(
+        "'kernel' must be a MatchingKernel, a KernelField, a file, or an array with",
+        as_kernel,
+        array,
+    )
+    refuses("'pixel_scale' must be", as_kernel, (array, 0.03), error=u.UnitsError)
 
 
 # PHYSICS: 4.95, 2.8, 1.3, 0.1 % at mu 0.03 and 0.6, 0.2, 0.06, < 0.01 % at 1e-3, measured

@@ -1,0 +1,62 @@
+"""Kernels of whatever a user has for one."""
+
+import os
+
+import astropy.units as u
+import numpy as np
+from astropy.nddata import NDData
+from astropy.wcs.utils import proj_plane_pixel_scales
+
+from miricigale.psf.kernel_field import KernelField
+from miricigale.psf.kernels import MatchingKernel
+from miricigale.utils.exceptions import argument_error
+
+
+def as_kernel(given, argument="kernel"):
+    """
+    Kernel of anything that is one.
+
+    Parameters
+    ----------
+    given : `MatchingKernel`, `KernelField`, path-like, pair or `~astropy.nddata.NDData`
+        A kernel, its file, an array with its pixel scale (``(array, 0.03 * u.arcsec)``), or an image with world
+        coordinates.
+    argument : str, optional
+        The argument's name, for messages.
+
+    Returns
+    -------
+    kernel : `MatchingKernel` or `KernelField`
+        An array is taken as by `MatchingKernel.from_array`.
+
+    Raises
+    ------
+    ValueError
+        If it is nothing of these; the message says what is missing.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.convolution import Gaussian2DKernel
+    >>> from miricigale.psf import as_kernel
+    >>> kernel = as_kernel((Gaussian2DKernel(3).array, 0.03 * u.arcsec))
+    >>> kernel.pixel_scale
+    <Quantity 0.03 arcsec>
+    """
+    if isinstance(given, (MatchingKernel, KernelField)):
+        return given
+    if isinstance(given, (str, os.PathLike)):
+        return MatchingKernel.read(given)
+    if isinstance(given, NDData) and given.wcs is not None:
+        scale = np.sqrt(np.prod(proj_plane_pixel_scales(given.wcs.celestial))) * u.deg
+        return MatchingKernel.from_array(np.asarray(given.data), pixel_scale=scale)
+    if isinstance(given, (tuple, list)) and len(given) == 2:
+        array, scale = given
+        # kernels of astropy hold their array
+        array = np.asarray(getattr(array, "array", array))
+        return MatchingKernel.from_array(array, pixel_scale=scale)
+    wanted = (
+        "a MatchingKernel, a KernelField, a file, or an array with its pixel scale, such as "
+        "(array, 0.03 * u.arcsec) (or give 'psf')"
+    )
+    raise argument_error(argument, wanted, type(given).__name__)
