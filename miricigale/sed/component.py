@@ -19,6 +19,38 @@ ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust", "agn", "xray", "igm
 COMPONENTS = Registry("component")
 
 
+#: Modules of CIGALE: the components that they are here, where the names differ.
+CIGALE_MODULES = {
+    "sfhdelayed": "delayed",
+    "sfh2exp": "double_exponential",
+    "dustatt_calzleit": "calzetti",
+    "dustatt_modified_starburst": "modified_starburst",
+    "dustatt_modified_CF00": "charlot_fall",
+    "dl2007": "dl07",
+    "yang20": "xray",
+    "redshifting": "meiksin2006",
+}
+
+
+def named_component(name, **defaults):
+    """
+    Make a component by its name, or that of CIGALE's module.
+
+    Parameters
+    ----------
+    name : str
+        One of ``COMPONENTS.names()`` or of `CIGALE_MODULES`.
+    **defaults
+        As for the component.
+
+    Raises
+    ------
+    KeyError
+        If there is no component of the name.
+    """
+    return COMPONENTS.get(CIGALE_MODULES.get(name, name))(**defaults)
+
+
 def register(cls):
     """
     Class decorator: make a component known by its ``name``.
@@ -215,9 +247,10 @@ class Component:
 
 def in_order(components):
     """Components of a model in the order of their roles: what is lacking or there twice is refused."""
-    components = tuple(components)
+    components = [named_component(one) if isinstance(one, str) else one for one in components]
     for one in components:
-        check_that(isinstance(one, Component), "components", "Component instances", repr(one))
+        wanted = "Component instances or names"
+        check_that(isinstance(one, Component), "components", wanted, repr(one))
     components = tuple(sorted(components, key=lambda one: ROLES.index(one.role)))
     roles = [one.role for one in components]
     for role, name in (("sfh", "age"), ("stellar", "metallicity")):
@@ -247,7 +280,7 @@ def read_config(config):
     for entry in entries:
         defaults = dict(entry)
         try:
-            parts.append(COMPONENTS.get(defaults.pop("name", "(none)"))(**defaults))
+            parts.append(named_component(defaults.pop("name", "(none)"), **defaults))
         except (KeyError, TypeError, ValueError, u.UnitsError) as err:
             raise config_error("[sed]", f"component {entry}: {err.args[0]}") from err
     return parts, {name: value for name, value in config.items() if name != "components"}

@@ -1,6 +1,7 @@
 """Models: components in a chain, from parameters to spectra and band fluxes."""
 
 import functools
+from collections.abc import Mapping
 
 import astropy.units as u
 
@@ -45,10 +46,10 @@ class SEDModel(Interactive):
 
     Parameters
     ----------
-    components : iterable of `~miricigale.sed.Component`
-        One of each role at most; a history (``sfh``) and populations (``stellar``) are needed, all other roles may
-        be left out, but ``dust`` needs ``attenuation`` and ``xray`` needs ``agn``. They act in the order of their
-        roles, whatever the order here.
+    components : iterable of `~miricigale.sed.Component` or str
+        Components or their names, CIGALE's too (``"sfhdelayed"``). One of each role at most; a history (``sfh``)
+        and populations (``stellar``) are needed, all other roles may be left out, but ``dust`` needs
+        ``attenuation`` and ``xray`` needs ``agn``. They act in the order of their roles, whatever the order here.
     cosmology : `~astropy.cosmology.Cosmology`, optional
         For distances and the age of the universe.
     frac_agn_definition : {"dust", "3-1000um"} or str, optional
@@ -410,6 +411,7 @@ class SEDModel(Interactive):
             If a value is outside its bounds, or the galaxy older than the universe.
         """
         parameters = {_OTHER_NAMES.get(name, name): value for name, value in parameters.items()}
+        parameters = tables.plain_mass(parameters)
         for name in parameters:
             if name not in self._parameters:
                 raise unknown_name("parameter", name, self._parameters)
@@ -517,8 +519,8 @@ class SEDModel(Interactive):
             ``mass`` and parameters of X-rays and the foreground have no place here. Other parameters have their
             defaults: with ``dust_excess`` the dust's luminosity is free of energy balance. With no ``frac_agn``
             but 0 the grid has no AGN.
-        filters : `~miricigale.filters.FilterSet` or list of str
-            The bands.
+        filters : `~miricigale.filters.FilterSet` or list of str or `~miricigale.filters.Filter`
+            The bands. They may stand before a dict of axes.
         cache : bool, optional
             Whether a grid of the same content (axes, bands, components, data, cosmology, code)
             is taken from the cache folder, and a new one kept there.
@@ -547,6 +549,9 @@ class SEDModel(Interactive):
         >>> model.grid(axes, ["miri.f770w"], cache=False)
         <ModelGrid 2 redshifts x 3 galaxies x 0 AGN x 1 fractions, 1 bands, 6 models>
         """
+        if isinstance(filters, Mapping):
+            # bands first, as fitters have them
+            axes, filters = filters, axes
         if axes is None or isinstance(axes, str):
             axes = self.named_axes(axes)
         axes = gridding.check_axes(self, axes)

@@ -155,6 +155,8 @@ class Parameter:
         if not hasattr(value, "unit") or value.unit is None:
             self._refuse_logarithms(value)
             return value
+        if isinstance(value, u.LogQuantity):
+            value = value.physical
         return self._quantity(value, value.unit).to_value(self.unit)
 
     def _refuse_logarithms(self, value):

@@ -4,7 +4,7 @@ import difflib
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
@@ -12,10 +12,13 @@ from miricigale.sed.chain import GALAXY, SIX, SKY, STELLAR, distinct
 from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.caching import cached
-from miricigale.utils.exceptions import ModelWarning, warn
+from miricigale.utils.exceptions import ModelWarning, units_error, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
+
+#: Names of the logarithm of a mass in lower case.
+_LOG_MASSES = ("log_mass", "logmass", "lmass", "log_m")
 
 BLOCK = 64  # rows worked out together: their spectra fit into the processor's cache
 
@@ -71,6 +74,39 @@ def _columns(model, table):
             out[name] = par.array(table[name])
         else:
             out[name] = np.full(len(table), par.default)
+    return out
+
+
+def plain_mass(values):
+    """
+    Values of parameters by name in which a logarithm of the mass is the mass.
+
+    Parameters
+    ----------
+    values : dict or `~astropy.table.Table`
+        By parameter; ``log_mass`` and the like are log10 of the mass in solar masses, and left alone where there
+        is a mass.
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`
+        If the logarithm has a unit.
+    """
+    names = values.colnames if isinstance(values, Table) else list(values)
+    logs = [name for name in names if name.lower() in _LOG_MASSES]
+    if not logs or "mass" in names:
+        return values
+    out = values.copy()
+    name = logs[0]
+    unit = getattr(out[name], "unit", None)
+    if unit == u.dex(u.Msun):
+        out["mass"] = out[name]
+    else:
+        if unit not in (None, u.dimensionless_unscaled):
+            raise units_error(name, "in dex(Msun) or without unit", unit)
+        exponent = np.ma.filled(np.ma.asarray(out[name], dtype=float), np.nan)
+        out["mass"] = 10.0**exponent * u.Msun
+    del out[name]
     return out
 
 
@@ -263,7 +299,7 @@ class _Blocks:
 
 def flux_table(model, table, filters):
     """Fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
-    table = QTable(as_table(table, "table"), copy=False)
+    table = plain_mass(QTable(as_table(table, "table"), copy=False))
     _warn_of_slips(model, table.colnames)
     n = len(table)
     names = model.derived_columns()

@@ -7,9 +7,10 @@ from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from miricigale.cigale.modules import _MODULES
 from miricigale.filters import Filter, FilterSet
 from miricigale.sed import COSMOLOGY, ModelFlags, Parameter, SEDModel, yang2021_axes
-from miricigale.sed.component import register
+from miricigale.sed.component import CIGALE_MODULES, COMPONENTS, register
 from miricigale.sed.components import (
     BC03,
     IGM,
@@ -163,7 +164,7 @@ def test_bad_parameters_are_refused(model, parameters, error, match):
         ([DelayedSFH()], "with a component of role 'stellar'"),
         ([DelayedSFH(), DelayedSFH(), BC03()], "at most one of each role"),
         ([DelayedSFH(), BC03(), DraineLi2007()], "with 'attenuation' if there is 'dust'"),
-        ([DelayedSFH(), "bc03"], "Component instances"),
+        ([DelayedSFH(), 3], "Component instances or names"),
     ],
 )
 def test_bad_chains_are_refused(components, match):
@@ -173,6 +174,31 @@ def test_bad_chains_are_refused(components, match):
 def test_order_of_the_list_does_not_matter():
     parts = [CalzettiLeitherer(), BC03(), DraineLi2007(), DelayedSFH()]
     assert [c.role for c in SEDModel(parts).components] == ["sfh", "stellar", "attenuation", "dust"]
+
+
+def test_components_by_their_names_and_those_of_cigale():
+    own = SEDModel(["delayed", "bc03", "calzetti", DraineLi2007()])
+    theirs = SEDModel(["sfhdelayed", "bc03", "dustatt_calzleit", "dl2007"])
+    assert [c.name for c in own.components] == [c.name for c in theirs.components]
+    assert set(CIGALE_MODULES.values()) <= set(COMPONENTS.names())
+    # the setup of CIGALE's files knows them all
+    assert set(CIGALE_MODULES) <= set(_MODULES)
+    refuses("no component 'sfhdelay'", SEDModel, ["sfhdelay", "bc03"], error=KeyError)
+
+
+def test_logarithms_of_masses_by_name_and_unit(model, filters):
+    wanted = model.fluxes({"redshift": [1.0, 1.0], "mass": [3e10, 1e9]}, filters)
+    logs = np.log10([3e10, 1e9])
+    for column in (logs, logs * u.dex(u.Msun), np.ma.array(logs)):
+        found = model.fluxes({"redshift": [1.0, 1.0], "log_mass": column}, filters)
+        for name in filters.names:
+            assert_allclose(found[name].value, wanted[name].value, rtol=1e-9)
+    sed = model.evaluate(redshift=1.0, logmass=logs[0])
+    assert_allclose(sed.parameters["mass"].value, 3e10)
+    assert_allclose(
+        model.evaluate(redshift=1.0, mass=9 * u.dex(u.Msun)).parameters["mass"].value, 1e9
+    )
+    refuses("'log_mass' must be in dex", model.evaluate, log_mass=10 * u.Msun, error=u.UnitsError)
 
 
 def test_from_dict():
