@@ -263,6 +263,10 @@ def measure_patch(inputs, grid, k, catalog=None, n_threads=None):
         warnings.filterwarnings("ignore", "none of the .* sources is on or near", PhotometryWarning)
         measured = inputs.measure(pixels, inputs.photometers(n_threads), segments, sources)
     table = measured.table
+    for band, section in zip(inputs.bands, parts, strict=True):
+        # pixels are those of the whole image
+        for name, pixels in zip(("y", "x"), section or (), strict=False):
+            table[f"{band}_{name}"] += pixels.start
     columns = [table[name] for name in table.colnames if name.endswith("flags")]
     table["new"] = np.any([one & ForcedFlags.NOT_IN_CATALOG for one in columns], axis=0)
     xy = _pixels(table["sky"], whole)

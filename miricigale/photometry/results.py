@@ -13,17 +13,20 @@ from astropy.nddata import CCDData
 from astropy.table import QTable
 from scipy.special import ndtr, ndtri
 
+from miricigale.evaluation.match import associate
 from miricigale.instrument.image import Image
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.photometry.draws import correlated_draws
 from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.offsets import OffsetMap
+from miricigale.photometry.priors import read_catalog
 from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Tabular
 from miricigale.utils.missing import floats
 from miricigale.utils.random import check_seed
+from miricigale.utils.region_files import write_circles
 from miricigale.utils.tables import described_table
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, FNU, check_count, is_number
@@ -389,6 +392,50 @@ class ForcedPhotometryResult(Tabular):
             if values is not None:
                 columns[band_column(key, name)] = values, text.format(**facts)
         return described_table(columns, dict(self.meta))
+
+    def write_regions(self, path, *, radius=0.5 * u.arcsec, overwrite=False):
+        """
+        Write the sources as regions of DS9, circles with the ids.
+
+        Parameters
+        ----------
+        path : path-like
+            The file, such as ``sources.reg``. Circles are green, orange where a flag is set, and red where nothing
+            was measured.
+        radius : `~astropy.units.Quantity`, optional
+            Of the circles.
+        overwrite : bool, optional
+            Whether an existing file is replaced.
+
+        Raises
+        ------
+        ImportError
+            If the package regions is not installed (``pip install miricigale[regions]``).
+        """
+        kind = np.where(self.flags == 0, "good", "flagged")
+        kind[~np.isfinite(self.flux.value)] = "missing"
+        table = QTable({"id": self.id, "sky": self.sky, "kind": kind})
+        write_circles(table, path, radius=radius, overwrite=overwrite)
+
+    def match_to_catalog(self, catalog, radius=0.5 * u.arcsec):
+        """
+        Find the sources in another catalog.
+
+        Parameters
+        ----------
+        catalog : table in any form, path-like or `~astropy.coordinates.SkyCoord`
+            As for `ForcedPhotometer.measure`.
+        radius : `~astropy.units.Quantity`, optional
+            How near a source of the catalog is.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            That of `~miricigale.evaluation.associate`, the photometry being the first catalog: a row for each
+            source and for each row of the catalog that has none, with what is ambiguous named.
+        """
+        own = QTable({"id": self.id, "sky": self.sky})
+        return associate(own, read_catalog(catalog)["id", "sky"], radius=radius)
 
     def plot(self, ax=None, **kwargs):
         """

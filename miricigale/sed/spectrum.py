@@ -349,11 +349,46 @@ class SED(Frozen, Interactive):
         kind = getattr(specutils, "Spectrum", None) or specutils.Spectrum1D
         return kind(spectral_axis=self.wave, flux=self.fnu, meta=dict(self.meta))
 
-    def plot(self, ax=None, **kwargs):
-        """Draw the spectrum (`miricigale.plotting.curves.plot_spectrum`) and return the axes."""
+    def plot(self, ax=None, *, components=False, **kwargs):
+        """
+        Draw the spectrum on logarithmic axes.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to; the current axes if not given.
+        components : bool, optional
+            Whether the components are drawn too, with a legend: dashed what no observer sees (light before
+            attenuation).
+        **kwargs
+            Passed to `~matplotlib.axes.Axes.plot` for the spectrum itself.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+
+        Raises
+        ------
+        ValueError
+            If components are asked for and the spectrum has none.
+        """
         from miricigale.plotting.curves import plot_spectrum
 
-        return plot_spectrum(self.wave.value, self.fnu.value, ax=ax, **kwargs)
+        if not components:
+            return plot_spectrum(self.wave.value, self.fnu.value, ax=ax, **kwargs)
+        check_that(self.components, "components", "False for a spectrum without components", True)
+        kwargs = {"color": "black", "lw": 1.5, "label": "sum"} | kwargs
+        ax = plot_spectrum(self.wave.value, self.fnu.value, ax=ax, **kwargs)
+        low, high = ax.get_ylim()
+        for name, part in self.components.items():
+            if np.any(part.fnu > 0):
+                style = "--" if name.endswith("_intrinsic") else "-"
+                label = name.replace("_", " ")
+                plot_spectrum(part.wave.value, part.fnu.value, ax=ax, label=label, ls=style, lw=1)
+        # faint parts would stretch the axis by many decades
+        ax.set_ylim(max(low, 1e-6 * high), high)
+        ax.legend(fontsize="small")
+        return ax
 
     def __repr__(self):
         return (

@@ -31,6 +31,7 @@ from miricigale.utils.missing import is_missing_word
 from miricigale.utils.optional import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
+from miricigale.utils.region_files import region_table
 from miricigale.utils.units import flux_unit
 
 _PIECE = 1 << 20
@@ -354,9 +355,7 @@ def _read_text(path, form, id_names):
     if form.startswith("ascii"):
         start = _start(path)
         if _DS9.search(start[:_PIECE]):
-            raise ValueError(
-                "it is a region file of DS9: save the regions as a table of ra and dec"
-            )
+            return region_table(path)
         source = str(path)
         if start.startswith(_BOM) or is_zip(path):
             # a mark at the start is no part of the first name, and of archives astropy reads no text

@@ -1,5 +1,7 @@
 """Ids: the column that holds them, and their values as they stand in a file."""
 
+import sys
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from numpy.testing import assert_array_equal
 from helpers.errors import refuses
 from miricigale.utils.exceptions import CatalogWarning
 from miricigale.utils.ids import counted_ids, id_column, ids_of_text, warn_of_duplicates
+from miricigale.utils.region_files import write_circles
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import as_table, read_ids, unique_ids
@@ -235,16 +238,42 @@ def test_the_table_of_objects_of_fits_ldac_is_the_catalog(tmp_path):
     refuses("2 tables of objects: name one", read_table, two, wanted="a table", error=OSError)
 
 
-def test_regions_are_refused_in_a_sentence(tmp_path):
+REGIONS = """# Region file format: DS9 version 4.1
+global color=green
+icrs
+circle(53.1,-27.8,0.5") # text={7}
+point(53.2,-27.8) # text={12}
+-ellipse(53.3,-27.8,1",2",30)
+"""
+
+
+def test_regions_without_their_package_are_refused_in_a_sentence(tmp_path, monkeypatch):
     path = tmp_path / "a.reg"
-    path.write_text('# Region file format: DS9 version 4.1\nfk5\ncircle(53.1,-27.8,0.5")\n')
-    refuses(
-        "a region file of DS9: save the regions as a table",
-        read_table,
-        path,
-        wanted="a table",
-        error=OSError,
-    )
+    path.write_text(REGIONS)
+    monkeypatch.setitem(sys.modules, "regions", None)
+    message = "'regions' is needed for this: pip install 'miricigale.regions.'"
+    refuses(message, read_table, path, wanted="a table", error=OSError)
+
+
+def test_regions_are_positions(tmp_path):
+    pytest.importorskip("regions", reason="needs regions: pip install miricigale[regions]")
+    path = tmp_path / "a.reg"
+    path.write_text(REGIONS)
+    table = read_table(path, wanted="a table")
+    assert table["id"].tolist() == [7, 12]
+    assert table["ra"].value.tolist() == [53.1, 53.2]
+    np.testing.assert_allclose(table["radius"].to_value(u.arcsec), [0.5, np.nan])
+    path.write_text("image\ncircle(3,4,2)\n")
+    message = "has a region .number 1, CirclePixelRegion. without a center on the sky"
+    refuses(message, read_table, path, wanted="a table", error=OSError)
+    sky = SkyCoord([53.1, np.nan, 53.3], [-27.8, -27.8, 0.0], unit="deg")
+    written = QTable({"id": [3, 4, 5], "sky": sky, "kind": ["good", "flagged", "missing"]})
+    write_circles(written, path, radius=0.4 * u.arcsec, overwrite=True)
+    back = read_table(path, wanted="a table")
+    assert back["id"].tolist() == [3, 5]
+    np.testing.assert_allclose(back["dec"].value, [-27.8, 0.0], atol=1e-8)
+    assert "color=red" in path.read_text()
+    refuses("already exists", write_circles, written, path, radius=1 * u.arcsec, error=OSError)
 
 
 def test_a_table_with_positions_is_read_in_pieces(tmp_path):

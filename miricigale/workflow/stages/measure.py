@@ -110,6 +110,9 @@ def join_photometry(context, unit):
     stacked = vstack(tables, metadata_conflicts="silent")
     joined = every["id", "sky"]
     for name in stacked.colnames[2:]:
+        if name in ("x", "y"):
+            # of the mosaic of a patch, which has a grid of its own
+            continue
         joined[name] = spread_rows(stacked[name], rows, name)
     context.save_table(f"{truth}/photometry/{band}.ecsv", joined)
 
