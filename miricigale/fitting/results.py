@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 
-from miricigale.fitting import drawing, result_tables
+from miricigale.fitting import drawing, histories, result_tables
 from miricigale.fitting.posterior import (
     cell_edges,
     cell_percentiles,
@@ -453,3 +453,4 @@ class FitResults(FitRows):
     samples, best_sed, plot_sed = drawing.samples, drawing.best_sed, drawing.plot_sed
     plot_pdf, plot_pdf2d = drawing.plot_pdf, drawing.plot_pdf2d
     plot_corner, plot_redshift = drawing.plot_corner, drawing.plot_redshift
+    plot_sfh = histories.plot_best_sfh

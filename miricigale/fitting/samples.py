@@ -6,7 +6,7 @@ from functools import cached_property
 import astropy.units as u
 import numpy as np
 
-from miricigale.fitting import drawn_spectra
+from miricigale.fitting import drawn_spectra, histories
 from miricigale.fitting.drawing import CORNER, labeled
 from miricigale.fitting.drawn_spectra import LEVELS, suffix
 from miricigale.fitting.likelihood import FitFlags
@@ -407,6 +407,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     spectra, sed_band = drawn_spectra.spectra, drawn_spectra.sed_band
     plot_sed_band = drawn_spectra.plot_sed_band
+    sfh_band, plot_sfh = histories.sfh_band, histories.plot_sfh_band
 
     def plot_pdf2d(self, key, a="redshift", b="frac_agn", ax=None, **kwargs):
         """Draw the joint distribution of two parameters of an object; returns the axes."""

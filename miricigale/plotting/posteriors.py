@@ -330,6 +330,43 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
     return ax
 
 
+def plot_history(lookback, bands, *, ax=None, color="tab:blue", label=None, **kwargs):
+    """
+    Draw percentiles of a star-formation history: pairs of levels as bands, a middle one as a line.
+
+    Parameters
+    ----------
+    lookback : `~astropy.units.Quantity`, shape (n,)
+        Times before the light left the galaxy.
+    bands : list of `~astropy.units.Quantity`, shape (n,)
+        Percentiles of the rate in ascending order.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; the current axes by default.
+    color : str, optional
+        Color.
+    label : str, optional
+        Label of the line.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.fill_between`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    x = _value(lookback, u.Gyr)
+    rows = [_value(band, u.Msun / u.yr) for band in bands]
+    n = len(rows)
+    style = {"color": color, "linewidth": 0, "alpha": 0.3, **kwargs}
+    for i in range(n // 2):
+        ax.fill_between(x, rows[i], rows[n - 1 - i], **style)
+    if n % 2:
+        ax.plot(x, rows[n // 2], color=color, linewidth=1, label=label)
+    ax.set(xlabel="lookback time (Gyr)", ylabel="star-formation rate (Msun / yr)")
+    ax.set(xlim=(0, None), ylim=(0, None))
+    return ax
+
+
 def plot_recovery(true, mean, std, *, ax=None, name=None, unit="", log=False, **kwargs):
     """
     Draw recovered against true values with their errors and the line of equality.

@@ -270,5 +270,10 @@ def test_curves_of_ones_own_stand_among_names():
     lines = results[0].plot_sed()[0].get_lines()
     assert any(np.isclose(line.get_xdata(), box.pivot.value).any() for line in lines)
     plt.close("all")
+    # the best history forms the best mass
+    line = results[0].plot_sfh().lines[0]
+    steps = np.diff(line.get_xdata())[0] * 1e9
+    assert_allclose(np.sum(line.get_ydata()) * steps, results[0].best["mass"].value, rtol=0.01)
+    plt.close("all")
     for name, band in ((box, "box"), ("F160W", "wfc3.f160w")):
         assert leave_out(fitter, photometry, [name]).bands == (band,)

@@ -4,6 +4,7 @@ import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import astropy.units as u
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -285,3 +286,20 @@ def test_draws_have_the_joint_posterior_of_all_models():
         keep = expected > 0
         statistic = np.sum((seen - expected)[keep] ** 2 / expected[keep])
         assert chi2.sf(statistic, keep.sum() - 1) > 1e-4
+
+
+def test_histories_hold_the_mass_that_was_formed(real):
+    """The integral of each history is its mass, and its end the rate of the last 100 Myr."""
+    draws = real["a"].n_draws
+    # all quantiles of the draws, so that their mean is that of the draws
+    levels = tuple((np.arange(draws) + 0.5) / draws)
+    table = real.sfh_band("a", levels)
+    step = np.diff(table["lookback"].to_value(u.yr))[0]
+    rates = np.array([table[name].value for name in table.colnames[1:]])
+    assert_allclose(rates.mean(axis=0).sum() * step, real.mean("mass")[0].value, rtol=0.03)
+    recent = table["lookback"] < 100 * u.Myr
+    assert_allclose(rates.mean(axis=0)[recent].mean(), real.mean("sfr_100myr")[0].value, rtol=0.05)
+    axes = real.plot_sfh("a")
+    assert axes.get_xlabel() == "lookback time (Gyr)"
+    assert len(axes.collections) == len(axes.lines) == 1
+    plt.close("all")
