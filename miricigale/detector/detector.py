@@ -183,8 +183,8 @@ class Detector(Interactive):
         return type(self)(chain, properties=self.properties)
 
     def __repr__(self):
-        lines = ",\n    ".join(map(repr, self.effects))
-        return f"Detector((\n    {lines},\n))"
+        names = " -> ".join(type(effect).__name__ for effect in self.effects)
+        return f"<Detector {names}>"
 
     def _facts(self):
         return {type(effect).__name__: effect for effect in self.effects}

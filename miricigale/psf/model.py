@@ -114,6 +114,13 @@ class InstrumentPSF(ImagePSF):
         self.position = None if position is None else tuple(float(v) for v in position)
         self.subarray = subarray
 
+    def __repr__(self):
+        ny, nx = self.data.shape
+        cells = f"{ny} x {nx} cells of {self.cell:.4g} arcsec"
+        name = f"{self.filter}, " if self.filter else ""
+        held = f", with {', '.join(self.includes)}" if self.includes else ""
+        return f"<InstrumentPSF {name}{cells}, frame of the {self.frame}{held}>"
+
     @deprecated("1.0", alternative="replace")
     def replaced(self, data=None, *, meta=None, **changes):
         """Return `replace` with the same changes."""

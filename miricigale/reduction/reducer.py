@@ -52,7 +52,7 @@ from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 _SCALE = 0.11 * ANGLE
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class Reducer(Interactive):
     """
     Settings of the reduction; every method leaves them as they are.
@@ -98,8 +98,8 @@ class Reducer(Interactive):
     Examples
     --------
     >>> from miricigale.reduction import Reducer
-    >>> Reducer(jump_threshold=4.5).jump_threshold
-    4.5
+    >>> Reducer(jump_threshold=4.5)
+    <Reducer native, jump_threshold=4.5>
     """
 
     backend: str = "native"
@@ -134,6 +134,17 @@ class Reducer(Interactive):
             raise argument_error("references", wanted, repr(self.references))
 
     replace = dataclasses.replace
+
+    def __repr__(self):
+        parts = [f"<Reducer {self.backend}"]
+        for item in dataclasses.fields(self)[1:]:
+            made = item.default_factory
+            default = item.default if made is dataclasses.MISSING else made()
+            value = repr(getattr(self, item.name))
+            # what is not by default; settings of many values by their name alone
+            if value != repr(default):
+                parts.append(f"{item.name}={value}" if len(value) < 40 else f"own {item.name}")
+        return f"{', '.join(parts)}>"
 
     def _facts(self):
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.errors import refuses
 from miricigale.detector import Detector, Ramp
 from miricigale.instrument import DQ, Exposure
-from miricigale.reduction import Reducer, read_images
+from miricigale.reduction import RampSettings, Reducer, read_images
 from miricigale.scene import Scene
 from miricigale.utils.exceptions import DataError
 
@@ -89,3 +89,9 @@ def test_integrations_and_pixels_of_a_ramp(ramps):
     x, y = map(int, place)
     assert ramp.pixel_dq[y, x] & int(DQ.DO_NOT_USE) == 0
     assert np.abs(np.subtract(ramp.wcs.world_to_pixel_values(150.1, 2.2), (x, y))).max() < 1
+
+
+def test_a_reducer_says_what_is_not_by_default():
+    assert repr(Reducer()) == "<Reducer native>"
+    changed = Reducer(skip_first=3, ramps=RampSettings(neighbor_threshold=5.0))
+    assert repr(changed) == "<Reducer native, skip_first=3, own ramps>"
