@@ -139,9 +139,14 @@ def make_parser(argv):
         for other, flags in command.get("as_in", {}).items():
             options |= {one: declared[other]["options"][one] for one in flags}
         options |= {shared[one]["flags"]: shared[one] for one in command.get("shared", ())}
-        groups = {}
+        groups, section, title = {}, made, None
         for flags, option in _of_both(options):
-            _add(made, groups, flags, option, known)
+            # an option of image and prior has its heading twice
+            if option.get("heading", title) != title:
+                title = option["heading"]
+                section = made.add_argument_group(title)
+            is_positional = not flags.startswith("-")
+            _add(made if is_positional else section, groups, flags, option, known)
         names = _option_names(made)
         made.set_defaults(option_names=names)
         parser.every_flag = (*parser.every_flag, *names.values())
@@ -197,9 +202,13 @@ def _of_both(options):
             yield _filled(flags, words), option | texts
 
 
+#: Keys of options that argparse does not know.
+_OWN_KEYS = ("flags", "group", "key", "heading")
+
+
 def _add(parser, groups, flags, option, known):
     """Add an option to a parser, or to its group of options of which one may be given."""
-    own = {key: value for key, value in option.items() if key not in ("flags", "group", "key")}
+    own = {key: value for key, value in option.items() if key not in _OWN_KEYS}
     own["help"] = _filled(own["help"], known)
     if "type" in own:
         # argparse applies it to a default that is text

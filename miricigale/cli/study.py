@@ -80,6 +80,9 @@ def plan(args):
     if args.time is not None and args.depth is not None:
         msg = "wanted are --time or --depth, not both"
         raise ValueError(msg)
+    if args.hours is not None and args.depth is not None:
+        msg = "wanted are --hours or --depth, not both"
+        raise ValueError(msg)
     from miricigale.planning import load_plan, write_plan
     from miricigale.utils.outputs import check_output
     from miricigale.utils.parallel import threads
@@ -102,7 +105,13 @@ def plan(args):
         check_output(path, "output", overwrite=True, inputs=[args.config])
     begin = time.monotonic()
     with threads(config.plan.threads or None) as executor:
-        comparison = write_plan(config, folder, executor=executor, overwrite=args.overwrite)
+        comparison = write_plan(
+            config,
+            folder,
+            executor=executor,
+            overwrite=args.overwrite,
+            progress_bar=not args.no_progress,
+        )
     wanted = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter", "completeness", "purity"]
     table = comparison[[*wanted, "n_agn", "merit"]]
     for name in table.colnames[1:]:
@@ -122,8 +131,9 @@ def _bands_of(args, values):
     found = {"exposures.bands": names}
     if args.config is None and not {"exposures.time", "exposures.depth"} & set(values):
         found["exposures.time"] = ExposureSection(bands=tuple(names)).by_band("time")
-        text = ", ".join(f"{t:g} s" for t in found["exposures.time"])
-        print(f"exposed as in CEERS: {text}", file=sys.stderr)
+        if "exposures.hours" not in values:
+            text = ", ".join(f"{t:g} s" for t in found["exposures.time"])
+            print(f"exposed as in CEERS: {text}", file=sys.stderr)
     return found | {"exposures.dithers": values.get("exposures.dithers", [4])}
 
 

@@ -53,7 +53,7 @@ def plan_table(*, quick=False):
     return QTable(rows)[[*order, "limit_etc", "limit", "limit_proposal", "fwhm"]]
 
 
-def write_plan(config, folder, *, executor=None, overwrite=False):
+def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=False):
     """
     Work out a plan and write it.
 
@@ -69,6 +69,8 @@ def write_plan(config, folder, *, executor=None, overwrite=False):
         Threads to fit with; the answer is the same.
     overwrite : bool, optional
         Whether files of these names are replaced.
+    progress_bar : bool, optional
+        Whether a progress bar is shown.
 
     Returns
     -------
@@ -98,7 +100,7 @@ def write_plan(config, folder, *, executor=None, overwrite=False):
     # refused before the fits, which take minutes
     check_outputs(paths, "folder", overwrite=overwrite)
     planner = Planner(config, executor=executor)
-    plans = planner.compare()
+    plans = planner.compare(progress_bar=progress_bar)
     comparison = comparison_table(planner, plans)
     comparison.meta |= {"answer": answer(planner, plans, comparison)}
     comparison.meta |= {"noise": dataclasses.asdict(config.noise)}

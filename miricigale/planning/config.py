@@ -94,6 +94,9 @@ class ExposureSection(Section):
         dithers, and for bands that it does not have that of F770W.
     depth
         5-sigma AB depth of each band instead of a time.
+    hours
+        Budget of each set of bands in hours that are charged, with overheads: its times, in the ratio of time, are
+        as long as that allows; 0: times as they are.
     dithers
         Dithers of each band.
     readout
@@ -115,6 +118,7 @@ class ExposureSection(Section):
     bands: tuple[str, ...] = option(CEERS_FILTERS, choices=imager_filters(), unique=True)
     time: tuple[float, ...] = option((), low=0.0, high=1e7, single=True)
     depth: tuple[float, ...] = option((), low=10.0, high=40.0, single=True)
+    hours: float = option(0.0, low=0.0, high=1e4)
     dithers: tuple[int, ...] = option((), low=1, high=500, single=True)
     readout: str = option("FASTR1", choices=readout_patterns())
     max_fill: float = option(0.6, low=0.05, high=0.95)
@@ -313,6 +317,8 @@ class PlanConfig(Configuration):
         if not exposures.depth:
             least = min(exposures.by_band("time"))
             self.check(least > 0, "exposures.time", "must be positive", least)
+        good = not (exposures.hours and exposures.depth)
+        self.check(good, "exposures.hours", "must be left out with depths", exposures.hours)
         wanted = f"must have one number per fracAGN ({len(agn.frac_agn)})"
         self.check_length("agn.shares", (0, len(agn.frac_agn)), wanted)
         self.check(not agn.shares or sum(agn.shares) > 0, "agn.shares", "must not all be 0")

@@ -45,8 +45,9 @@ def write_page(path, planner, plans, comparison, areas=None, *, overwrite=False)
     page.items(rows[1])
     merit = page.texts["sets"]["merits"][config.survey.rank]
     page.table("table", rows, n=rows[0]["n"], min_detected=planner.min_detected, merit=merit)
+    page.table("accuracy", rows)
     page.figure("figure", _comparison_figure(comparison))
-    _write_exposures(page, config, every)
+    _write_exposures(page, config, miri, every)
     shown = list({plan.name: plan for plan in (plans[0], best, every)}.values())
     chosen = planner.common(plans)
     page.section("fits")
@@ -117,18 +118,28 @@ def _notices(page, planner):
         page.notice("library", library=library)
 
 
-def _write_exposures(page, config, plan):
-    """The section on the exposures of all bands."""
+def _write_exposures(page, config, plans, every):
+    """The section on the exposures of all sets of bands, the one of most bands first."""
     n = config.exposures.pointings
     page.section(
         "exposures",
-        plan=plan.name,
-        light=sum(band.time.to_value(u.h) for band in plan.bands.values()),
+        "budget" if config.exposures.hours else "text",
+        plan=every.name,
+        light=sum(band.time.to_value(u.h) for band in every.bands.values()),
         where="one pointing" if n == 1 else f"each of {n} pointings",
-        area=plan.area.value,
-        time=plan.time.to_value(u.h),
+        area=every.area.value,
+        time=every.time.to_value(u.h),
+        hours=config.exposures.hours,
     )
-    page.table("table", _entries(plan.band_table()))
+    rows, shown = [], set()
+    for plan in sorted(plans, key=lambda one: one is not every):
+        for entry in _entries(plan.band_table()):
+            exposure = entry["band"], entry["time"], entry["frames"]
+            if exposure not in shown:
+                # of the same exposures there is a row for one set
+                shown.add(exposure)
+                rows.append(entry | {"set": plan.name})
+    page.table("table", rows)
 
 
 def _comparison_figure(table):

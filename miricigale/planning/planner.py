@@ -7,11 +7,14 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, vstack
 
+from miricigale.instrument import frame_time
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import band_plans, wall_clock
 from miricigale.planning.sample import make_sample
+from miricigale.utils.exceptions import config_error
 from miricigale.utils.options import check_that
+from miricigale.utils.progress import progress
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.workflow.stages.fits import existing_errors, study_fitter
 from miricigale.workflow.stages.inputs import fit_plan
@@ -23,6 +26,8 @@ EXISTING = "existing bands"
 _SIZES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.2, 1.6])
 #: Field of the imager.
 _FIELD = 74 * 113 * u.arcsec**2
+#: Frames of the shortest exposure of a budget.
+_LEAST = 3
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -155,6 +160,55 @@ class Planner:
         """The exposures of all bands, each time multiplied by ``share``: dict of `BandPlan`."""
         return band_plans(self.config, share=share)
 
+    def share(self, bands, pointings=None):
+        """
+        Factor on all exposure times with which a set of bands takes the hours of the configuration.
+
+        Parameters
+        ----------
+        bands : iterable of str
+            MIRI bands of the configuration.
+        pointings : int, optional
+            Pointings, each a visit; those of the configuration by default.
+
+        Returns
+        -------
+        share : float
+            The largest that the budget allows, to 0.1 %; 1 without a budget, or bands.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.ConfigError`
+            If the shortest exposures take longer.
+        """
+        exposures, bands = self.config.exposures, tuple(bands)
+        if not exposures.hours or not bands:
+            return 1.0
+        pointings = exposures.pointings if pointings is None else pointings
+
+        def charged(share):
+            plans = self.band_plans(share)
+            chosen = [plans[name] for name in bands]
+            return wall_clock(chosen, self.config.overheads, pointings=pointings).to_value(u.h)
+
+        times = np.array(exposures.by_band("time"))
+        dithers = np.array(exposures.by_band("dithers"))
+        low = float(np.max(_LEAST * frame_time(exposures.readout).value * dithers / times))
+        least = charged(low)
+        if least > exposures.hours:
+            names = ", ".join(name.removeprefix("miri.") for name in bands)
+            raise config_error(
+                "[exposures] hours",
+                f"must be at least {least:.2f} for {names}, got {exposures.hours:g}",
+            )
+        high = low * 2
+        while charged(high) <= exposures.hours:
+            low, high = high, high * 2
+        while high > 1.001 * low:
+            middle = np.sqrt(low * high)
+            low, high = (middle, high) if charged(middle) <= exposures.hours else (low, middle)
+        return low
+
     @functools.cached_property
     def _existing(self):
         """Mock photometry in the existing bands, the same for every plan."""
@@ -279,7 +333,7 @@ class Planner:
             table[f"{name}_missing"] = ~np.isfinite(photometry[name])
         return table
 
-    def compare(self, *, measured=None):
+    def compare(self, *, measured=None, progress_bar=False):
         """
         Evaluate the existing bands alone and each set of bands of the configuration.
 
@@ -287,17 +341,25 @@ class Planner:
         ----------
         measured : `~astropy.table.QTable`, optional
             As for `photometry`.
+        progress_bar : bool, optional
+            Whether a progress bar is shown.
 
         Returns
         -------
         plans : list of `Plan`
             The existing bands first.
         """
-        plans = [self.evaluate((), name=EXISTING)]
-        for name in self.config.exposures.sets:
-            short = name.replace("miri.", "").replace(" ", "")
-            bands = self.config.set_bands(name)
-            plans.append(self.evaluate(bands, name=short, measured=measured))
+        sets = self.config.exposures.sets
+        # refused before the fits, which take minutes
+        shares = [self.share(self.config.set_bands(name)) for name in sets]
+        with progress(show=progress_bar, total=len(sets) + 1, desc="fits", unit="sets") as bar:
+            plans = [self.evaluate((), name=EXISTING)]
+            bar.update()
+            for name, share in zip(sets, shares, strict=True):
+                short = name.replace("miri.", "").replace(" ", "")
+                options = {"name": short, "share": share, "measured": measured}
+                plans.append(self.evaluate(self.config.set_bands(name), **options))
+                bar.update()
         return plans
 
     def divide(self, bands=None):
@@ -315,7 +377,14 @@ class Planner:
             One for each number of ``[survey] areas``.
         """
         areas = self.config.survey.areas
-        return [self.evaluate(bands, name=str(n), share=1.0 / n, pointings=n) for n in areas]
+        if not self.config.exposures.hours:
+            return [self.evaluate(bands, name=str(n), share=1.0 / n, pointings=n) for n in areas]
+        chosen = self.config.exposures.bands if bands is None else tuple(bands)
+        plans = []
+        for n in areas:
+            share = self.share(chosen, n)
+            plans.append(self.evaluate(chosen, name=str(n), share=share, pointings=n))
+        return plans
 
     def common(self, plans):
         """Which sources one of the plans detects in `min_detected` bands: more bands never make them fewer."""

@@ -14,7 +14,7 @@ from helpers.errors import refuses
 from miricigale.depth import saturation_flux
 from miricigale.instrument import psf_fwhm
 from miricigale.photometry import ErrorModel
-from miricigale.planning import Planner, area_table, comparison_table, load_plan
+from miricigale.planning import Planner, area_table, comparison_table, load_plan, wall_clock
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.planner import EXISTING
 from miricigale.utils.exceptions import ConfigError
@@ -278,3 +278,29 @@ def test_what_cannot_be_planned_is_one_sentence(capsys, arguments, message):
     err = command(capsys, "plan", *arguments, status=2).err
     assert err.startswith(f"miricigale: {message}")
     assert err.count("\n") == 1
+
+
+def test_a_budget_in_hours_is_what_is_charged():
+    """As long as the budget allows, with overheads, in the ratio of the times."""
+    bands = ["miri.f770w", "miri.f1500w", "miri.f2100w"]
+    sets = ["f770w", "f1500w,f2100w"]
+    exposures = {"bands": bands, "time": [1000, 1000, 3000], "dithers": 4, "sets": sets, "hours": 6}
+    planner = Planner(load_plan(overrides={"exposures": exposures}))
+    for name in sets:
+        chosen = planner.config.set_bands(name)
+        plans = planner.band_plans(planner.share(chosen))
+        mine = [plans[band] for band in chosen]
+        charged = wall_clock(mine, planner.config.overheads).to_value(u.h)
+        # exposures are whole numbers of integrations and groups
+        assert 5.9 < charged <= 6.0
+    assert_allclose(mine[1].time / mine[0].time, 3, rtol=0.05)
+    one, four = planner.share(chosen), planner.share(chosen, 4)
+    # each of four pointings has a visit of its own
+    assert four < one / 4
+    assert planner.share(()) == 1.0
+    short = Planner(load_plan(overrides={"exposures": exposures | {"hours": 0.5}}))
+    refuses("hours must be at least 0.8. for f770w", short.share, bands[:1], error=ConfigError)
+    with_depths = {"exposures": exposures | {"depth": 25.0}}
+    refuses(
+        "hours must be left out with depths", load_plan, overrides=with_depths, error=ConfigError
+    )

@@ -1,4 +1,5 @@
 import io
+import re
 import shlex
 from pathlib import Path
 
@@ -116,6 +117,15 @@ def test_every_command_has_two_examples_that_it_can_read():
             assert program == "miricigale"
             # exits where options or arguments are none of the command's
             parser.parse_args(words)
+
+
+def test_help_has_options_in_groups(capsys):
+    refuses("^0$", main, ["photometry", "--help"], error=SystemExit)
+    text = capsys.readouterr().out
+    titles = re.findall(r"^(\S.*):$", text, re.MULTILINE)
+    assert len(titles) == len(set(titles)) >= 8
+    # each option is in the group that its heading begins
+    assert text.index("PSFs and kernel:") < text.index("--kernel FITS  ") < text.index("the fit:")
 
 
 def test_help_names_presets_and_surveys(capsys):
