@@ -25,11 +25,12 @@ from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Tabular
 from miricigale.utils.missing import floats
+from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed
 from miricigale.utils.region_files import write_circles
 from miricigale.utils.tables import described_table
 from miricigale.utils.unified import read_write
-from miricigale.utils.units import ANGLE, FNU, check_count, is_number
+from miricigale.utils.units import ANGLE, FNU, check_count, is_number, positive
 
 #: Columns of which a band's name takes the place of flux.
 _FLUXES = ("flux", "flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf")
@@ -313,6 +314,13 @@ class ForcedPhotometryResult(Tabular):
             raise argument_error("confidence", "between 0 and 1", confidence)
         return self.flux - ndtri((1 - confidence) * ndtr(self.snr)) * self.flux_err
 
+    def _row(self, key):
+        """Row of the source of an id."""
+        if not np.any(self.id == key):
+            msg = f"no source with the id {key!r}"
+            raise KeyError(msg)
+        return int(np.argmax(self.id == key))
+
     def correlation(self, first, second):
         """
         Correlation of the errors of two sources, given by id.
@@ -327,12 +335,7 @@ class ForcedPhotometryResult(Tabular):
         KeyError
             If the catalog has no such id.
         """
-        rows = []
-        for key in (first, second):
-            if not np.any(self.id == key):
-                msg = f"no source with the id {key!r}"
-                raise KeyError(msg)
-            rows.append(int(np.argmax(self.id == key)))
+        rows = [self._row(first), self._row(second)]
         errors = self.flux_err.value[rows]
         return float(self.covariance[rows[0], rows[1]] / np.prod(errors))
 
@@ -457,3 +460,44 @@ class ForcedPhotometryResult(Tabular):
         model, residual = self.model_image.data, self.residual_image
         scale = pixel_scale(residual.wcs)
         return plot_model_residual(residual.data + model, model, ax=ax, pixel_scale=scale, **kwargs)
+
+    def plot_source(self, key, ax=None, *, size=5 * u.arcsec, **kwargs):
+        """
+        Draw image, model and residual about one source.
+
+        Parameters
+        ----------
+        key : object
+            Id of the source.
+        ax : sequence of three `~matplotlib.axes.Axes`, optional
+            Where to draw.
+        size : `~astropy.units.Quantity`, optional
+            Side of the cutouts.
+        **kwargs
+            Passed to `~miricigale.plotting.images.plot_model_residual`.
+
+        Returns
+        -------
+        ax : `~numpy.ndarray` of three `~matplotlib.axes.Axes`
+
+        Raises
+        ------
+        KeyError
+            If the catalog has no such id.
+        ValueError
+            If the source is not on the image.
+        """
+        from miricigale.plotting.images import plot_model_residual
+
+        row = self._row(key)
+        scale = pixel_scale(self.residual_image.wcs)
+        half = max(1, round(positive(size, ANGLE, "size") / scale / 2))
+        ny, nx = self.residual_image.shape
+        place = self.x[row], self.y[row]
+        # NaN is on no image
+        inside = -0.5 <= place[0] < nx - 0.5 and -0.5 <= place[1] < ny - 0.5
+        check_that(inside, "key", "a source on the image", repr(key))
+        x, y = (round(float(value)) for value in place)
+        part = np.s_[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1]
+        model, residual = self.model_image.data[part], self.residual_image.data[part]
+        return plot_model_residual(residual + model, model, ax=ax, pixel_scale=scale, **kwargs)

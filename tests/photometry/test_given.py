@@ -1,6 +1,7 @@
 """Images, catalogs, PSFs and results of forced photometry in the forms that users have."""
 
 import astropy.units as u
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -149,6 +150,20 @@ def test_results_are_indexed_like_their_table(images, psfs, sky):
     assert_allclose(result.magnitude.value, 23.9 - 2.5 * np.log10(result.flux.value))
     assert result.flag_names()[0] == []
     assert "sources: 16" in result.summary()
+    # on the pixels of the image
+    x, y = images[0].wcs.world_to_pixel(sky)
+    assert_allclose([result["x"], result["y"]], [x, y], atol=1e-6)
+    panels = result.plot_source(4, size=1 * u.arcsec)
+    whole = result.residual_image.data + result.model_image.data
+    drawn = panels[0].get_images()[0].get_array()
+    column, row = round(float(result.x[3])), round(float(result.y[3]))
+    # the middle of the cutout is the pixel of the source
+    assert drawn[drawn.shape[0] // 2, drawn.shape[1] // 2] == pytest.approx(whole[row, column])
+    plt.close("all")
+    refuses("no source with the id 99", result.plot_source, 99, error=KeyError)
+    matches = result.match_to_catalog(sky[3:5])
+    assert matches["second"][3:5].tolist() == [0, 1]
+    assert matches["status"][2] == "unmatched"
     message = "no column 'fluxx'; known: .*; did you mean 'flux'"
     refuses(message, result.__getitem__, "fluxx", error=KeyError)
     assert result.residual is result.residual_image
