@@ -40,6 +40,12 @@ def fit(args):
         write_table(found, table, overwrite=True)
         page = fit_page(found, args.photometry, **chosen(args, "catalog_map z_spec"), hdu=hdu)
         page = page.write(args.output / "page.html", overwrite=True)
+        if args.plots:
+            from miricigale.fitting.object_plots import write_plots
+
+            ids = None if args.plots == ["all"] else args.plots
+            options = {"overwrite": True, "progress_bar": not args.no_progress}
+            write_plots(found["galaxy"], args.output / "plots", ids, **options)
     except KeyboardInterrupt:
         n_parts = len(list(args.output.glob("part-*.fits")))
         how = "the same command" + ("" if args.resume else ", without --no-resume,")

@@ -10,6 +10,7 @@ from photutils.aperture import CircularAnnulus, CircularAperture
 from miricigale.depth.fitted import fitted_noise, psf_of
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
 from miricigale.depth.published import etc_setup, scaled_limit
+from miricigale.filters import FilterSet
 from miricigale.instrument import Exposure, frame_time, frames_per_group, imager_filters
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.meta import provenance
@@ -247,8 +248,8 @@ def sensitivity(
 
     Parameters
     ----------
-    filter : str
-        One of `~miricigale.instrument.imager_filters`.
+    filter : str or list of str
+        One of `~miricigale.instrument.imager_filters`, or several.
     time : `~astropy.units.Quantity`, optional
         Total exposure time, all dithers.
     n_sigma : float, optional
@@ -269,7 +270,7 @@ def sensitivity(
     Returns
     -------
     flux : `~astropy.units.Quantity`
-        Total flux of the source, uJy.
+        Total flux of the source, uJy; shape (n,) for n filters.
 
     Raises
     ------
@@ -289,6 +290,10 @@ def sensitivity(
     25.32 mag(AB) {'excess': 'ideal'}
     24.91 mag(AB) {'method': 'aperture'}
     """
+    if isinstance(filter, (list, tuple, FilterSet)):
+        more = {"method": method, "excess": excess, "residual": residual, "n_dithers": n_dithers}
+        limits = [sensitivity(one, time, n_sigma=n_sigma, **more, **options) for one in filter]
+        return u.Quantity(limits)
     check_choice(method, "method", ("fit", "aperture"))
     unused = {"fit": ("aperture", "annulus", "correlation"), "aperture": ("size", "mosaic")}
     for name in unused[method]:

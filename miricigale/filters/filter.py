@@ -273,6 +273,11 @@ class Filter(Frozen, Interactive):
         return self.bounds[1]
 
     @classmethod
+    def from_file(cls, path, *, name=None, unit=None):
+        """Return the filter of a file; see `read`."""
+        return cls.read(path, name=name, unit=unit)
+
+    @classmethod
     def read(cls, path, *, name=None, unit=None):
         r"""
         Read a filter from a file.

@@ -14,6 +14,7 @@ from miricigale.fitting.catalog_rows import open_catalog
 from miricigale.fitting.classes import classes_of, classes_section
 from miricigale.fitting.drawing import fitted_curves
 from miricigale.fitting.likelihood import unused_bands
+from miricigale.fitting.object_plots import draw_objects
 from miricigale.fitting.page_numbers import fit_numbers, known_redshifts
 from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure, plain_text
@@ -271,16 +272,13 @@ def _examples(page, results, found, step, curves):
     if not chosen:
         return
     page.section("examples")
-    figure, axes = new_figure(-(-len(chosen) // 2), 2, size=(WIDTH / 2, 3.3))
-    picked = results[np.array([step * row for row, _ in chosen])]
-    for ax, (_, what), one in zip(axes.ravel(), chosen, picked, strict=False):
-        one.plot_sed(ax, filters=curves)
+    picked = list(results[np.array([step * row for row, _ in chosen])])
+    titles = []
+    for (_, what), one in zip(chosen, picked, strict=True):
         z = "" if found.meta["fixed"] else f"z = {one.best['redshift'].value:.2f}, "
-        title = f"{plain_text(one.ids)}: {z}reduced chi2 {one.reduced_chi2:.2f} ({what})"
-        ax.set_title(title, fontsize="small")
-    for ax in axes.ravel()[len(chosen) :]:
-        ax.remove()
-    page.figure("figure", figure)
+        chi2 = f"reduced chi2 {one.reduced_chi2:.2f}"
+        titles.append(f"{plain_text(one.ids)}: {z}{chi2} ({what})")
+    page.figure("figure", draw_objects(picked, curves, titles))
 
 
 def _choose(found):

@@ -245,12 +245,14 @@ def plot_sed_fit(
     if residual_ax is None:
         ax.set_xlabel("observed wavelength (µm)")
         return ax
-    pull = np.where(have, (flux - model) / np.where(have, err, 1.0), np.nan)
+    # a band that was left out may have an error that is none
+    stated = have & (err > 0)
+    pull = np.where(stated, (flux - model) / np.where(stated, err, 1.0), np.nan)
     residual_ax.axhline(0.0, color="0.6", linewidth=0.8)
     for rows, _, style in points:
         residual_ax.plot(wave[rows], pull[rows], **style)
     # of limits only those that the model passes have to be seen
-    shown_pull = have & ~(limit & (pull > 0))
+    shown_pull = stated & ~(limit & (pull > 0))
     size = np.nanmax(np.abs(pull[shown_pull]), initial=2.5) * 1.15
     if np.any(bound):
         residual_ax.errorbar(wave[bound], pull[bound], yerr=0.25 * size, **_ARROW)

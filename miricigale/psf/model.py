@@ -121,6 +121,24 @@ class InstrumentPSF(ImagePSF):
         held = f", with {', '.join(self.includes)}" if self.includes else ""
         return f"<InstrumentPSF {name}{cells}, frame of the {self.frame}{held}>"
 
+    def encircled_energy(self, radius):
+        """
+        Fraction of all light within radii; see `~miricigale.psf.encircled_energy`.
+
+        Parameters
+        ----------
+        radius : `~astropy.units.Quantity`
+            Of any shape.
+
+        Returns
+        -------
+        fraction : `~numpy.ndarray` or float
+        """
+        # which is made of this module
+        from miricigale.psf.energy import encircled_energy
+
+        return encircled_energy(self, radius)
+
     @deprecated("1.0", alternative="replace")
     def replaced(self, data=None, *, meta=None, **changes):
         """Return `replace` with the same changes."""

@@ -294,3 +294,9 @@ def test_unknown_names_list_the_known():
     # frames of 2.775 s
     wanted = "'time' must be at least one integration of 10 groups, 27.75 s, got 10"
     refuses(wanted, sensitivity, NAME, 10 * u.s, n_groups=10)
+
+
+def test_several_filters_have_a_limit_each():
+    names = ["F770W", "F1500W"]
+    alone = [sensitivity(name, 1000 * u.s).value for name in names]
+    assert_allclose(sensitivity(names, 1000 * u.s).value, alone)

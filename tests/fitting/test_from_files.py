@@ -3,6 +3,7 @@
 import io
 import warnings
 from pathlib import Path
+from urllib.parse import unquote
 
 import astropy.units as u
 import numpy as np
@@ -23,6 +24,7 @@ from miricigale.fitting import (
 )
 from miricigale.fitting.catalog_rows import open_catalog
 from miricigale.fitting.grid import GridEngine
+from miricigale.fitting.object_plots import write_plots
 from miricigale.fitting.page import fit_page
 from miricigale.sed import SEDModel, read_spectra, template_grid
 from miricigale.sed.foreground import band_extinction
@@ -299,6 +301,10 @@ def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_p
     ):
         assert text in page, text
     assert "outliers, above 0.15" in page
+    # a picture of each object that was fitted, by its id
+    written = write_plots(results, tmp_path / "plots", table["id"][:2])
+    assert [unquote(path.stem) for path in written] == table["id"][:2].tolist()
+    refuses("no object with the id 'x'", write_plots, results, tmp_path, ["x"], error=KeyError)
     monkeypatch.setattr("miricigale.fitting.page._MOST", 2)
     few = fit_page(results, tmp_path / "cat.fits").to_html()
     assert "numbers and figures are of one object in 3, 2 of them" in few
