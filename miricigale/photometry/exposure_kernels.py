@@ -142,6 +142,9 @@ class ExposureKernels:
 def exposure_roll(image):
     """Position angle (deg) of the detector's +y: as stated (``pa_aper``), or that of the coordinates."""
     pa_aper = image.meta.get("pa_aper")
+    if pa_aper is None:
+        # headers of files have that of an option
+        pa_aper = getattr(image, "pa_aper", None)
     if pa_aper is not None and np.size(pa_aper) == 1:
         return float(np.ravel(u.Quantity(pa_aper, u.deg).value)[0])
     return float(grid_angle(image.wcs, image.shape).to_value(u.deg))

@@ -9,9 +9,8 @@ from scipy.optimize import least_squares
 from miricigale.instrument import imager_filters, psf_fwhm
 from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
-from miricigale.psf.model import instrument_psf
+from miricigale.psf.model import enclosed_light, instrument_psf
 from miricigale.utils.declared import declared
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.tables import described_columns
 from miricigale.utils.units import ANGLE, to_array
@@ -57,13 +56,7 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
         width = math.sqrt(max(scale**2 - psf.cell**2, 0.0)) / psf.pixel_scale.value
         form = {"oversampling": psf.n_cells, "pixel": False}
         data = detector_response(data, **form, boxes=(width,))
-    radii = to_array(radius, ANGLE, "radius", finite=True)
-    if np.any(radii < 0) or np.any(radii > psf.half_width):
-        wanted = f"between 0 and the half width of the PSF, {psf.half_width:.4g} arcsec"
-        raise argument_error("radius", wanted, radius)
-    flat = np.ascontiguousarray(radii.ravel() / psf.cell)
-    sums = _core.radial_sums(data, *psf.origin, flat) / psf.n_cells**2
-    return float(sums[0]) if radii.ndim == 0 else sums.reshape(radii.shape)
+    return enclosed_light(psf, data, radius)
 
 
 def radius_of_encircled_energy(psf, fraction):

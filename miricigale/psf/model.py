@@ -134,10 +134,7 @@ class InstrumentPSF(ImagePSF):
         -------
         fraction : `~numpy.ndarray` or float
         """
-        # which is made of this module
-        from miricigale.psf.energy import encircled_energy
-
-        return encircled_energy(self, radius)
+        return enclosed_light(self, self.data, radius)
 
     @deprecated("1.0", alternative="replace")
     def replaced(self, data=None, *, meta=None, **changes):
@@ -524,3 +521,37 @@ def _half_width(data, origin):
     """Cells from the center to the nearest edge."""
     x, y = (float(v) for v in origin)
     return min(x, data.shape[1] - 1 - x, y, data.shape[0] - 1 - y) + 0.5
+
+
+def enclosed_light(psf, data, radius):
+    """
+    Light of an image on the cells of a PSF inside circles around its center.
+
+    Parameters
+    ----------
+    psf : `InstrumentPSF`
+        Says where the center is, and how large cells are.
+    data : `~numpy.ndarray`, shape (ny, nx)
+        Image.
+    radius : `~astropy.units.Quantity`
+        Scalar or array of radii.
+
+    Returns
+    -------
+    light : float or `~numpy.ndarray`
+        Of all light, as of ``data``.
+
+    Raises
+    ------
+    ValueError
+        If a radius is negative or its circle leaves the grid.
+    """
+    radii = to_array(radius, ANGLE, "radius", finite=True)
+    if np.any(radii < 0) or np.any(radii > psf.half_width):
+        wanted = f"between 0 and the half width of the PSF, {psf.half_width:.4g} arcsec"
+        raise argument_error("radius", wanted, radius)
+    flat = np.ascontiguousarray(radii.ravel() / psf.cell)
+    sums = _core.radial_sums(data, *psf.origin, flat) / psf.n_cells**2
+    if radii.ndim == 0:
+        return float(sums[0])
+    return sums.reshape(radii.shape)
