@@ -130,8 +130,8 @@ def fitted_noise(
     >>> for excess in ("flight", "ideal"):
     ...     sky, photon = fitted_noise("miri.f770w", 3000 * u.s, excess=excess)
     ...     print(f"error of a faint source, {excess}: {sky:.4f} uJy")
-    error of a faint source, flight: 0.0258 uJy
-    error of a faint source, ideal: 0.0184 uJy
+    error of a faint source, flight: 0.0263 uJy
+    error of a faint source, ideal: 0.0188 uJy
     """
     seconds = positive(time, u.s, "time")
     if n_integrations is None:
