@@ -11,6 +11,7 @@ from numpy.testing import assert_array_equal
 from helpers.commands import command
 from helpers.errors import refuses
 from miricigale.cli import main
+from miricigale.cli.exposures import reducer_of
 from miricigale.cli.options import declarations, make_parser
 from miricigale.detector import Detector
 from miricigale.filters.surveys import SURVEYS
@@ -249,3 +250,13 @@ def test_a_catalog_comes_from_standard_input(tmp_path, monkeypatch):
     found, same = (Table.read(tmp_path / name / "table.fits") for name in ("fits", "same"))
     for column in ("id", "redshift_p50", "chi2_best"):
         assert_array_equal(found[column], same[column])
+
+
+def test_options_of_a_reduction_fill_its_settings():
+    """Each goes to the field of its name, whichever settings have it."""
+    words = "reduce a.fits -o out --stripes --sky-flat 3 --skip-first 2 --jump-threshold 0"
+    argv = [*words.split(), "--references", "none", "--background", "sep"]
+    reducer = reducer_of(make_parser(argv).parse_args(argv))
+    assert (reducer.background.method, reducer.background.stripes) == ("sep", True)
+    assert reducer.background.sky_flat == 3.0
+    assert (reducer.skip_first, reducer.jump_threshold, reducer.references) == (2, None, "none")
