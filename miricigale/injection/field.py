@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.injection.light import light_on_image, psf_on_pixels
+from miricigale.injection.light import light_on_file
 from miricigale.injection.population import fitted_shapes
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry import ForcedPhotometer, detect_sources
@@ -16,6 +16,7 @@ from miricigale.photometry.catalogs import joined_sky
 from miricigale.photometry.file_inputs import Pixels
 from miricigale.photometry.kernel_files import image_psf
 from miricigale.photometry.packaging import new_ids
+from miricigale.photometry.repeated_pixels import own_pixels
 from miricigale.psf import make_psf, psf_image, rotate_psf
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import match_sky
@@ -33,7 +34,7 @@ class Measured:
     rows: np.ndarray
 
 
-def recovered_rows(positions, fluxes, known, known_fluxes, sky, flux, radius):
+def recovered_rows(positions, fluxes, former, former_fluxes, sky, flux, radius):
     """
     Say which detection is which injected source.
 
@@ -41,7 +42,7 @@ def recovered_rows(positions, fluxes, known, known_fluxes, sky, flux, radius):
     ----------
     positions, fluxes
         Detections on the image with the sources: `~astropy.coordinates.SkyCoord`, and `~numpy.ndarray` in uJy.
-    known, known_fluxes
+    former, former_fluxes
         The same on the image without them.
     sky, flux
         The same of the injected sources.
@@ -55,9 +56,9 @@ def recovered_rows(positions, fluxes, known, known_fluxes, sky, flux, radius):
         radius, or hidden by a brighter source that was there before.
     """
     rows, _ = match_sky(positions, sky, radius=radius)
-    if len(known) and len(sky):
-        nearest, apart, _ = sky.match_to_catalog_sky(known)
-        hidden = (apart < radius) & (known_fluxes[nearest] > flux)
+    if len(former) and len(sky):
+        nearest, apart, _ = sky.match_to_catalog_sky(former)
+        hidden = (apart < radius) & (former_fluxes[nearest] > flux)
         rows = np.where(hidden, -1, rows)
     return rows
 
@@ -110,7 +111,8 @@ class PriorField:
         header = self.inputs.highres.header
         form = {"pixel_scale": kernel.pixel_scale, "frame": "sky"}
         form["angle"] = grid_angle(header.wcs, header.shape)
-        target, source = (np.asarray(one) for one in (kernel.target, kernel.source))
+        target = np.asarray(kernel.target)
+        source = np.asarray(kernel.source)
         return (
             make_psf(target, enclosed=min(1.0, float(target.sum())), **form),
             make_psf(source, enclosed=min(1.0, float(source.sum())), **form),
@@ -125,7 +127,7 @@ class PriorField:
         good[y[~on_prior], x[~on_prior]] = False
         return good
 
-    def measure(self, sources=None, psfs=None, known=None, image_file=None):
+    def measure(self, sources=None, psfs=None, former=None, image_file=None):
         """
         Measure the field as its user does.
 
@@ -135,10 +137,10 @@ class PriorField:
             What is injected: ``sky``, ``profile``, shapes, ``flux`` and ``prior_flux``; nothing by default.
         psfs : (psf, prior_psf), optional
             Of `psfs`, for the sources.
-        known : `~astropy.table.QTable`, optional
+        former : `~astropy.table.QTable`, optional
             ``sky`` and ``flux`` of what is detected on the prior without them.
         image_file : `~miricigale.photometry.MosaicFile`, optional
-            An image that shows the sources already; theirs is the light on the prior alone then.
+            An image that shows the sources already; labels_found is the light on the prior alone then.
 
         Returns
         -------
@@ -151,9 +153,13 @@ class PriorField:
         n = 0 if sources is None else len(sources)
         light = prior_light = None
         if n and image_file is None:
-            light = self._light(inputs.images[0], sources, sources["flux"], psfs[0])
+            light = light_on_file(
+                inputs.images[0], sources, sources["flux"], psfs[0], self.n_threads
+            )
         if n:
-            prior_light = self._light(inputs.highres, sources, sources["prior_flux"], psfs[1])
+            prior_light = light_on_file(
+                inputs.highres, sources, sources["prior_flux"], psfs[1], self.n_threads
+            )
         file = inputs.images[0] if image_file is None else image_file
         pixels = Pixels(inputs.highres.read(prior_light), [], {self.band: file.read(light)})
         segments, catalog = inputs.find_sources(pixels, inputs.catalog)
@@ -165,19 +171,22 @@ class PriorField:
         if n and detected:
             prior_fluxes = sources["prior_flux"].to_value(FNU)
             fluxes = np.asarray(catalog["flux"].to_value(FNU))
-            known_fluxes = np.asarray(known["flux"].to_value(FNU))
+            former_fluxes = np.asarray(former["flux"].to_value(FNU))
             # as far as a position of the prior may be off and still be the source's
             radius = measurement.results[self.band].psf_fwhm / 2
-            where = catalog["sky"], fluxes, known["sky"], known_fluxes
-            rows = recovered_rows(*where, sources["sky"], prior_fluxes, radius)
+            rows = recovered_rows(
+                catalog["sky"],
+                fluxes,
+                former["sky"],
+                former_fluxes,
+                sources["sky"],
+                prior_fluxes,
+                radius,
+            )
         result = measurement.results[self.band]
-        found = Measured(measurement.table, result, pixels.images[self.band], rows)
-        return found, pixels, segments, catalog
-
-    def _light(self, file, sources, flux, psf):
-        header = file.header
-        own = psf_on_pixels(psf, header.wcs, header.shape)
-        return light_on_image(sources, flux, header.wcs, header.shape, own, self.n_threads)
+        image = own_pixels(pixels.images[self.band])
+        measured = Measured(measurement.table, result, image, rows)
+        return measured, pixels, segments, catalog
 
     def _with_sources(self, pixels, segments, catalog, sources):
         """Segments and catalog with the injected sources: their segments are those that detection finds."""
@@ -188,12 +197,12 @@ class PriorField:
             # the map is one of the prior with the sources
             rows["label"], _ = nearest_values(segments, places)
         else:
-            own, _ = detect_sources(pixels.prior)
-            segments, rows["label"] = joined_segments(segments, own.data, places)
-        both = QTable({"id": np.concatenate([np.asarray(catalog["id"]), rows["id"]])})
-        both["sky"] = joined_sky([catalog["sky"], rows["sky"]])
-        both["label"] = np.concatenate([np.asarray(catalog["label"], int), rows["label"]])
-        return segments, both
+            detection, _ = detect_sources(pixels.prior)
+            segments, rows["label"] = joined_segments(segments, detection.data, places)
+        joined = QTable({"id": np.concatenate([np.asarray(catalog["id"]), rows["id"]])})
+        joined["sky"] = joined_sky([catalog["sky"], rows["sky"]])
+        joined["label"] = np.concatenate([np.asarray(catalog["label"], int), rows["label"]])
+        return segments, joined
 
     def shapes(self, pixels, segments, catalog, psfs):
         """Fitted profiles of the sources (`~miricigale.injection.population.fitted_shapes`)."""
@@ -201,7 +210,7 @@ class PriorField:
         return fitted_shapes(pixels.prior, segments, catalog, psf, self.n_threads)
 
 
-def joined_segments(segments, own, places):
+def joined_segments(segments, detected, places):
     """
     Add the segments of injected sources to a map.
 
@@ -209,7 +218,7 @@ def joined_segments(segments, own, places):
     ----------
     segments : int `~numpy.ndarray`, shape (ny, nx)
         The user's map.
-    own : int `~numpy.ndarray`, shape (ny, nx)
+    detected : int `~numpy.ndarray`, shape (ny, nx)
         Segments of a detection on the image with the sources.
     places : `~numpy.ndarray`, shape (n, 2)
         Pixel positions of the sources.
@@ -217,18 +226,18 @@ def joined_segments(segments, own, places):
     Returns
     -------
     segments : int `~numpy.ndarray`, shape (ny, nx)
-        A copy with new labels; pixels of other sources stay theirs.
+        A copy with new labels; pixels of other sources stay labels_found.
     labels : int `~numpy.ndarray`, shape (n,)
         Those of the sources; 0 without a segment, or on that of another source.
     """
     segments = segments.copy()
     first = int(segments.max()) + 1
-    here, _ = nearest_values(segments, places)
-    theirs, _ = nearest_values(own, places)
+    present, _ = nearest_values(segments, places)
+    labels_found, _ = nearest_values(detected, places)
     labels = np.zeros(len(places), int)
-    for k in np.flatnonzero((here == 0) & (theirs > 0)):
+    for k in np.flatnonzero((present == 0) & (labels_found > 0)):
         labels[k] = first + k
-        segments[(own == theirs[k]) & (segments == 0)] = labels[k]
+        segments[(detected == labels_found[k]) & (segments == 0)] = labels[k]
     return segments, labels
 
 
@@ -273,34 +282,31 @@ class ImageField:
         """Pixels of the image that have data: bool, (ny, nx)."""
         return ~np.asarray(image.mask, bool)
 
-    def measure(self, sources=None, psfs=None, known=None, image_file=None):
-        """As `PriorField.measure`; ``known`` are the sources of the field with their shapes."""
+    def measure(self, sources=None, psfs=None, former=None, image_file=None):
+        """As `PriorField.measure`; ``former`` are the sources of the field with their shapes."""
         n = 0 if sources is None else len(sources)
         light = None
         if n and image_file is None:
-            header = self.file.header
-            psf = psf_on_pixels(psfs[0], header.wcs, header.shape)
-            where = header.wcs, header.shape, psf, self.n_threads
-            light = light_on_image(sources, sources["flux"], *where)
+            light = light_on_file(self.file, sources, sources["flux"], psfs[0], self.n_threads)
         image = (self.file if image_file is None else image_file).read(light)
+        image = own_pixels(image)
         segments = None
-        if known is None:
+        if former is None:
             segmentation, catalog = detect_sources(image, preset=self.preset)
             segments = segmentation.data
-            known = self._shapes(image, segments, catalog)
-        catalog = with_shapes(known, sources)
+            former = self._shapes(image, segments, catalog)
+        catalog = with_shapes(former, sources)
         photometer = ForcedPhotometer(
             psf=self.psf, template="sersic", n_threads=self.n_threads, **self.options
         )
         result = photometer.measure(image, catalog=catalog)
         rows = np.arange(len(catalog) - n, len(catalog))
-        found = Measured(result.to_table(self.band), result, image, rows)
-        return found, Pixels(None, [], {self.band: image}), segments, known
+        measured = Measured(result.to_table(self.band), result, image, rows)
+        return measured, Pixels(None, [], {self.band: image}), segments, former
 
     def _shapes(self, image, segments, catalog):
-        header = self.file.header
-        scale = pixel_scale(header.wcs)
-        turned = rotate_psf(self.psf, grid_angle=grid_angle(header.wcs, header.shape))
+        scale = pixel_scale(image.wcs)
+        turned = rotate_psf(self.psf, grid_angle=grid_angle(image.wcs, image.shape))
         n = 2 * int(self.psf.half_width / scale) + 1
         psf = psf_image(turned, pixel_scale=scale * ANGLE, shape=n)
         return fitted_shapes(image, segments, catalog, psf, self.n_threads)
@@ -310,23 +316,23 @@ class ImageField:
         return catalog
 
 
-def with_shapes(known, sources):
+def with_shapes(former, sources):
     """A catalog of Sersic profiles and points: those of the field, and after them what is injected."""
-    tables = [known] if sources is None else [known, sources]
+    tables = [former] if sources is None else [former, sources]
     rows = QTable()
-    ids = np.asarray(known["id"])
+    ids = np.asarray(former["id"])
     if sources is not None:
         ids = np.concatenate([ids, new_ids(ids, len(sources))])
     rows["id"] = ids
     rows["sky"] = joined_sky([one["sky"] for one in tables])
-    rows["profile"] = np.concatenate([np.asarray(one["profile"]) for one in tables])
+    rows["profile"] = np.concatenate([np.asarray(table["profile"]) for table in tables])
     for name, unit in (
         ("half_light_radius", ANGLE),
         ("sersic_index", None),
         ("axis_ratio", None),
         ("position_angle", u.deg),
     ):
-        values = [np.asarray(u.Quantity(one[name]).value) for one in tables]
+        values = [np.asarray(u.Quantity(table[name]).value) for table in tables]
         rows[name] = np.concatenate(values) * (1 if unit is None else unit)
     return rows
 

@@ -1,13 +1,17 @@
 """Light of sources on the pixels of an image."""
 
+import warnings
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry.arrays import pixel_scale
+from miricigale.photometry.repeated_pixels import own_pixels
 from miricigale.psf import make_psf, psf_image, rotate_psf
 from miricigale.scene import Scene
+from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.units import ANGLE
 
 #: Cells within the width (FWHM) of a PSF.
@@ -83,6 +87,42 @@ def light_on_image(sources, flux, wcs, shape, psf, n_threads=None):
     wcs = wcs.deepcopy()
     wcs.pixel_shape = shape[::-1]
     return scene_light(rows, band, wcs, psf, n_threads)
+
+
+def light_on_file(file, sources, flux, psf, n_threads=None):
+    """
+    Surface brightness of sources on the pixels of a file.
+
+    Parameters
+    ----------
+    file : `~miricigale.photometry.MosaicFile`
+        The image. Where each of its pixels is there several times, the light is too.
+    sources, flux, n_threads
+        As for `light_on_image`.
+    psf : `~miricigale.psf.InstrumentPSF`
+        In the frame of the sky.
+
+    Returns
+    -------
+    light : `~numpy.ndarray`, shape (ny, nx)
+        MJy/sr, without noise.
+    """
+    with warnings.catch_warnings():
+        # those of the image are given where it is measured
+        warnings.simplefilter("ignore", PhotometryWarning)
+        image = own_pixels(file.read())
+    cells = psf_on_pixels(psf, image.wcs, image.shape)
+    light = light_on_image(sources, flux, image.wcs, image.shape, cells, n_threads)
+    n = image.meta.get("repeated_pixels", 1)
+    if n == 1:
+        return light
+    header = file.header
+    # the middle of the first of the repeated pixels, in those of the file
+    middle = np.array(header.wcs.world_to_pixel(image.wcs.pixel_to_world(0, 0)))
+    x, y = np.rint(middle - (n - 1) / 2).astype(int)
+    every = np.zeros(header.shape)
+    every[y : y + n * light.shape[0], x : x + n * light.shape[1]] = np.kron(light, np.ones((n, n)))
+    return every
 
 
 def scene_light(rows, band, wcs, psf, n_threads):

@@ -60,8 +60,8 @@ def write_page(path, result, name, *, in_ramps=False):
     for by in BINNED_BY:
         head = "size (arcsec, rms)" if by == "size" else _HEADS[by]
         page.table("table", _dicts(result.purity(by)), by=head)
-    own = np.any(np.asarray(result.sources["row"]) >= 0)
-    drawn = "those of the catalog" if own else "those of the field's sources"
+    has_catalog = np.any(np.asarray(result.sources["row"]) >= 0)
+    drawn = "those of the catalog" if has_catalog else "those of the field's sources"
     noise = "in ramps it has its photon noise" if in_ramps else "it has no photon noise of its own"
     page.section("method", drawn=drawn, apart=f"{APART:g}", noise=noise)
     report.write(path, overwrite=True)

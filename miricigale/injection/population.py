@@ -214,11 +214,11 @@ def read_sources(catalog, band, prior_band, wcs):
     rows["flux"] = flux * FNU
     prior_flux = np.full(len(table), np.nan)
     if prior_band is not None and prior_band != band:
-        own = as_sources(catalog, prior_band, "catalog of sources")
-        if prior_band in own.colnames:
-            require_columns(own, [prior_band], "catalog", units={prior_band: FNU})
-            prior_flux = plain_floats(own[prior_band], prior_band, "catalog")
-            prior_flux = prior_flux * own[prior_band].unit.to(FNU)
+        of_prior = as_sources(catalog, prior_band, "catalog of sources")
+        if prior_band in of_prior.colnames:
+            require_columns(of_prior, [prior_band], "catalog", units={prior_band: FNU})
+            prior_flux = plain_floats(of_prior[prior_band], prior_band, "catalog")
+            prior_flux = prior_flux * of_prior[prior_band].unit.to(FNU)
     rows["prior_flux"] = prior_flux * FNU
     if {name.lower() for name in table.colnames} & set(_POSITIONS):
         rows["sky"] = as_positions(table, "catalog", wcs)
@@ -237,8 +237,8 @@ def _check_shapes(shapes, extended):
         bad = extended & ~good
         if bad.any():
             row = int(np.argmax(bad))
-            what = f"a usable {name!r} for each galaxy"
-            raise argument_error("catalog", what, f"{shapes[name][row]} in row {row} (from 0)")
+            need = f"a usable {name!r} for each galaxy"
+            raise argument_error("catalog", need, f"{shapes[name][row]} in row {row} (from 0)")
 
 
 def counts_slope(magnitude, limit):

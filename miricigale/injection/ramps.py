@@ -90,8 +90,8 @@ class Exposures:
         )
         bad = table[~np.isin(table["status"], ["reduced", "kept"])]
         if len(bad):
-            what = f"{bad['file'][0]}: {bad['reason'][0] or bad['status'][0]}"
-            raise argument_error("paths", "exposures that can be reduced", what)
+            reason = f"{bad['file'][0]}: {bad['reason'][0] or bad['status'][0]}"
+            raise argument_error("paths", "exposures that can be reduced", reason)
         mosaics = [name for name in table["file"] if str(name).startswith("mosaic_")]
         check_that(len(mosaics) == 1, "paths", "exposures of one filter", mosaics)
         return Path(folder) / str(mosaics[0])
@@ -262,7 +262,7 @@ def _with_charge(raw, added, maps, y, x, integration, rng):
         offsets = np.zeros(raw.shape)
         offsets[:, :n] = reset[:, :n]
         level = level + offsets
-    coefficients = [at(one) for one in maps.linearity]
+    coefficients = [at(plane) for plane in maps.linearity]
     counts = raw.astype(float)
     measured = counts - level
     saturation = np.broadcast_to(at(maps.saturation), raw.shape)
@@ -286,7 +286,7 @@ def _linear(measured, coefficients):
 
 def _measured(target, start, coefficients):
     """Counts above the bias whose linear ones are ``target``, by Newton's method."""
-    slopes = [k * one for k, one in enumerate(coefficients)][1:]
+    slopes = [k * coefficient for k, coefficient in enumerate(coefficients)][1:]
     measured = start.copy()
     for _ in range(_STEPS):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

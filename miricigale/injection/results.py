@@ -236,7 +236,7 @@ class InjectionResult(Interactive):
             ]
         else:
             bins = _neighbors(np.asarray(table["neighbor_light"]), everything)
-        rows = [self._purity_row(*one) for one in bins]
+        rows = [self._purity_row(*group) for group in bins]
         return _described(rows, "purity")
 
     def _purity_row(self, name, low, high, member):

@@ -196,9 +196,9 @@ def field_stage(context, _):
     task = Task.of(context.config, context.seed)
     base = measure_base(task.field(context.n_threads), task.injection)
     context.save_table("photometry.fits", base.table)
-    context.save_rows("field/known", base.known)
+    context.save_rows("field/sources", base.former)
     context.save_rows("field/population", base.population)
-    detections = [_detection_rows(one, base.model) for one in (base.detections, base.negatives)]
+    detections = [_detection_rows(table, base.model) for table in (base.detections, base.negatives)]
     for name, rows in zip(("detections", "negatives"), detections, strict=True):
         context.save_rows(f"field/{name}", rows)
     pulls = np.zeros(0) if base.empty_pulls is None else np.asarray(base.empty_pulls)
@@ -230,7 +230,7 @@ def _read_base(context):
             psfs[k] = read_psf(context.path(f"field/{name}.fits"))
     return Base(
         table=None,
-        known=context.table("field/known.ecsv"),
+        former=context.table("field/sources.ecsv"),
         detections=context.table("field/detections.ecsv"),
         negatives=context.table("field/negatives.ecsv"),
         population=context.table("field/population.ecsv"),
@@ -255,8 +255,10 @@ def trial_stage(context, unit):
     with tempfile.TemporaryDirectory() as folder:
         image = None
         if task.exposures is not None and len(sources):
-            where = context.seed, number, folder, context.n_threads
-            image = task.image.replace(path=task.exposures.injected(sources, *where))
+            mosaic = task.exposures.injected(
+                sources, context.seed, number, folder, context.n_threads
+            )
+            image = task.image.replace(path=mosaic)
         rows, table = run_trial(field, task.injection, base, sources, image)
     if len(rows):
         rows.add_column(np.full(len(rows), number), name="trial", index=0)
@@ -298,7 +300,8 @@ def _result(context, config, seed):
     base = _read_base(context)
     paths = [context.path(f"trials/{name}.fits") for name in trial_names(config)]
     tables = [read_table(path, wanted="a table of a trial") for path in paths]
-    sources = vstack([one for one in tables if len(one)] or tables, metadata_conflicts="silent")
+    filled = [table for table in tables if len(table)]
+    sources = vstack(filled or tables, metadata_conflicts="silent")
     for table, negative in ((base.detections, False), (base.negatives, True)):
         table["negative"] = np.full(len(table), negative)
     detections = vstack([base.detections, base.negatives], metadata_conflicts="silent")

@@ -59,7 +59,7 @@ class Base:
     ----------
     table : `~astropy.table.QTable`
         The user's photometry.
-    known : `~astropy.table.QTable`
+    former : `~astropy.table.QTable`
         Sources of the prior (``sky``, ``flux``), or of the image with their shapes.
     detections, negatives : `~astropy.table.QTable`
         Detections on the image, and on its negative.
@@ -77,7 +77,7 @@ class Base:
     """
 
     table: QTable
-    known: QTable
+    former: QTable
     detections: QTable
     negatives: QTable
     population: QTable
@@ -121,13 +121,13 @@ def measure_base(field, injection):
     good_pixels = field.usable(image, pixels.prior)
     room = np.count_nonzero(good_pixels) * pixel_scale(image.wcs) ** 2 / (APART * fwhm) ** 2
     n_injected = int(min(room / _ROOM, max(_FEWEST, _SHARE * n)))
-    known = shapes
+    former = shapes
     if field.has_prior:
-        known = QTable({"sky": catalog["sky"]})
-        known["flux"] = catalog["flux"] if "flux" in catalog.colnames else shapes["flux"]
+        former = QTable({"sky": catalog["sky"]})
+        former["flux"] = catalog["flux"] if "flux" in catalog.colnames else shapes["flux"]
     return Base(
         table=measured.table,
-        known=known,
+        former=former,
         detections=detect_sources(image, preset=injection.preset)[1],
         negatives=detect_sources(_negative(image), preset=injection.preset)[1],
         population=population,
@@ -270,10 +270,10 @@ def run_trial(field, injection, base, sources, image_file=None):
     """
     if not len(sources):
         measured, *_ = field.measure(
-            known=None if field.has_prior else base.known, image_file=image_file
+            former=None if field.has_prior else base.former, image_file=image_file
         )
         return QTable(), measured.table
-    measured, *_ = field.measure(sources, base.psfs, base.known, image_file)
+    measured, *_ = field.measure(sources, base.psfs, base.former, image_file)
     image, result = measured.image, measured.result
     rows = QTable({"row": sources["row"], "sky": sources["sky"].icrs})
     rows["kind"] = np.where(np.asarray(sources["profile"]) == "point", "star", "galaxy")
@@ -285,15 +285,14 @@ def run_trial(field, injection, base, sources, image_file=None):
     for name in SHAPE:
         rows[name] = sources[name]
     _, detections = detect_sources(image, preset=injection.preset)
-    fluxes, known_fluxes = (
-        np.asarray(one["flux"].to_value(FNU)) for one in (detections, base.detections)
-    )
-    found = recovered_rows(
-        detections["sky"], fluxes, base.detections["sky"], known_fluxes, sources["sky"],
+    fluxes = np.asarray(detections["flux"].to_value(FNU))
+    former_fluxes = np.asarray(base.detections["flux"].to_value(FNU))
+    partners = recovered_rows(
+        detections["sky"], fluxes, base.detections["sky"], former_fluxes, sources["sky"],
         sources["flux"].to_value(FNU), base.facts["fwhm"] * ANGLE,
     )  # fmt: skip
-    rows["detected"] = found >= 0
-    rows["flux_detected"] = _taken(fluxes, found) * FNU
+    rows["detected"] = partners >= 0
+    rows["flux_detected"] = _taken(fluxes, partners) * FNU
     rows["in_prior"] = measured.rows >= 0
     for name in ("flux", "flux_err"):
         rows[name] = _taken(getattr(result, name).to_value(FNU), measured.rows) * FNU
@@ -330,6 +329,6 @@ def place_names(xy, shape):
 
 def _taken(values, rows):
     """Values of rows; NaN for those of -1."""
-    found = np.full(len(rows), np.nan)
-    found[rows >= 0] = np.asarray(values)[rows[rows >= 0]]
-    return found
+    taken = np.full(len(rows), np.nan)
+    taken[rows >= 0] = np.asarray(values)[rows[rows >= 0]]
+    return taken

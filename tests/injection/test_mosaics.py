@@ -13,7 +13,7 @@ from helpers.mosaics import CENTER, FINE, HI, LO, lattice, places, render
 from miricigale.cli import main
 from miricigale.injection import CompletenessCurve, Injection
 from miricigale.injection.field import joined_segments, recovered_rows
-from miricigale.injection.light import light_on_image, psf_on_pixels
+from miricigale.injection.light import light_on_file, light_on_image, psf_on_pixels
 from miricigale.injection.population import counts_slope, draw_magnitudes, draw_places, read_sources
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, detect_sources, measure_files
@@ -56,26 +56,28 @@ def points(rng, low, high, n):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """An image of 25 points, a prior of the same, and the PSFs."""
+    """An image of 25 points; a small one of nine of them, with a prior; and the PSFs."""
     folder, rng = tmp_path_factory.mktemp("field"), np.random.default_rng(7)
     sky = places(*lattice(rng, 5, 6.0, 1.0))
     flux = ERROR * 10 ** rng.uniform(1, 2, len(sky))
     write(folder / "image.fits", sky, flux, rng)
-    prior = {"scale": FINE, "width": HI, "side": 600, "noise": 0.0005}
-    write(folder / "prior.fits", sky, flux, rng, **prior)
+    near = CENTER.separation(sky).arcsec < 10
+    write(folder / "part.fits", sky[near], flux[near], rng, side=170)
+    prior = {"scale": FINE, "width": HI, "side": 320, "noise": 0.0005}
+    write(folder / "prior.fits", sky[near], flux[near], rng, **prior)
     psf_of(LO).write(folder / "psf.fits")
     psf_of(HI).write(folder / "sharp.fits")
     return folder
 
 
-def image_of(folder):
-    return MosaicFile(folder / "image.fits", filter="irac.ch4", psf=folder / "psf.fits")
+def image_of(folder, name="image"):
+    return MosaicFile(folder / f"{name}.fits", filter="irac.ch4", psf=folder / "psf.fits")
 
 
 @pytest.fixture(scope="module")
 def result(folder):
     own = points(np.random.default_rng(3), -1.6, 0.6, 360)
-    injection = Injection(own, n_trials=8, n_sources=45, preset=PRESET)
+    injection = Injection(own, n_trials=6, n_sources=45, preset=PRESET)
     return injection.run(image_of(folder), folder=folder / "run")
 
 
@@ -125,7 +127,7 @@ def test_the_limit_of_forced_photometry_is_five_sigma(result):
 def test_pulls_of_injected_sources_are_normal(result):
     numbers = result.errors()
     n = numbers["n_measured"]
-    assert n == len(result.sources) == 360
+    assert n == len(result.sources) == 270
     assert abs(numbers["pull_median"]) < 3 * 1.2533 / np.sqrt(n)
     assert_allclose(numbers["pull_rms"], 1.0, atol=3 / np.sqrt(2 * n))
     assert abs(numbers["bias"]) < 3 * numbers["bias_err"]
@@ -152,11 +154,12 @@ def test_completeness_of_detection_is_that_of_simulated_fields(result, folder, t
     curve = CompletenessCurve.fit(
         result.sources["magnitude"][free], result.sources["detected"][free]
     )
-    both = np.hypot(curve.limit_err, truth.limit_err)
-    assert both < 0.04
-    assert_allclose(curve.limit, truth.limit, atol=0.05 + both)
+    # of both samples, and of the noise of one field
+    error = np.hypot(np.hypot(curve.limit_err, truth.limit_err), 0.016)
+    assert error < 0.05
+    assert abs(curve.limit - truth.limit) < 2.5 * error
     fine = np.linspace(truth.limit - 1, truth.limit + 0.5, 30)
-    assert np.mean(np.abs(curve(fine) - truth(fine))) < 0.04
+    assert np.mean(np.abs(curve(fine) - truth(fine))) < 0.05
 
 
 @pytest.mark.slow
@@ -164,16 +167,16 @@ def test_a_finished_run_stands_and_workers_change_nothing(result, folder, tmp_pa
     from concurrent.futures import ThreadPoolExecutor
 
     own = points(np.random.default_rng(3), -1.6, 0.6, 360)
-    injection = Injection(own, n_trials=2, n_sources=45, preset=PRESET)
+    injection = Injection(own, n_trials=1, n_sources=45, preset=PRESET)
     with ThreadPoolExecutor(2) as executor:
         again = injection.run(
             image_of(folder), folder=tmp_path / "b", executor=executor, n_threads=2
         )
-    some = result.sources[result.sources["trial"] <= 2]
+    some = result.sources[result.sources["trial"] == 1]
     for name in ("flux", "flux_err", "detected", "x"):
         assert_array_equal(again.sources[name], some[name])
     before = (folder / "run" / "sources.fits").stat().st_mtime_ns
-    injection.replace(n_trials=8).run(image_of(folder), folder=folder / "run")
+    injection.replace(n_trials=6).run(image_of(folder), folder=folder / "run")
     assert (folder / "run" / "sources.fits").stat().st_mtime_ns == before
     with pytest.raises(OtherResultsError):
         injection.replace(seed=2).run(image_of(folder), folder=tmp_path / "b")
@@ -182,7 +185,7 @@ def test_a_finished_run_stands_and_workers_change_nothing(result, folder, tmp_pa
 
 @pytest.fixture(scope="module")
 def prior_files(folder):
-    return image_of(folder), MosaicFile(folder / "prior.fits", psf=folder / "sharp.fits")
+    return image_of(folder, "part"), MosaicFile(folder / "prior.fits", psf=folder / "sharp.fits")
 
 
 @pytest.mark.slow
@@ -205,20 +208,20 @@ def test_sources_are_put_into_the_prior_too(folder, prior_files, tmp_path, capsy
     header = fits.getheader(prior.path, "SCI")
     fits.PrimaryHDU(segments.data, header).writeto(tmp_path / "seg.fits")
     rng = np.random.default_rng(2)
-    own = points(rng, -3.0, -2.0, 30)
+    own = points(rng, -3.0, -2.0, 10)
     own["nircam.f430m"] = own["irac.ch4"]
-    own["half_light_radius"] = np.where(np.arange(30) % 2, 0.3, 0.0) * u.arcsec
-    own["sersic_index"], own["axis_ratio"] = np.ones(30), np.full(30, 0.7)
-    own["position_angle"] = np.full(30, 40.0) * u.deg
+    own["half_light_radius"] = np.where(np.arange(10) % 2, 0.3, 0.0) * u.arcsec
+    own["sersic_index"], own["axis_ratio"] = np.ones(10), np.full(10, 0.7)
+    own["position_angle"] = np.full(10, 40.0) * u.deg
     own.write(tmp_path / "own.ecsv")
     files = [str(one.path) for one in prior_files]
     options = ["--filter", "irac.ch4", "--psf", str(image.psf), "--highres-psf", str(prior.psf)]
-    options += ["--sources", str(tmp_path / "own.ecsv"), "--trials", "1", "--number", "30"]
+    options += ["--sources", str(tmp_path / "own.ecsv"), "--trials", "1", "--number", "10"]
     options += ["--segmentation", str(tmp_path / "seg.fits"), "--no-progress"]
     assert main(["inject", *files, *options, "-o", str(tmp_path / "run")]) == 0
-    assert "30 sources; page: index.html" in capsys.readouterr().out
+    assert "10 sources; page: index.html" in capsys.readouterr().out
     found = QTable.read(tmp_path / "run" / "sources.fits")
-    assert_array_equal(found["row"], np.arange(30))
+    assert_array_equal(found["row"], np.arange(10))
     assert np.all(found["in_prior"])
     galaxy = np.asarray(found["kind"]).astype(str) == "galaxy"
     free = np.asarray(found["neighbor_light"]) < 0.1
@@ -303,3 +306,30 @@ def test_sources_without_room_are_refused(folder, tmp_path):
     injection = Injection(own, n_trials=1, n_sources=500, preset=PRESET)
     with pytest.raises(ValueError, match=r"'n_sources' must be at most \d+, which have room"):
         injection.run(image_of(folder), folder=tmp_path / "full")
+
+
+def test_light_on_repeated_pixels_is_repeated(tmp_path):
+    rng = np.random.default_rng(3)
+    small = write(tmp_path / "small.fits", places([2.0]), [1.0], rng, side=60)
+    with fits.open(small) as hdus:
+        own = np.array(hdus["SCI"].data)
+        wcs = north_up_wcs(CENTER, PIXEL / 2 * u.arcsec, (120, 120))
+        header = wcs.to_header()
+        header.update(BUNIT="uJy", FILTER="F430M")
+        planes = [
+            (np.kron(own, np.ones((2, 2))) / 4, "SCI"),
+            (np.full((120, 120), NOISE / 4), "ERR"),
+        ]
+        large = [fits.PrimaryHDU(), *(fits.ImageHDU(one[0], header, name=one[1]) for one in planes)]
+        fits.HDUList(large).writeto(tmp_path / "large.fits")
+    sources = QTable(
+        {"sky": places([-1.0]), "profile": ["point"], "half_light_radius": [0.0] * u.arcsec}
+    )
+    sources["sersic_index"] = sources["axis_ratio"] = [1.0]
+    sources["position_angle"] = [0.0] * u.deg
+    files = [
+        MosaicFile(tmp_path / f"{name}.fits", filter="irac.ch4") for name in ("small", "large")
+    ]
+    light, enlarged = (light_on_file(one, sources, [2.0] * u.uJy, psf_of(LO)) for one in files)
+    assert light.max() > 0
+    assert_allclose(enlarged, np.kron(light, np.ones((2, 2))), rtol=1e-5, atol=1e-7 * light.max())
