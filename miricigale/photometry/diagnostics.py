@@ -3,12 +3,16 @@
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.errors import noise_correlation, stated_correlation
 from miricigale.photometry.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.residual_sources import ResidualPeaks, residual_peaks
 from miricigale.utils.parallel import chunks
+
+#: Part of a template's light on pixels at the rim of the data from which its flux may be off by some per cent.
+_RIM_LIGHT = 0.1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -22,6 +26,7 @@ class Diagnostics:
     #: (n,): Of each row of the bank; NaN where not fitted, and for second components.
     chi2: np.ndarray
     residual_fraction: np.ndarray
+    rim: np.ndarray  # (n,): Fraction of each row's light on pixels at the rim of the image's data.
     poor: np.ndarray  # (n,): Whether chi2 is too large for noise.
     peaks: ResidualPeaks  # Light that no template explains.
 
@@ -33,7 +38,7 @@ def diagnose(fit, xy):
     correlation = None
     if fit.settings.errors.correlated_noise and len(fit.rows):
         correlation = _correlation(fit, residual, model)
-    chi2, left, core = _statistics(fit, residual).T
+    chi2, left, core, rim = _statistics(fit, residual).T
     with np.errstate(divide="ignore", invalid="ignore"):
         left = left / (fit.total * core)
     out = np.ones(len(chi2), bool)
@@ -48,7 +53,7 @@ def diagnose(fit, xy):
     if fit.free is not None:
         # what the high-resolution image shows is not what is fitted here
         poor[fit.rows] |= fit.free.strain > POOR_STRAIN
-    return Diagnostics(model, residual, correlation, chi2, left, poor, peaks)
+    return Diagnostics(model, residual, correlation, chi2, left, rim, poor, peaks)
 
 
 def _correlation(fit, residual, model):
@@ -67,18 +72,68 @@ def _correlation(fit, residual, model):
 
 
 def _statistics(fit, residual):
-    """Chi2, light left and light of each template's core (see the kernel), shape (n, 3)."""
+    """Chi2, light left and light of each template's core (see the kernel), its part on the rim, shape (n, 4)."""
     out = np.full((len(fit.bank.order), 3), np.nan)
+    rim_light = np.zeros(len(out))
     if not len(fit.rows):
-        return out
+        return np.column_stack([out, rim_light])
+    rim = rim_pixels(fit.arrays.usable)
     for block in fit.bank.blocks():
 
         def measure(part, block=block):
             rows = slice(block.first + part.start, block.first + part.stop)
-            residual_statistics(*block.some(part), residual, fit.inverse_sigma, out[rows])
+            values, boxes, starts = block.some(part)
+            residual_statistics(values, boxes, starts, residual, fit.inverse_sigma, out[rows])
+            rim_light[rows] = _light_on(rim, values, boxes, starts)
 
         fit.bank.map(measure, block.parts())
-    return out
+    return np.column_stack([out, rim_light / fit.bank.full_light()])
+
+
+def rim_pixels(usable):
+    """
+    Pixels at the rim of the data: usable ones beside what is beyond the first and last usable pixels.
+
+    Those of a drizzled mosaic are covered in part, and show the brightness of that part as if it were that of the
+    whole pixel: the light of a star that falls there is too large.
+
+    Parameters
+    ----------
+    usable : `~numpy.ndarray` of bool, shape (ny, nx)
+        Pixels with data. The edge of the array is no rim.
+
+    Returns
+    -------
+    rim : `~numpy.ndarray` of bool, shape (ny, nx)
+    """
+    (left, right), (low, high) = _ends(usable)
+    rows, columns = np.ogrid[: usable.shape[0], : usable.shape[1]]
+    beyond = (columns < left[rows]) | (columns > right[rows])
+    beyond |= (rows < low[columns]) | (rows > high[columns])
+    return usable & binary_dilation(beyond)
+
+
+def _light_on(mask, values, boxes, starts):
+    """Sum of each flat stamp over the pixels of a mask."""
+    light = np.zeros(len(boxes))
+    for k, (y, x, ny, nx) in enumerate(boxes):
+        part = mask[y : y + ny, x : x + nx]
+        if part.any():
+            stamp = values[starts[k] : starts[k] + ny * nx].reshape(ny, nx)
+            light[k] = stamp[part].sum()
+    return light
+
+
+def _ends(usable):
+    """First and last usable pixel of each row, and of each column; none of a row without any."""
+    ends = []
+    for image in (usable, usable.T):
+        some = image.any(axis=1)
+        n = image.shape[1]
+        first = image.argmax(axis=1)
+        last = n - 1 - image[:, ::-1].argmax(axis=1)
+        ends.append((np.where(some, first, n), np.where(some, last, -1)))
+    return ends
 
 
 def _cut_by_rim(usable, boxes):
@@ -88,14 +143,10 @@ def _cut_by_rim(usable, boxes):
     That is before the first or after the last usable pixel of a row or column: of a mosaic whose footprint is
     turned against its pixels, what is not exposed.
     """
-    found, ends = np.zeros(len(boxes), bool), []
+    found = np.zeros(len(boxes), bool)
     if not len(boxes):
         return found
-    for one in (usable, usable.T):
-        some, n = one.any(axis=1), one.shape[1]
-        first, last = one.argmax(axis=1), n - 1 - one[:, ::-1].argmax(axis=1)
-        ends.append((np.where(some, first, n), np.where(some, last, -1)))
-    (left, right), (low, high) = ends
+    (left, right), (low, high) = _ends(usable)
     for k, (y, x, ny, nx) in enumerate(boxes):
         rows, columns = np.ogrid[y : y + ny, x : x + nx]
         beyond = (columns < left[rows]) | (columns > right[rows])
@@ -127,5 +178,6 @@ def source_flags(fit, diagnostics, place, flux, blending):
     cut = np.flatnonzero(fit.main & (flags[place] & int(ForcedFlags.MASKED) > 0))
     cut = cut[_cut_by_rim(fit.arrays.usable, fit.bank.box[cut])]
     flags[place[cut]] |= int(ForcedFlags.EDGE)
+    flags[place[fit.main & (diagnostics.rim > _RIM_LIGHT)]] |= int(ForcedFlags.EDGE)
     flags[np.isnan(flux) & (flags & int(ForcedFlags.DEGENERATE) == 0)] |= int(ForcedFlags.NO_DATA)
     return flags, coverage

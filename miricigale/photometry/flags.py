@@ -21,10 +21,13 @@ class ForcedFlags(Flags):
     >>> ForcedFlags.names(96)
     ['no_segment', 'noisy_segment']
     >>> print(ForcedFlags.POOR_FIT.value, ForcedFlags.meanings()[1])
-    256 ('edge', "More than a tenth of the template's light falls off the image or its footprint.")
+    256 ('edge', "More than a tenth of the template's light falls off the image or its footprint, or on its rim.")
     """
 
-    EDGE = 1, "More than a tenth of the template's light falls off the image or its footprint."
+    EDGE = (
+        1,
+        "More than a tenth of the template's light falls off the image or its footprint, or on its rim.",
+    )
     MASKED = 2, "More than a tenth of the template's light falls on masked pixels."
     NO_DATA = 4, "Too little of the template's light falls on usable pixels: not measured."
     BLENDED = 8, "Blending makes the error more than twice that of the source alone."

@@ -225,6 +225,20 @@ def test_outliers_are_masked_and_stars_are_not():
     assert reject_outliers(images[:2], images[0].wcs) == images[:2]
 
 
+def test_of_two_images_none_loses_the_good_pixel():
+    """Two values do not say which is the outlier: the median of two is halfway, and jwst masks both."""
+    wcs = small_wcs()
+    rng = np.random.default_rng(1)
+    images = [make(rng.normal(size=(150, 160)), wcs) for _ in range(2)]
+    images[0].data[70, 80] += 50
+    for fewest in (2, 1):
+        checked = reject_outliers(images[:fewest], wcs)
+        assert not any(im.mask is not None and im.mask[70, 80] for im in checked)
+    mosaic = drizzle_images(reject_outliers(images, wcs), wcs)
+    assert mosaic.n_images[70, 80] == 2
+    assert np.isfinite(mosaic.image.data[70, 80])
+
+
 def test_outliers_of_fields_side_by_side_are_those_of_each_field():
     """Two pointings of three dithers that do not touch: together each is judged as alone."""
     rng = np.random.default_rng(11)
