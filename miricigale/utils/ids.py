@@ -24,8 +24,8 @@ _LISTED = 3
 
 
 def _plain_name(name):
-    """A name in lower case, without a byte-order mark and what stands between words."""
-    return re.sub(r"[\ufeff\s_\-.]+", "", str(name)).lower()
+    """A name in lower case, without a byte-order mark, a comment's mark and what stands between words."""
+    return re.sub(r"[\ufeff#\s_\-.]+", "", str(name)).lower()
 
 
 def is_id_name(name):
@@ -79,7 +79,10 @@ def likely_ids(table):
     names = []
     for name in table.colnames:
         kind = getattr(getattr(table[name], "dtype", None), "kind", "")
-        looks = _ID_PART.search(name) or _ID_END.search(name) or _plain_name(name) in _LIKELY
+        plain = _plain_name(name)
+        looks = _ID_PART.search(name) or _ID_END.search(name)
+        # source_name, objname
+        looks = looks or plain in _LIKELY or plain.endswith("name")
         if looks and kind in "iufUSO" and table[name].ndim == 1 and _is_distinct(table[name]):
             names.append(name)
     return names

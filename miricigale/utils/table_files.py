@@ -369,6 +369,7 @@ def _read_text(path, form, id_names):
             names = [name for name in table.colnames if name in id_names or is_id_name(name)]
             _numbers_among_words(table, names)
             _ids_as_written(table, path, source, form, names)
+            _unmark_first_name(table)
         return table
     if is_zip(path):
         msg = f"of {form} in a zip archive: unpack it first"
@@ -379,6 +380,16 @@ def _read_text(path, form, id_names):
     else:
         options = {}
     return Table.read(path, format=form, **options)
+
+
+def _unmark_first_name(table):
+    """Take the mark of a comment off the first name: a line "#id,f,e" names columns, as many programs write it."""
+    if not table.colnames:
+        return
+    first = table.colnames[0]
+    plain = first.lstrip("# ")
+    if first.startswith("#") and plain and plain not in table.colnames:
+        table.rename_column(first, plain)
 
 
 def _numbers_among_words(table, id_names):

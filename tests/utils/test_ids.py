@@ -33,6 +33,7 @@ LARGE = [2**53 + 1, 2**62 + 1, 2**62 + 3]
         (["objID", "specz"], "objID"),
         (["Source_Id"], "Source_Id"),
         (["\ufeffid", "ra"], "\ufeffid"),
+        (["#id", "ra"], "#id"),
         (["label", "NUMBER"], "NUMBER"),
         (["label", "ra"], "label"),
         (["valid", "grid", "ra"], None),
@@ -283,3 +284,19 @@ def test_a_table_with_positions_is_read_in_pieces(tmp_path):
     rows = open_rows(tmp_path / "s.fits", 2)
     assert rows.colnames == ("id", "f", "sky")
     assert rows.chunk(1)["sky"].ra.deg.tolist() == [53.3]
+
+
+def test_the_mark_of_a_comment_before_the_names_is_no_part_of_the_first(tmp_path):
+    """As ``numpy.savetxt(header=...)`` and many scripts write the names of a CSV."""
+    for first, name in (("#id", "id"), ("# ra", "ra")):
+        path = tmp_path / f"{name}.csv"
+        path.write_text(f"{first},f\n0007,1.0\n0012,2.0\n")
+        assert read_table(path, wanted="a table").colnames == [name, "f"]
+    assert read_table(tmp_path / "id.csv", wanted="a table")["id"].tolist() == ["0007", "0012"]
+
+
+@pytest.mark.parametrize("name", ["source_name", "OBJNAME", "Target Name", "recno", "designation"])
+def test_names_that_look_like_ids_are_named_where_rows_are_counted(name):
+    table = Table({"f": [1.0, 1.0], name: [101, 102]})
+    with pytest.warns(CatalogWarning, match=f"rows are counted from 1, though '{name}' looks like"):
+        assert counted_ids(table, "catalog").tolist() == [1, 2]
