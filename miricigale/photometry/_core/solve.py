@@ -5,6 +5,8 @@ import scipy.linalg
 import scipy.sparse
 from scipy.sparse.linalg import splu
 
+from miricigale.utils.compilation import njit
+
 
 def symmetric_lu(matrix):
     """Factorize a symmetric sparse matrix without pivots (`scipy.sparse.linalg.SuperLU`)."""
@@ -79,21 +81,23 @@ def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None,
     matrix = (unit @ matrix @ unit).tocsr()
     # H M H = D (S^-1 (D M D) S^-1) D with S = D H^-1 D
     middles = [None if one is None else (unit @ one @ unit).tocsr() for one in middles]
-    pattern = (matrix if pattern is None else pattern).tocsr()
+    pattern = _arrays(matrix if pattern is None else pattern.tocsr())
+    parts, filled = _arrays(matrix), [None if one is None else _arrays(one) for one in middles]
     rows, columns, values = [], [], [[] for _ in middles]
-    inverse_diagonal = np.empty(n)
+    inverse_diagonal, place = np.empty(n), np.full(n, -1)
     for near, inner in _blocks(n, y, x, core, halo, exact):
-        inverse = _dense_inverse(matrix[near][:, near].toarray())
+        place[near] = np.arange(len(near))
+        inverse = _dense_inverse(_dense(*parts, near, place))
         inverse_diagonal[near[inner]] = np.diag(inverse)[inner]
-        wanted = pattern[near[inner]][:, near].tocoo()
-        i = np.flatnonzero(inner)[wanted.row]
+        i, j = _elements(*pattern[:2], near, inner, place)
         rows.append(near[i])
-        columns.append(near[wanted.col])
-        for middle, found in zip(middles, values, strict=True):
+        columns.append(near[j])
+        for middle, found in zip(filled, values, strict=True):
             block = inverse
             if middle is not None:
-                block = inverse @ middle[near][:, near].toarray() @ inverse
-            found.append(block[i, wanted.col])
+                block = inverse @ _dense(*middle, near, place) @ inverse
+            found.append(block[i, j])
+        place[near] = -1
     rows, columns = np.concatenate(rows), np.concatenate(columns)
 
     def matrix_of(found):
@@ -102,6 +106,40 @@ def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None,
         return ((half + half.T) * 0.5).tocsr()
 
     return [matrix_of(found) for found in values], inverse_diagonal * scale**2
+
+
+def _arrays(matrix):
+    """Starts of the rows, columns and values of a sparse matrix, as the kernels take them."""
+    return matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), matrix.data
+
+
+@njit(cache=True, nogil=True)
+def _dense(start, column, data, near, place):
+    """Some rows and columns of a sparse matrix; ``place``, (n,), is that of each among them, or -1."""
+    block = np.zeros((len(near), len(near)))
+    for i, row in enumerate(near):
+        for k in range(start[row], start[row + 1]):
+            j = place[column[k]]
+            if j >= 0:
+                block[i, j] += data[k]
+    return block
+
+
+@njit(cache=True, nogil=True)
+def _elements(start, column, near, inner, place):
+    """Places, among some rows and columns, of the non-zeros in the inner ones of the rows."""
+    most = 0
+    for i, row in enumerate(near):
+        most += start[row + 1] - start[row] if inner[i] else 0
+    found, count = np.empty((2, most), np.int64), 0
+    for i, row in enumerate(near):
+        if inner[i]:
+            for k in range(start[row], start[row + 1]):
+                if place[column[k]] >= 0:
+                    found[0, count] = i
+                    found[1, count] = place[column[k]]
+                    count += 1
+    return found[:, :count]
 
 
 def _blocks(n, y, x, core, halo, exact):
