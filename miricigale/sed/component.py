@@ -189,6 +189,11 @@ class Component:
     @property
     def parameters(self):
         """Parameters with the defaults of this instance: dict of name to Parameter."""
+        return dict(self._parameters)
+
+    @functools.cached_property
+    def _parameters(self):
+        """What `parameters` is a copy of: models ask for them thousands of times."""
         out = {}
         for name, par in type(self).declared().items():
             if name in self.__dict__:
