@@ -238,11 +238,20 @@ def test_published_numbers_are_named_once_and_can_be_measured():
     assert all(one.source for one in PUBLISHED)
 
 
-@pytest.mark.slow
-def test_a_study_beside_the_paper(study):
+OPTIONS = {"seed": 1, "n_draws": 100, "reasons": {"f_scaling.f770w": "no mismatch"}}
+
+
+@pytest.fixture(scope="module")
+def compared(study):
+    """The study with numbers of other products, and its table beside the paper."""
     extra = {"points.scatter": Estimate(0.01), "f_scaling.f770w": Estimate(1.0, 0.99, 1.01, 40)}
-    study, reasons = dataclasses.replace(study, extra=extra), {"f_scaling.f770w": "no mismatch"}
-    table = compare_with_paper(study, seed=1, n_draws=100, reasons=reasons)
+    study = dataclasses.replace(study, extra=extra)
+    return study, compare_with_paper(study, **OPTIONS)
+
+
+@pytest.mark.slow
+def test_a_study_beside_the_paper(compared):
+    study, table = compared
     assert len(table) == len(PUBLISHED)
     row = {r["key"]: r for r in table}
     assert row["points.scatter"]["verdict"] == "within the bound"
@@ -267,13 +276,10 @@ def test_a_study_beside_the_paper(study):
 
 
 @pytest.mark.slow
-def test_numbers_of_other_exposures_are_not_judged(study):
+def test_numbers_of_other_exposures_are_not_judged(compared):
     """Two of 366 s next to 1665 s: only what does not depend on the depth has a verdict."""
-    extra = {"points.scatter": Estimate(0.01), "f_scaling.f770w": Estimate(1.0, 0.99, 1.01, 40)}
-    study = dataclasses.replace(study, extra=extra)
-    options = {"seed": 1, "n_draws": 10}
-    same = compare_with_paper(study, **options)
-    other = compare_with_paper(study, **options, same_exposures=False)
+    study, same = compared
+    other = compare_with_paper(study, **OPTIONS, same_exposures=False)
     assert_allclose(other["ours"], same["ours"])
     judged = np.array([one.quantity == "extra" for one in PUBLISHED])
     assert set(other["verdict"][~judged]) == {"other exposures"}

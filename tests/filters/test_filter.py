@@ -87,18 +87,20 @@ def test_a_filter_cites_its_source():
     assert any("sedpy" in text for text in meta["citations"])
 
 
-@pytest.mark.slow
 def test_catalog_convention_gives_the_true_flux_of_its_reference_spectrum():
     def blackbody(lam):
         return BlackBody(1e4 * u.K)(lam * u.um).value * 1e6
 
+    def proportional(lam):
+        return 1.0 * lam
+
     # nu F_nu constant for IRAC
-    for name, reference in (("irac.ch1", float), ("irac.ch4", float), ("mips.24", blackbody)):
+    references = {"irac.ch1": proportional, "irac.ch4": proportional, "mips.24": blackbody}
+    for name, reference in references.items():
         band = Filter.from_name(name)
         nominal = band.reference_wavelength.value
         wave = np.geomspace(band.wave.value[0] / 1.01, band.wave.value[-1] * 1.01, 5000)
-        fnu = np.array([reference(x) for x in wave])
-        flux = band.synthetic_flux(spectrum(wave, fnu)) * band.catalog_factor
+        flux = band.synthetic_flux(spectrum(wave, reference(wave))) * band.catalog_factor
         assert_quantity_allclose(flux, reference(nominal) * u.uJy, rtol=5e-5)
     assert Filter.from_name("miri.f770w").catalog_factor == 1
 
