@@ -79,10 +79,10 @@ def draw(catalog, flux, psf, wcs, shape, scale):
 
 
 class Field:
-    """A scene's images without noise, and draws of the noise."""
+    """A scene's images without noise, and draws of the noise; the scene is that of the seed, or given."""
 
-    def __init__(self, seed, kernel, target):
-        self.catalog = scene(seed)
+    def __init__(self, seed, kernel, target, catalog=None):
+        self.catalog = scene(seed) if catalog is None else catalog
         self.rng = np.random.default_rng([seed, 1])
         side = np.ptp(self.catalog["dx"]) + 9
         self.wcs, self.light = {}, {}

@@ -28,6 +28,8 @@ class Cutout:
     #: What is added to a profile: the image less the profile, which has the sharp PSF; None
     #: without.
     rest: "Cutout | None" = None
+    #: Of the largest piece of a divided galaxy the template of the whole; None without, or if that is a point.
+    whole: "Cutout | None" = None
 
     def __post_init__(self):
         object.__setattr__(self, "data", np.asarray(self.data, np.float32))

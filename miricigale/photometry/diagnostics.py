@@ -13,6 +13,8 @@ from miricigale.utils.parallel import chunks
 
 #: Part of a template's light on pixels at the rim of the data from which its flux may be off by some per cent.
 _RIM_LIGHT = 0.1
+#: Errors by which a flux is above twice the image's light, or negative, where templates cancel.
+_ABOVE_LIGHT, _NEGATIVE = 3.0, 5.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,6 +29,9 @@ class Diagnostics:
     chi2: np.ndarray
     residual_fraction: np.ndarray
     rim: np.ndarray  # (n,): Fraction of each row's light on pixels at the rim of the image's data.
+    # (n,): The flux with which each row would have all of the image's light below its core, uJy; NaN where not
+    # fitted, and for second components.
+    seen: np.ndarray
     poor: np.ndarray  # (n,): Whether chi2 is too large for noise.
     peaks: ResidualPeaks  # Light that no template explains.
 
@@ -41,9 +46,12 @@ def diagnose(fit, xy):
     chi2, left, core, rim = _statistics(fit, residual).T
     with np.errstate(divide="ignore", invalid="ignore"):
         left = left / (fit.total * core)
+        # the image is its model and the residual
+        seen = _statistics(fit, residual + fit.arrays.usable * model)[:, 1] / core
     out = np.ones(len(chi2), bool)
     out[fit.rows] = False
     out |= ~fit.main
+    seen = np.where(out, np.nan, seen)
     chi2, left = np.where(out, np.nan, chi2), np.where(out, np.nan, left)
     # where the measured noise is above that of the uncertainty, it is the measure
     lag = 0 if correlation is None else correlation.shape[0] // 2
@@ -53,7 +61,7 @@ def diagnose(fit, xy):
     if fit.free is not None:
         # what the high-resolution image shows is not what is fitted here
         poor[fit.rows] |= fit.free.strain > POOR_STRAIN
-    return Diagnostics(model, residual, correlation, chi2, left, rim, poor, peaks)
+    return Diagnostics(model, residual, correlation, chi2, left, rim, seen, poor, peaks)
 
 
 def _correlation(fit, residual, model):
@@ -153,6 +161,27 @@ def _cut_by_rim(usable, boxes):
         beyond |= (rows < low[columns]) | (rows > high[columns])
         found[k] = np.sum(beyond) > 0.5 * np.sum(~usable[y : y + ny, x : x + nx])
     return found
+
+
+def canceling(flux, error, seen):
+    """
+    Whether fluxes are more than the image can hold, by which those of neighbors must be negative, or are negative.
+
+    Parameters
+    ----------
+    flux, error : `~numpy.ndarray`, shape (n,)
+        Fluxes and their errors, uJy; NaN where not measured.
+    seen : `~numpy.ndarray`, shape (n,)
+        As of `Diagnostics`.
+
+    Returns
+    -------
+    canceling : bool `~numpy.ndarray`, shape (n,)
+        Those above twice the image's light by three errors, or negative by five.
+    """
+    with np.errstate(invalid="ignore"):
+        above = flux - 2.0 * np.maximum(seen, 0.0) > _ABOVE_LIGHT * error
+        return above | (flux < -_NEGATIVE * error)
 
 
 def source_flags(fit, diagnostics, place, flux, blending):

@@ -45,43 +45,51 @@ def _write_templates(templates, path, *, overwrite=False):
     table = {"id": ascii_ids(templates.id, "id"), **_sky_columns(templates.sky)}
     table |= {k: getattr(templates, k) for k in names if getattr(templates, k) is not None}
     table |= {f"fitted_{name}": templates.fitted[name] for name in FITTED.names}
-    layers = [
-        (row, one) for row, light in enumerate(templates.light) if light for one in light.layers
-    ]
+    layers = []
+    for row, light in enumerate(templates.light):
+        if light is None:
+            continue
+        layers += [(row, False, layer) for layer in light.layers]
+        if light.whole is not None:
+            layers += [(row, True, layer) for layer in light.whole.layers]
     rows = {
-        "row": np.array([row for row, _ in layers], int),
-        "corner": np.array([one.origin for _, one in layers], int).reshape(-1, 2),
-        "shape": np.array([one.data.shape for _, one in layers], int).reshape(-1, 2),
-        "noise": np.array([one.noise for _, one in layers], float),
-        "convolved": np.array([one.convolved for _, one in layers], bool),
+        "row": np.array([row for row, _, _ in layers], int),
+        "whole": np.array([whole for _, whole, _ in layers], bool),
+        "corner": np.array([layer.origin for *_, layer in layers], int).reshape(-1, 2),
+        "shape": np.array([layer.data.shape for *_, layer in layers], int).reshape(-1, 2),
+        "noise": np.array([layer.noise for *_, layer in layers], float),
+        "convolved": np.array([layer.convolved for *_, layer in layers], bool),
     }
-    pixels = np.concatenate([one.data.ravel() for _, one in layers] or [np.empty(0)])
+    pixels = np.concatenate([layer.data.ravel() for *_, layer in layers] or [np.empty(0)])
     arrays = {"pixels": pixels} | ({} if templates.psf is None else {"psf": templates.psf})
     grid = None if templates.wcs is None else grid_text(templates.wcs)
     write_parts(
-        path, "source-templates-2", text={"meta": templates.meta, "grid": grid}, arrays=arrays,
+        path, "source-templates-3", text={"meta": templates.meta, "grid": grid}, arrays=arrays,
         tables={"sources": Table(table), "layers": Table(rows)}, overwrite=overwrite,
     )  # fmt: skip
 
 
 def _read_templates(path):
-    with open_parts(path, ("source-templates-2",), wanted="templates of sources") as parts:
+    with open_parts(path, ("source-templates-3",), wanted="templates of sources") as parts:
         text = parts.text
         columns, rows = (_columns(parts.table(name)) for name in ("sources", "layers"))
         pixels = parts.array("pixels") if "pixels" in parts else np.empty(0)
         light = [None] * len(columns["id"])
+        wholes = list(light)
         ends = np.cumsum(np.prod(rows["shape"], axis=1, dtype=int))
         # the last layer of a source first: each is what is added to the one before
         for k in range(len(ends) - 1, -1, -1):
             h, w = (int(n) for n in rows["shape"][k])
             row, origin = int(rows["row"][k]), tuple(int(c) for c in rows["corner"][k])
-            light[row] = Cutout(
-                pixels[ends[k] - h * w : ends[k]].reshape(h, w),
-                origin,
-                noise=float(rows["noise"][k]),
-                convolved=bool(rows["convolved"][k]),
-                rest=light[row],
-            )
+            data = pixels[ends[k] - h * w : ends[k]].reshape(h, w)
+            form = {
+                "noise": float(rows["noise"][k]),
+                "convolved": bool(rows["convolved"][k]),
+            }
+            if rows["whole"][k]:
+                wholes[row] = Cutout(data, origin, rest=wholes[row], **form)
+            else:
+                light[row] = Cutout(data, origin, rest=light[row], whole=wholes[row], **form)
         fitted = not_fitted(len(light))
         for name in FITTED.names:
             fitted[name] = columns.pop(f"fitted_{name}")

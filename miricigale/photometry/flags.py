@@ -75,3 +75,17 @@ class ForcedFlags(Flags):
             "the template."
         ),
     )
+    SHREDDED = (
+        16384,
+        (
+            "The segment is a piece of a larger galaxy: the template is the light of the segment and the "
+            "part of the galaxy's wings that is nearest to it. The sum of the pieces is the galaxy."
+        ),
+    )
+    CANCELING = (
+        32768,
+        (
+            "Templates cancel: the flux is above twice the image's light below its template by 3 sigma, "
+            "or negative by 5."
+        ),
+    )

@@ -7,6 +7,7 @@ import scipy.sparse
 
 from miricigale.photometry._core.solve import factorize
 from miricigale.photometry.errors import LinearFit, cross_matrix, normal_matrix, sandwich_matrix
+from miricigale.photometry.pieces import divided_galaxies
 from miricigale.photometry.template_changes import TemplateChanges
 from miricigale.utils.parallel import parallel_map
 
@@ -127,7 +128,7 @@ def free_templates(fit, fitted):
     kernel, size_scatter = fit.settings.mean_kernel, fit.settings.errors.size_scatter
     changes = TemplateChanges(kernel.source, kernel.target, size_scatter)
     snr = np.abs(plain.flux) * np.sqrt(plain.matrix.diagonal())
-    known = np.isfinite(fitted["parameters"][:, 0])
+    known = np.isfinite(fitted["parameters"][:, 0]) & (fitted["galaxy"] == 0)
     wanted = np.flatnonzero(known & (snr > LEAST) & (plain.flux > 0))
     parts = bank.parts(rows)
 
@@ -135,12 +136,24 @@ def free_templates(fit, fitted):
         return changes.of(parts[k], fitted[k], LEAST / snr[k])
 
     found = parallel_map(find, wanted, executor=bank.executor)
-    owner = np.array([k for k, (some, _) in zip(wanted, found, strict=True) for _ in some], int)
+    owner = [k for k, (some, _) in zip(wanted, found, strict=True) for _ in some]
+    every = [one for some, _ in found for one in some]
     noise = np.zeros(len(rows))
     noise[wanted] = [one for _, one in found]
+    scale = np.abs(plain.flux)
+    galaxies = divided_galaxies(fitted, plain.flux)
+    for galaxy in galaxies:
+        noise[galaxy.rows] = [changes.pixel_noise(parts[k]) for k in galaxy.rows]
+        largest = galaxy.largest
+        least = LEAST / galaxy.signal(plain.matrix)
+        # the whole galaxy changes, which its largest piece stands for
+        scale[largest] = galaxy.flux
+        for change in changes.of(parts[largest].whole, fitted[largest], least)[0]:
+            owner.append(largest)
+            every.append(galaxy.of_largest(change))
+    owner = np.array(owner, int)
     if not (len(owner) or noise.any()):
         return None
-    every = [one for some, _ in found for one in some]
     other = bank.at_resolution(bank.order[rows[owner]], [one.cutout for one in every])
     owner = owner[other.order]
     fixed = np.array([one.fixed for one in every], bool)[other.order]
@@ -151,7 +164,7 @@ def free_templates(fit, fitted):
     own, projection, _, _ = normal_matrix(other, fit.inverse_sigma, images)
     cross = cross_matrix(bank, other, fit.inverse_sigma).tocsr()[rows]
     owner = owner[~fixed]
-    prior = np.concatenate([np.zeros(len(rows)), plain.flux[owner] ** -2.0])
+    prior = np.concatenate([np.zeros(len(rows)), scale[owner] ** -2.0])
     matrix = joined_matrix(plain.matrix, cross, own, basis) + scipy.sparse.diags_array(prior)
     free = LinearFit(
         matrix.tocsr(),

@@ -1,5 +1,6 @@
 """Templates of sources on the high-resolution image: points, profiles, or the image itself."""
 
+import copy
 import dataclasses
 import itertools
 
@@ -8,13 +9,24 @@ import scipy.ndimage
 
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.flags import ForcedFlags
-from miricigale.photometry.shapes import Beside, Shape, ShapeFitter, not_fitted
+from miricigale.photometry.shapes import POINT_SIZE, Beside, Shape, ShapeFitter, not_fitted
+from miricigale.photometry.shredded import (
+    claimed_groups,
+    continued_groups,
+    divided,
+    joined_groups,
+    padded,
+    reaching_over,
+)
 from miricigale.photometry.wings import adjust_wings
 from miricigale.utils.parallel import chunks, parallel_map
 
 #: Width (pixels) of the Gaussian that defines the core, its least signal-to-noise, how many standard
 #: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbor.
 _WIDTH, _CORE_SNR, _EXCESS, _OTHER_SNR = 1.5, 4.0, 3.0, 4.0
+
+#: Noise of the image smoothed with it over that of the pixels.
+_GAIN = 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
 
 #: Error of a profile, as a fraction of the brightness: no galaxy is one to better than that.
 _MISFIT = 0.1
@@ -110,15 +122,23 @@ def cutouts(
             found[k] = _bare(data, variance, segments, label[k])
         return found, flags, snr, fitted
     lights = _Lights(data, variance, ShapeFitter(psf, scale), segments, select, executor)
-    models, population = lights.fit([(label[k], xy[k]) for k in chosen])
-    for k, model in zip(chosen, models, strict=True):
-        if model is None:
-            flags[k] = int(ForcedFlags.NOISY_SEGMENT)
-        else:
-            found[k], fitted[k] = model.cutout, model.record
-    for k in np.flatnonzero(flags & int(ForcedFlags.NOISY_SEGMENT)):
+    sources = [(label[k], xy[k]) for k in chosen]
+    models, population = lights.fit(sources)
+    models, galaxies = lights.rejoined(models, sources, population)
+    for galaxy in galaxies:
+        for row, piece, record in zip(galaxy.rows, galaxy.pieces, galaxy.records(), strict=True):
+            found[chosen[row]], fitted[chosen[row]] = piece, record
+            flags[chosen[row]] |= int(ForcedFlags.SHREDDED)
+    in_pieces = set(itertools.chain(*(galaxy.rows for galaxy in galaxies)))
+    for row, (k, model) in enumerate(zip(chosen, models, strict=True)):
+        if model is not None:
+            found[k], fitted[k] = model.cutout, (*model.record, 0.0, 1.0)
+        elif found[k] is None or row not in in_pieces:
+            flags[k] |= int(ForcedFlags.NOISY_SEGMENT)
+    lacking = int(ForcedFlags.NOISY_SEGMENT | ForcedFlags.SHREDDED)
+    for k in np.flatnonzero(flags & lacking == int(ForcedFlags.NOISY_SEGMENT)):
         shape = lights.fitter.unfitted(xy[k], population.at(segments.brightness(label[k])))
-        fitted[k] = shape.parameters, shape.covariance, shape.point, 1.0
+        fitted[k] = shape.parameters, shape.covariance, shape.point, 1.0, 0.0, 1.0
     return found, flags, snr, fitted
 
 
@@ -151,6 +171,22 @@ class _Segments:
     def brightness(self, label):
         """Ln of the light of a label."""
         return np.log(max(self.totals[label], 1e-300))
+
+    def merged(self, groups):
+        """The same with each group of labels as one segment, which has the first of them."""
+        names = np.arange(len(self.totals))
+        places, totals, ratio = list(self.places), self.totals.copy(), self.ratio.copy()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variance = np.where(self.ratio > 0, (self.totals / self.ratio) ** 2, 0.0)
+        for group in groups:
+            leader = group[0]
+            names[group] = leader
+            places[leader - 1] = _hull([self.places[label - 1] for label in group])
+            totals[leader] = self.totals[group].sum()
+            noise = np.sqrt(variance[group].sum())
+            ratio[leader] = totals[leader] / noise if noise > 0 else np.inf
+        labels = names.astype(self.labels.dtype)[self.labels]
+        return _Segments(labels, self.usable, places, totals, ratio)
 
 
 def _bare(data, variance, segments, label):
@@ -188,6 +224,25 @@ class _Model:
         return shape.parameters, shape.covariance, shape.point, self.light
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Galaxy:
+    """A galaxy whose light is divided among sources."""
+
+    rows: list  # Numbers of its sources.
+    pieces: list  # The `Cutout` of each, None without light; that of the largest has the template of the whole.
+    shares: np.ndarray  # Their parts of the light.
+    record: tuple | None  # What is known of the whole, None if templates are taken without error.
+    number: int = 0
+
+    def records(self):
+        """What is known of each piece, as `~miricigale.photometry.shapes.FITTED`."""
+        found = not_fitted(len(self.rows))
+        for k, (piece, share) in enumerate(zip(self.pieces, self.shares, strict=True)):
+            if piece is not None and self.record is not None:
+                found[k] = (*self.record, self.number, share)
+        return found
+
+
 class _Lights:
     """All sources of one image, whose pixels may hold light of each other."""
 
@@ -206,7 +261,11 @@ class _Lights:
         models = parallel_map(lambda one: self._draft(*one), drafts, executor=self.executor)
         population = self._population(models, sources)
         models = self._joined(models, sources, population)
-        for turn in range(_PASSES):
+        return self._refined(models, sources, population), population
+
+    def _refined(self, models, sources, population, first=0):
+        """Fit models again without the light of others; those that hold none of it in the first pass only."""
+        for turn in range(first, _PASSES):
             sum_of_all = self._paint(models)
 
             def again(one, sum_of_all=sum_of_all, turn=turn):
@@ -221,7 +280,145 @@ class _Lights:
                 return self._model(label, xy, others, population, model)
 
             models = parallel_map(again, zip(models, sources, strict=True), executor=self.executor)
-        return models, population
+        return models
+
+    def rejoined(self, models, sources, population):
+        """
+        Fit galaxies that are divided into several segments as what they are, and divide their light.
+
+        Parameters
+        ----------
+        models, sources, population
+            As `fit` returns and takes them.
+
+        Returns
+        -------
+        models : list
+            Those of all sources that are whole; None for pieces.
+        galaxies : list of `_Galaxy`
+            Galaxies of several pieces, and sources whose profile reaches over those of others although it touches
+            none of them.
+        """
+        labels = [label for label, _ in sources]
+        before, groups, lights = list(models), [], self
+        # what has no peak of its own first: its profile is no evidence against others
+        for find in [*[continued_groups] * _PASSES, *[claimed_groups] * _PASSES]:
+            found = find(models, sources, lights.segments, *lights.as_seen)
+            if not found:
+                continue
+            groups = joined_groups(groups, found)
+            new = set(itertools.chain(*found))
+            lights = self._of_galaxies([[labels[k] for k in group] for group in groups])
+            changed = [group for group in groups if not new.isdisjoint(group)]
+            models, sources = lights._put_together(models, sources, population, changed)
+        reaching = reaching_over(models, sources, lights.segments, *lights.as_seen)
+        members = {group[0]: group for group in groups} | {
+            k: [k] for k in reaching if k not in {group[0] for group in groups}
+        }
+        galaxies = []
+        for leader, group in members.items():
+            galaxy = None
+            if models[leader] is not None:
+                of_group = [labels[k] for k in group]
+                galaxy = self._divided(models[leader], group, of_group, cut=leader in reaching)
+            if galaxy is None:
+                # as they were before
+                for k in group:
+                    models[k] = before[k]
+            else:
+                models[leader] = None
+                galaxies.append(dataclasses.replace(galaxy, number=len(galaxies) + 1))
+        return models, galaxies
+
+    @property
+    def as_seen(self):
+        """Variance, labels of sources, and the smoothed image with its noise: as `continued_groups` takes them."""
+        return self.variance, self.others, (self.light, _GAIN)
+
+    def _of_galaxies(self, groups):
+        """The same sources, groups of labels as one segment each."""
+        lights = copy.copy(self)
+        lights.segments = self.segments.merged(groups)
+        lights.others = lights.segments.ratio >= _OTHER_SNR
+        return lights
+
+    def _put_together(self, models, sources, population, groups):
+        """Models and sources with those of each group (row numbers) in its first row."""
+        models, sources = list(models), list(sources)
+        gone = {sources[k][0] for group in groups for k in group}
+        for group in groups:
+            leader = group[0]
+            label = sources[leader][0]
+            for k in group:
+                models[k] = None
+            place = self.segments.places[label - 1]
+            inside = self.segments.labels[place] == label
+            y, x = np.unravel_index(
+                np.argmax(np.where(inside, self.light[place], -np.inf)), inside.shape
+            )
+            sources[leader] = label, np.array([x, y]) + _corner(place)
+            models[leader] = self._draft(*sources[leader], nodes=False)
+        for k, model in enumerate(models):
+            if model is not None and not gone.isdisjoint(model.labels):
+                # profiles of pieces were no good neighbors
+                models[k] = dataclasses.replace(model, labels=(), beside=None)
+        fresh = {group[0] for group in groups if models[group[0]] is not None}
+        # overlapping profiles are fitted together, as all are
+        near = [
+            model if any(_overlap(model, models[k]) for k in fresh) else None for model in models
+        ]
+        for k, model in enumerate(self._joined(near, sources, population)):
+            if model is not near[k]:
+                models[k] = model
+                fresh.add(k)
+        sum_of_all = self._paint(models)
+        for k in sorted(fresh):
+            others = sum_of_all[models[k].around] - models[k].image
+            models[k] = self._model(*sources[k], others, population, models[k])
+        return self._refined(models, sources, population, first=1), sources
+
+    def _divided(self, whole, rows, labels, *, cut):
+        """
+        The `_Galaxy` of a model of several segments, None if nothing is left of its light.
+
+        ``rows`` and ``labels`` are those of the pieces. With ``cut`` it has no light on the segments of others.
+        """
+        template, place = whole.cutout, whole.around
+        reach = int(self.fitter.reach)
+        low, high = _corner(place)[::-1] - reach, [one.stop + reach for one in place]
+        if template is not None:
+            # as far as the profile is drawn
+            low = np.minimum(low, template.origin)
+            high = np.maximum(high, np.add(template.origin, template.data.shape))
+        corner, shape = tuple(low.tolist()), tuple((high - low).tolist())
+        if template is None:
+            parameters = np.array(whole.shape.parameters)
+            parameters[:2] += _corner(place) - low[::-1]
+            parameters[2] = POINT_SIZE
+            image = self.fitter.profiles(shape, parameters)[0]
+        else:
+            origin = np.subtract(template.origin, low)
+            image = self.fitter.convolve(template.data[None], origin, shape)[0]
+        image, core = np.array(image, float), np.zeros(shape, bool)
+        if template is not None and template.rest is not None:
+            rest = template.rest
+            image += padded(rest.data, rest.origin, corner, shape, 0.0)
+            core = padded(rest.data != 0, rest.origin, corner, shape, False)
+        seen = padded(self.segments.labels, (0, 0), corner, shape, 0)
+        total = whole.shape.flux / whole.light
+        if cut:
+            image[self.others[seen] & ~np.isin(seen, labels)] = 0.0
+            within = image.sum()
+            if not within > 0:
+                return None
+            image, total = image / within, total * within
+        variance = padded(self.variance, (0, 0), corner, shape, np.inf) / total**2
+        pieces, shares = divided(image, corner, seen, labels, core, variance)
+        record = None if cut else whole.record
+        if not cut:
+            largest = int(np.argmax(shares))
+            pieces[largest] = dataclasses.replace(pieces[largest], whole=template)
+        return _Galaxy(rows, pieces, shares, record)
 
     def _joined(self, models, sources, population):
         """The models, profiles that hold light of each other fitted together."""
@@ -397,6 +594,14 @@ def _hull(places):
     return tuple(slice(min(s.start for s in one), max(s.stop for s in one)) for one in sides)
 
 
+def _overlap(model, other):
+    """Whether the stamps of two models overlap; not if one is None."""
+    if model is None or other is None:
+        return False
+    pairs = zip(model.around, other.around, strict=True)
+    return all(one.start < two.stop and two.start < one.stop for one, two in pairs)
+
+
 def _within(place, around):
     """Where a rectangle is in another."""
     pairs = zip(place, around, strict=True)
@@ -417,7 +622,7 @@ def _around(place, xy, shape):
 def _smooth(data, variance, executor):
     """The image smoothed, and where its signal-to-noise is that of a core."""
     light, core = np.empty(data.shape, np.float32), np.empty(data.shape, bool)
-    rim, gain = round(16 * _WIDTH) + 1, 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
+    rim = round(16 * _WIDTH) + 1
 
     def smooth(rows):
         first = max(rows.start - rim, 0)
@@ -430,7 +635,7 @@ def _smooth(data, variance, executor):
             for image, width in ((data, _WIDTH), (variance, 4 * _WIDTH))
         )
         light[rows] = found
-        core[rows] = (noise > 0) & (found > _CORE_SNR * gain * np.sqrt(noise))
+        core[rows] = (noise > 0) & (found > _CORE_SNR * _GAIN * np.sqrt(noise))
 
     parallel_map(smooth, chunks(len(data), 256), executor=executor)
     return light, core

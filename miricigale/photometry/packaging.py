@@ -10,7 +10,7 @@ from astropy.nddata import StdDevUncertainty
 from astropy.table import QTable
 
 from miricigale.instrument.image import Image
-from miricigale.photometry.diagnostics import source_flags
+from miricigale.photometry.diagnostics import canceling, source_flags
 from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.fit_errors import fit_covariances
 from miricigale.photometry.flags import ForcedFlags
@@ -81,6 +81,9 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     xy = np.concatenate([catalog.xy, new_xy])
     near = unexplained_neighbors(diagnostics.peaks, xy + fit.displacement(xy), flux)
     flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    seen = np.full(n_all, np.nan)
+    seen[place[main]] = diagnostics.seen[main]
+    flags[canceling(flux, flux_err[0], seen)] |= int(ForcedFlags.CANCELING)
     chi2[place[main]] = diagnostics.chi2[main]
     left[place[main]] = diagnostics.residual_fraction[main]
     columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage, "chi2": chi2}

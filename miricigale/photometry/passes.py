@@ -165,7 +165,9 @@ class _More:
     def _centers(self, double):
         """Positions of sources: of the catalog, or of their profiles where those are surely elsewhere."""
         xy, fitted = self.catalog.xy[self.catalog.near[double]], self.catalog.fitted[double]
-        rows = np.flatnonzero(np.isfinite(fitted["parameters"][:, 0]))
+        # what is fitted to a piece of a galaxy is the whole of it
+        whole = fitted["galaxy"] == 0
+        rows = np.flatnonzero(np.isfinite(fitted["parameters"][:, 0]) & whole)
         if len(rows):
             center = fitted["parameters"][rows, :2]
             place = pixel_to_pixel(self._first.arrays.wcs, self._grid_wcs, *xy[rows].T)

@@ -28,10 +28,21 @@ _NODES, _WIDER = 32, 1.4
 
 #: What is kept of the profile fitted to a source: its parameters with x and y on the whole image, the
 #: covariance of ln flux and parameters, the probability of a point, and the profile's part of the
-#: light of the template. NaN where nothing is known.
+#: light of the template. Of a piece of a galaxy that is divided into several segments, a number of that galaxy
+#: and the piece's share of its light (0 and 1 of all others). NaN where nothing is known.
 FITTED = np.dtype(
-    [("parameters", float, (6,)), ("covariance", float, (7, 7)), ("point", float), ("light", float)]
+    [
+        ("parameters", float, (6,)),
+        ("covariance", float, (7, 7)),
+        ("point", float),
+        ("light", float),
+        ("galaxy", float),
+        ("share", float),
+    ]
 )
+
+#: Ln radius (pixels) of what is drawn as a point.
+POINT_SIZE = -30.0
 
 #: Largest number of steps, and the gain in chi^2 below which the fit ends.
 _STEPS, _GAIN = 25, 0.1
@@ -113,6 +124,7 @@ def not_fitted(n):
     found = np.empty(n, FITTED)
     for name in FITTED.names:
         found[name] = np.nan
+    found["galaxy"], found["share"] = 0.0, 1.0
     return found
 
 
@@ -197,7 +209,7 @@ class ShapeFitter(ShapeModels):
         changes = inner.changes(beside)
         nodes = inner.nodes(parameters, flux, covariance[3:, 3:], mean, changes)
         start = parameters.copy()
-        start[2] = -30.0
+        start[2] = POINT_SIZE
         as_point = -np.inf
         # a point that is far worse in the same place need not be moved to the best one
         near = inner.misfit(start) < -2 * evidence + _FAR_BELOW

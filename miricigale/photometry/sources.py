@@ -315,6 +315,10 @@ class SourceTemplates:
             values = [getattr(one, name) for one in parts]
             if all(one is not None for one in values):
                 rows[name] = np.concatenate(values)
+        # numbers of divided galaxies are those of their part
+        parts_of = np.repeat(np.arange(len(parts)), [len(one) for one in parts])
+        number = rows["fitted"]["galaxy"]
+        number += np.where(number > 0, parts_of * number.max(initial=0.0), 0.0)
         return cls(
             **rows, sky=joined_sky([one.sky for one in parts]),
             light=sum((one.light for one in parts), ()),

@@ -9,7 +9,7 @@ from miricigale.photometry._core.shape_fits import draw_curves
 from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.shape_models import ShapeModels
-from miricigale.photometry.shapes import normal_nodes
+from miricigale.photometry.shapes import POINT_SIZE, normal_nodes
 
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
 #: widths of the PSF.
@@ -128,7 +128,7 @@ class TemplateChanges:
         ]
         # more or less of the light may be in the middle than in the other band, unless a point on top of it
         # is that light: the center is open only then
-        middle = self._target.profiles(shape, [*parameters[:2], -30.0, 0.0, 0.0, 0.0])[0]
+        middle = self._target.profiles(shape, [*parameters[:2], POINT_SIZE, 0.0, 0.0, 0.0])[0]
         middle = middle - self._blurred(rest.data)
         middle -= self._target.convolve(profile.data[None], profile.origin - corner, shape)[0]
         seen = self._size_scatter**2 * np.sum(middle**2) > least**2 * power
@@ -138,6 +138,13 @@ class TemplateChanges:
         weight = 1.0 - self._blurred(template) / power
         each = cutout.noise / max(np.count_nonzero(core), 1)
         return changes, float(each * np.sum(weight[core] ** 2))
+
+    def pixel_noise(self, cutout):
+        """Variance of ln flux by the noise of a cutout's pixels."""
+        template = self._blurred(cutout.data.astype(float))
+        seen = cutout.data != 0
+        weight = 1.0 - self._blurred(template) / np.sum(template**2)
+        return float(cutout.noise * np.mean(weight[seen] ** 2))
 
     def _blurred(self, images):
         """Images, (..., ny, nx), as blurred as the image is beside the high-resolution one."""

@@ -27,7 +27,7 @@ from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf, prior
 @stage(
     "templates",
     "templates of the sources",
-    version=2,
+    version=3,
     needs=("highres",),
     sections=("highres.filter", "highres.pixel_scale"),
     units=study_patches,
@@ -44,7 +44,7 @@ def make_templates(context, patch):
 @stage(
     "photometry",
     "forced photometry",
-    version=6,
+    version=7,
     needs=("mosaics", "highres", "kernels", "templates"),
     sections=(*KERNEL, "photometry.method"),
     resources=IMAGE_RESOURCES,
