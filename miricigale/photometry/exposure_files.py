@@ -49,12 +49,14 @@ class ExposureInputs(Inputs):
 
     @property
     def labels(self):
-        """As of `Inputs`, with the names of the exposures."""
+        """As of `Inputs`, with the names of the exposures, without that of their kind of product."""
         labels = []
         for band, rows in self.groups.items():
             many_bands = len(self.groups) > 1
             for k in rows:
                 name = Path(str(self.images[k].path)).name.partition(".")[0]
+                # models and residuals are no products of JWST
+                name = name.removesuffix("_cal").removesuffix("_crf")
                 parts = [short_band(band)] if many_bands else []
                 if len(rows) > 1:
                     parts.append(name)

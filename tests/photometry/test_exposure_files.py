@@ -74,7 +74,7 @@ def test_exposures_of_one_filter_are_fitted_together(files, tmp_path):
     assert np.abs((table[BAND].value - files.flux) / error).max() < 4
     for k, file in enumerate(files.images):
         model, residual = (
-            read_image(path.with_name(f"{name}_dither{k}_cal.fits")) for name, path in paths.items()
+            read_image(path.with_name(f"{name}_dither{k}.fits")) for name, path in paths.items()
         )
         image = file.read()
         assert_array_equal(residual.mask, image.mask)
