@@ -57,7 +57,6 @@ def header(exposure, *, filename="", start=None):
         "FILENAME": filename, "FILTER": name.upper(), "READPATT": exposure.readout,
         "TARG_RA": where["RA_REF"], "TARG_DEC": where["DEC_REF"], "APERNAME": f"MIRIM_{where['SUBARRAY']}",
         "NINTS": n_int, "INTEND": n_int, "NGROUPS": exposure.n_groups, "NFRAMES": exposure.n_frames,
-        "FRMDIVSR": exposure.n_frames,
         "NSAMPLES": 9 if exposure.readout.startswith("SLOW") else 1,
         "EXPOSURE": f"{number:05d}", "PATT_NUM": number,
         **{name: time.to_value("s") for name, time in times.items()},
@@ -67,10 +66,15 @@ def header(exposure, *, filename="", start=None):
         **{f"PC{i + 1}_{j + 1}": float(matrix[i, j]) for i, j in np.ndindex(2, 2)},
     }  # fmt: skip
     parts = declared("miricigale.detector", "level1b.toml")
-    return tuple(
+    primary, science = (
         fits.Header([(key, values.get(key, value), text) for key, (value, text) in part.items()])
         for part in parts.values()
     )
+    if exposure.n_frames > 1:
+        # by which the sum of frames was divided: the pipeline scales what differs from NFRAMES
+        card = ("FRMDIVSR", exposure.n_frames, "divisor of the sum of frames in a group")
+        primary.insert("NFRAMES", card, after=True)
+    return primary, science
 
 
 def keywords(exposure):
