@@ -16,7 +16,6 @@ _KNOWN = (
 def fit(args):
     """Fit a catalog."""
     from miricigale.fitting.classes import fit_classes, write_table
-    from miricigale.fitting.page import fit_page
     from miricigale.utils.exceptions import OtherResultsError
 
     hdu = int(args.hdu) if (args.hdu or "").isdigit() else args.hdu
@@ -35,6 +34,9 @@ def fit(args):
                 executor=executor,
                 progress_bar=not args.no_progress,
             )
+        # kernels are loaded after the files were checked
+        from miricigale.fitting.page import fit_page
+
         kind = ".parquet" if args.photometry.suffix.lower() == ".parquet" else ".fits"
         table = args.output / f"table{kind}"
         write_table(found, table, overwrite=True)

@@ -7,11 +7,10 @@ from miricigale.injection.ramps import Exposures
 from miricigale.injection.settings import InjectionSettings
 from miricigale.injection.stages import run_injection
 from miricigale.reduction import Reducer
-from miricigale.utils.interactive import Interactive, checked_calls
+from miricigale.utils.interactive import Interactive
 from miricigale.utils.units import ANGLE
 
 
-@checked_calls
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Injection(Interactive, InjectionSettings):
     """

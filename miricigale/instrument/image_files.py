@@ -89,6 +89,11 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     >>> write_image(image, "image.fits", planes={"dq": np.zeros((4, 4), np.int64)})  # doctest: +SKIP
     """
     check_product_name(path, WRITER)
+    write_planes(image, path, planes=planes, rounded=rounded, overwrite=overwrite)
+
+
+def write_planes(image, path, *, planes=None, rounded=False, overwrite=False):
+    """Write what `write_image` writes, under any name: the files of a study are read by the package alone."""
     if image.wcs is not None:
         header = image.wcs.to_header(relax=True)
     else:

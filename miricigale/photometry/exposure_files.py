@@ -5,7 +5,6 @@ import dataclasses
 import warnings
 from pathlib import Path
 
-from miricigale.photometry.exposure_kernels import ExposureKernels
 from miricigale.photometry.file_inputs import Inputs, Measurement, Pixels, file_kernel, short_band
 from miricigale.photometry.kernel_files import image_psf
 from miricigale.utils.exceptions import PhotometryWarning, argument_error
@@ -114,6 +113,9 @@ class ExposureInputs(Inputs):
 
     def _kernels(self, rows):
         """Kernels of some exposures: of files, or models by place and roll."""
+        # PSFs are heavy, and files are checked before
+        from miricigale.photometry.exposure_kernels import ExposureKernels
+
         files = [self.images[k] for k in rows]
         has_own = [self.kernels[k] is not None or self.images[k].psf is not None for k in rows]
         modeled = files[0].header.filter.startswith("miri.") and not any(has_own)

@@ -54,7 +54,8 @@ names = ("tau", "age", "ebv", "alpha")
 axes = {name: SEDModel.yang2021_axes("quick")[name] for name in names}
 axes["redshift"] = np.unique(np.round(photometry["redshift"], 2))
 model = SEDModel.yang2021(agn=False)
-settings = GridSettings(redshift_tolerance=0.01)
+# on the nodes, as studies fit their input: the model has to be one that the grid has
+settings = GridSettings(redshift_tolerance=0.01, interpolate=0)
 fitter = BayesFitter(model, bands, axes=axes, settings=settings)
 spectra = fitter.fit(photometry, redshift="redshift")
 

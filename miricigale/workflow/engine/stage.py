@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from astropy.table import QTable
 
-from miricigale.instrument.image_files import read_image, write_image
+from miricigale.instrument.image_files import read_image, write_planes
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import data_error, warn
 from miricigale.utils.folder import FileFolder
@@ -285,7 +285,7 @@ class Context:
 
     def save_image(self, name, image, **planes):
         """Write an image, rounded far below its noise, and further planes."""
-        return self.save(name, lambda path: write_image(image, path, planes=planes, rounded=True))
+        return self.save(name, lambda path: write_planes(image, path, planes=planes, rounded=True))
 
     def image(self, name, *planes):
         """Read an image (and planes) that an earlier stage wrote."""

@@ -11,6 +11,8 @@ error.
 # with models that have neither: the difference stands for that of real galaxies and models. Photometric errors are
 # 3 %.
 
+import warnings
+
 import astropy.units as u
 import matplotlib.pyplot as plt
 import numpy as np
@@ -18,6 +20,7 @@ from astropy.table import QTable
 
 from miricigale import BayesFitter, FilterSet, SEDModel
 from miricigale.fitting import measure_template_error
+from miricigale.utils.exceptions import FitWarning
 
 bands = ["acs.f435w", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w"]
 bands += [
@@ -41,8 +44,10 @@ for band in bands:
 
 # %%
 # Start with a model error of 10 %, fit at the known redshifts, and measure the error that the residuals need.
-# Repeat with what was found. Use one half of the sample here and test on the other.
+# Repeat with what was found. Use one half of the sample here and test on the other. Fits warn of bands that
+# scatter by more than the errors in use; here that is what is measured.
 
+warnings.filterwarnings("ignore", "fluxes scatter", FitWarning)
 model = SEDModel.yang2021(agn=False)
 grid = model.grid(SEDModel.yang2021_axes("galaxy"), bands)
 half = photometry[: n // 2]
