@@ -22,7 +22,7 @@ from astropy.table import QTable
 from miricigale.cigale import read_cigale_catalog
 from miricigale.filters import read_catalog_photometry
 from miricigale.fitting import BayesFitter, compare_classes
-from miricigale.fitting.classes import fit_classes, write_table
+from miricigale.fitting.catalogs.classes import fit_classes, write_table
 from miricigale.sed import SED, SEDModel, quasar_axes, template_grid
 
 BANDS = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2"]

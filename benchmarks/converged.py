@@ -21,7 +21,7 @@ import numpy as np
 from ceers import sample
 
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SurveyCalibration
-from miricigale.fitting.continuation import Continuation
+from miricigale.fitting.grid.continuation import Continuation
 from miricigale.sed import SEDModel
 
 QUANTITIES = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")

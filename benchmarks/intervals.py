@@ -22,7 +22,7 @@ from astropy.table import QTable
 from fit import loop_time
 
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings
-from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.sed import SEDModel
 
 BANDS = [

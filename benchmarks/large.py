@@ -34,7 +34,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting import BayesFitter, GridSettings, fit_file, open_results
-from miricigale.fitting.page import fit_page
+from miricigale.fitting.catalogs.page import fit_page
 from miricigale.sed import SEDModel
 from miricigale.utils.row_files import open_rows, write_rows
 

@@ -17,7 +17,7 @@ from astropy.stats import mad_std
 from astropy.table import Table
 
 from miricigale.photometry import ErrorSettings, MosaicFile
-from miricigale.photometry.from_files import measure_files
+from miricigale.photometry.commands.from_files import measure_files
 
 BINS = ((-np.inf, 3), (3, 5), (5, 10), (10, 30), (30, np.inf))
 

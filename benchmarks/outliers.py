@@ -21,7 +21,7 @@ from fit import loop_time
 
 from miricigale import BayesFitter, SEDModel
 from miricigale.fitting import GridSettings, SurveyCalibration
-from miricigale.fitting.posterior import cell_percentiles
+from miricigale.fitting.posterior.posterior import cell_percentiles
 from miricigale.sed import ModelGrid
 
 #: The exact sum is over the nodes.

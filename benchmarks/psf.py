@@ -26,8 +26,8 @@ from miricigale.photometry import (
     detect_sources,
     read_prior,
 )
-from miricigale.photometry.kernel_files import matching_kernel
-from miricigale.photometry.page import _empty_positions
+from miricigale.photometry.commands.kernel_files import matching_kernel
+from miricigale.photometry.commands.page import _empty_positions
 from miricigale.psf import (
     MatchingKernel,
     encircled_energy,

@@ -24,7 +24,7 @@ from astropy.stats import mad_std
 from ceers import row, sample
 
 from miricigale.fitting import BayesFitter, GridSettings, SurveyCalibration, leave_out
-from miricigale.fitting.template_error import pivots
+from miricigale.fitting.data.template_error import pivots
 from miricigale.sed import SEDModel
 
 EDGES = np.array([1.3, 1.6, 2.0, 2.4, 2.8, 3.2, 3.6, 4.2, 5.0, 7.0, 11.0])

@@ -41,7 +41,7 @@ from miricigale.fitting import (
     leave_out,
     red_dot_prior,
 )
-from miricigale.fitting.pulls import left_out_pulls
+from miricigale.fitting.results.pulls import left_out_pulls
 from miricigale.sed import ModelGrid, red_dot_axes, red_dots, template_grid
 
 ERRORS = {"model_error": 0.0, "template_error": SurveyCalibration.survey().template_error}

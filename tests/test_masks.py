@@ -219,7 +219,7 @@ def test_blanks_of_files_are_missing_fluxes(tmp_path, form):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_positions_and_redshifts_behind_a_mask_are_missing(kind):
-    from miricigale.fitting.priors import known_redshifts
+    from miricigale.fitting.posterior.priors import known_redshifts
 
     mask = np.arange(X.size) == HIDDEN
     table = as_table(

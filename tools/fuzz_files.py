@@ -97,13 +97,13 @@ def make_files(folder):
     from miricigale.filters import CatalogMap, read_catalog_photometry
     from miricigale.fitting import BayesFitter
     from miricigale.instrument import read_dithers
-    from miricigale.photometry.kernel_files import read_kernel
-    from miricigale.photometry.mosaics import read_mosaic
-    from miricigale.photometry.priors import read_prior
+    from miricigale.photometry.commands.kernel_files import read_kernel
+    from miricigale.photometry.detection.prior_catalog import read_prior
+    from miricigale.photometry.images.mosaics import read_mosaic
     from miricigale.planning import load_plan
     from miricigale.psf import filter_psf
     from miricigale.psf.files import read_psf
-    from miricigale.reduction.files import read_images
+    from miricigale.reduction.images.files import read_images
     from miricigale.scene import read_catalog
     from miricigale.sed import SED
     from miricigale.utils.table_files import write_table

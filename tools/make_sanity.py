@@ -18,10 +18,9 @@ from astropy.table import QTable
 from miricigale.instrument.image_files import read_image
 from miricigale.pages import cell_of, number
 from miricigale.sed import SEDModel
-from miricigale.workflow import Context, load_config
+from miricigale.workflow import Context, labels, load_config
 from miricigale.workflow.page import (
     band_figures,
-    labels,
     pictures,
     provenance,
     source_figures,

@@ -7,9 +7,9 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from miricigale.filters.band_names import band_filters, filter_of_band, is_line
-from miricigale.filters.given import given_filters
+from miricigale.filters.filter_arguments import given_filters
 from miricigale.utils.exceptions import CatalogWarning, data_error, warn
-from miricigale.utils.missing import negative_errors, plain_floats, without_codes
+from miricigale.utils.missing_values import negative_errors, plain_floats, without_codes
 from miricigale.utils.options import check_data
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column, read_ids

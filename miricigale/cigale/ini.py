@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import config_error, data_error
 from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
 
 _DECLARED = declared("miricigale.cigale", "pcigale.toml")
 #: Values of ``lim_flag``, those of older versions too.

@@ -11,7 +11,7 @@ from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.xray_bands import ALPHA_OX
 from miricigale.utils.exceptions import ConfigError, config_error
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.table_files import read_table
 
 

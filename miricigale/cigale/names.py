@@ -2,7 +2,7 @@
 
 import astropy.units as u
 
-from miricigale.utils.declared import declared
+from miricigale.utils.package_tables import declared
 
 #: What ``names.toml`` has.
 DECLARED = declared("miricigale.cigale", "names.toml")

@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting import FitFlags
-from miricigale.fitting.quantities import node_shares, put_draws
+from miricigale.fitting.posterior.quantities import node_shares, put_draws
 from miricigale.fitting.samplers.run import chi2_at
 from miricigale.utils.exceptions import FitWarning
 from miricigale.utils.parallel import chunks

@@ -9,7 +9,7 @@ from miricigale.cigale.modules import read_modules
 from miricigale.cigale.names import cigale_names
 from miricigale.cigale.setup import CigaleSetup
 from miricigale.filters.band_names import band_filters, xray_energies
-from miricigale.filters.given import given_filters
+from miricigale.filters.filter_arguments import given_filters
 from miricigale.utils.exceptions import CatalogWarning, ConfigError, config_error, warn
 from miricigale.utils.options import check_choice
 from miricigale.utils.outputs import check_output

@@ -21,7 +21,7 @@ from miricigale.sed.grid_spectra import row_values
 from miricigale.sed.xray_bands import with_xray_bands, xray_filter
 from miricigale.utils.exceptions import config_error
 from miricigale.utils.files import replacing
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns
 

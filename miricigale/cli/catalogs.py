@@ -15,7 +15,7 @@ _KNOWN = (
 
 def fit(args):
     """Fit a catalog."""
-    from miricigale.fitting.classes import fit_classes, write_table
+    from miricigale.fitting.catalogs.classes import fit_classes, write_table
     from miricigale.utils.exceptions import OtherResultsError
 
     hdu = int(args.hdu) if (args.hdu or "").isdigit() else args.hdu
@@ -35,7 +35,7 @@ def fit(args):
                 progress_bar=not args.no_progress,
             )
         # kernels are loaded after the files were checked
-        from miricigale.fitting.page import fit_page
+        from miricigale.fitting.catalogs.page import fit_page
 
         kind = ".parquet" if args.photometry.suffix.lower() == ".parquet" else ".fits"
         table = args.output / f"table{kind}"
@@ -43,7 +43,7 @@ def fit(args):
         page = fit_page(found, args.photometry, **chosen(args, "catalog_map z_spec"), hdu=hdu)
         page = page.write(args.output / "page.html", overwrite=True)
         if args.plots:
-            from miricigale.fitting.object_plots import write_plots
+            from miricigale.fitting.results.object_plots import write_plots
 
             ids = None if args.plots == ["all"] else args.plots
             options = {"overwrite": True, "progress_bar": not args.no_progress}
@@ -117,7 +117,7 @@ def images_of(args, paths, prefix=""):
 
 def photometry(args):
     """Measure images."""
-    from miricigale.photometry.from_files import measure_files
+    from miricigale.photometry.commands.from_files import measure_files
 
     *paths, prior = [*(args.image or ()), *args.positional, *(args.highres or ())] or [None]
     ways = bool(args.image) == bool(args.highres) != bool(args.positional)
@@ -171,8 +171,8 @@ def errors(args):
     import astropy.units as u
 
     from miricigale.photometry import MosaicFile, image_errors
-    from miricigale.photometry.kernel_files import image_psf
-    from miricigale.photometry.page import write_errors_page
+    from miricigale.photometry.commands.kernel_files import image_psf
+    from miricigale.photometry.commands.page import write_errors_page
     from miricigale.utils.outputs import check_output
     from miricigale.utils.table_files import write_table
 

@@ -7,7 +7,7 @@ _FILES = "mask saturation bias reset linearity dark gain read_noise flat photom"
 
 def reduce(args):
     """Reduce exposures."""
-    from miricigale.reduction.from_files import reduce_files
+    from miricigale.reduction.commands.from_files import reduce_files
     from miricigale.utils.options import check_data
 
     for path in args.files:

@@ -103,7 +103,7 @@ def show(args):
 def psf(args):
     """Write the PSF of a mosaic."""
     from miricigale.photometry import MosaicFile
-    from miricigale.photometry.kernel_files import image_psf
+    from miricigale.photometry.commands.kernel_files import image_psf
     from miricigale.psf import MODEL_FILTERS
 
     made = image_psf(MosaicFile(args.image, filter=args.filter, pa_aper=args.pa_aper))

@@ -42,7 +42,11 @@ def main(argv=None):
     logging.basicConfig(level=level, format="%(message)s", handlers=[handler])
     if not quiet:
         # what is compiled, and what is fitted, is said at any verbosity
-        for name in ("utils.compilation", "fitting.from_files", "fitting.class_names"):
+        for name in (
+            "utils.compilation",
+            "fitting.catalogs.from_files",
+            "fitting.catalogs.class_names",
+        ):
             logging.getLogger(f"miricigale.{name}").setLevel(logging.INFO)
     if args.version:
         from miricigale import __version__

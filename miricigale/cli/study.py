@@ -45,7 +45,7 @@ def run(args):
 def _show_cost(config, folder, until, again):
     """Print what a run takes, and do nothing."""
     from miricigale.workflow import StudyRunner, check_study, study_cost
-    from miricigale.workflow.stages import study_stages
+    from miricigale.workflow.stage_list import study_stages
 
     check_study(config)
     # names of stages and units are checked as in a run
@@ -124,7 +124,7 @@ def plan(args):
 
 def _bands_of(args, values):
     """Keys of the bands that were asked for: those that nothing else gives as in the CEERS exposures."""
-    from miricigale.instrument.figures import imager_filter
+    from miricigale.instrument.published_tables import imager_filter
     from miricigale.planning.config import ExposureSection
 
     names = [imager_filter(name) for name in args.bands]

@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.instrument import frame_time, imager_filters
-from miricigale.instrument.figures import filter_row, imager_filter, table
+from miricigale.instrument.published_tables import filter_row, imager_filter, table
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.units import to_array

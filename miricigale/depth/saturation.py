@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from miricigale.instrument import Exposure, electron_rate, miri_detector
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns
 

@@ -8,10 +8,10 @@ from astropy.time import Time
 
 from miricigale.filters import Filter
 from miricigale.instrument import background_level
-from miricigale.instrument.figures import filter_row, imager_filter
+from miricigale.instrument.published_tables import filter_row, imager_filter
 from miricigale.refdata import locate
 from miricigale.utils.caching import cached
-from miricigale.utils.optional import require
+from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array

@@ -31,7 +31,7 @@ from miricigale.detector.latent import checked_previous
 from miricigale.detector.ramp import Ramp
 from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, miri_detector
-from miricigale.instrument.figures import table
+from miricigale.instrument.published_tables import table
 from miricigale.utils.exceptions import DetectorWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance

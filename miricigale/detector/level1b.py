@@ -21,10 +21,10 @@ from astropy.time import Time, TimeDelta
 
 from miricigale.instrument import kept_keywords, placed_keywords
 from miricigale.instrument.asdf_extension import asdf_extension, bytes_table
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing
 from miricigale.utils.meta import plain_value
+from miricigale.utils.package_tables import declared
 
 _START = "2022-06-21T00:00:00"
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from miricigale.evaluation.estimates import Estimate, weighted_share
 from miricigale.evaluation.metrics import one_by_one
-from miricigale.utils.declared import declared
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_columns
 
 #: Names in order of rising fracAGN, and the limits between them.

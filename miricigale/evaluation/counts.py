@@ -4,9 +4,9 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.sed import COSMOLOGY
-from miricigale.utils.declared import declared
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, require_columns, unique_ids
 from miricigale.utils.units import FNU, LUMINOSITY, MASS, ab_magnitude, positive, to_array

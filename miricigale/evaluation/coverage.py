@@ -4,10 +4,10 @@ import numpy as np
 from scipy.stats import kstest
 
 from miricigale.evaluation.metrics import fraction_interval
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
 

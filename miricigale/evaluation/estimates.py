@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.evaluation.metrics import OUTLIER, fraction_interval, sigma_mad
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.random import check_seed, stream
 
 #: Values that are held at once: draws are made in pieces of this size.

@@ -4,7 +4,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.evaluation.estimates import bootstrap, median
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.units import WAVE, positive, to_array
 
 #: Rest wavelengths of the strong features of polycyclic aromatic hydrocarbons.

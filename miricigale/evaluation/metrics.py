@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 from astropy.stats import binom_conf_interval
 
-from miricigale.utils.missing import floats, without_mask
+from miricigale.utils.missing_values import floats, without_mask
 from miricigale.utils.options import check_that
 
 #: abs(dz) / (1 + z) above which a redshift is an outlier.

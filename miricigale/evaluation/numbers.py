@@ -10,8 +10,8 @@ from miricigale.evaluation.classes import (
     selection_quality,
 )
 from miricigale.evaluation.quantities import OF_FITS, REDSHIFT_BINS, measure
-from miricigale.utils.declared import declared
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
+from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, described_rows
 

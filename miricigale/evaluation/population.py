@@ -7,8 +7,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from miricigale.sed import stern2015_6um
-from miricigale.utils.declared import declared
 from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, require_columns, unique_ids
 from miricigale.utils.units import LUMINOSITY, MASS, positive, to_array

@@ -14,7 +14,7 @@ from miricigale.evaluation.metrics import OUTLIER
 from miricigale.evaluation.study import TruthResults
 from miricigale.evaluation.xray import half_complete, xray_luminosity_at, yang2021_xray_flux
 from miricigale.filters import Filter
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude

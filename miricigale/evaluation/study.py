@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, ab_magnitude
 

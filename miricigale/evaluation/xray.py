@@ -9,9 +9,9 @@ from scipy.special import expit, ndtr, ndtri
 
 from miricigale.evaluation.metrics import fraction_interval, one_by_one
 from miricigale.sed.xray import stern2015, xray_flux
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
+from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_columns
 
 _CGS = u.erg / u.s / u.cm**2

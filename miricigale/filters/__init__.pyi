@@ -4,8 +4,8 @@ from .band_names import find_filter as find_filter
 from .catalog_files import read_catalog_photometry as read_catalog_photometry
 from .catalog_map import CatalogMap as CatalogMap
 from .filter import Filter as Filter
+from .filter_arguments import as_filter as as_filter
 from .filter_set import FilterSet as FilterSet
 from .filter_set import filter_table as filter_table
-from .given import as_filter as as_filter
 from .photometry_table import as_photometry as as_photometry
 from .surveys import SURVEYS as SURVEYS

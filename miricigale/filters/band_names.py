@@ -4,8 +4,8 @@ import re
 
 from miricigale.filters.library import FILTERS, SEDPY, curve_folder
 from miricigale.utils.caching import cached
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.package_tables import declared
 
 # between the parts of a name, and the endings of the files of curves
 _BETWEEN = re.compile(r"[\s._/:-]+")

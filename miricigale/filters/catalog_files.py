@@ -12,7 +12,7 @@ from miricigale.filters.catalog_map import TRANSLATE_SUFFIXES, CatalogMap
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.files import reading
 from miricigale.utils.ids import counted_ids, warn_of_duplicates
-from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.missing_values import plain_floats, without_codes
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
 
@@ -123,7 +123,7 @@ def catalog_messages(lost, pieces, treatment="taken as missing, by the number th
 
 def codes_of(table, bands):
     """
-    Numbers of a table that look like codes for a missing value (`miricigale.utils.missing`).
+    Numbers of a table that look like codes for a missing value (`miricigale.utils.missing_values`).
 
     Parameters
     ----------

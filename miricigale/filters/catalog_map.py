@@ -24,7 +24,7 @@ from miricigale.utils.exceptions import (
     warn,
 )
 from miricigale.utils.ids import id_column, ids_and_missing
-from miricigale.utils.missing import (
+from miricigale.utils.missing_values import (
     is_code,
     negative_codes,
     negative_errors,

@@ -10,7 +10,7 @@ import numpy as np
 from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.files import packed_open, unpacked_size
 from miricigale.utils.meta import full_meta
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_data
 from miricigale.utils.table_files import TABLE_FORMATS, read_table
 from miricigale.utils.units import WAVE

@@ -10,7 +10,7 @@ from astropy.table import QTable
 
 from miricigale.filters.band_names import find_filter, known_filter
 from miricigale.filters.filter import UNCOVERED, Filter
-from miricigale.filters.given import as_filter
+from miricigale.filters.filter_arguments import as_filter
 from miricigale.filters.spectra import check_wave, spectrum_arrays
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.interactive import Interactive

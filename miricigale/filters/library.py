@@ -8,9 +8,9 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.refdata import Registry, citations, locate
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.options import check_data, check_names
+from miricigale.utils.package_tables import declared
 from miricigale.utils.units import WAVE
 
 _RESOURCE = "filters.sedpy"

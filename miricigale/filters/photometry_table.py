@@ -13,7 +13,7 @@ from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
 from miricigale.utils.exceptions import CatalogWarning, units_error, warn
 from miricigale.utils.ids import counted_ids, id_column
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table, error_column
 from miricigale.utils.units import FNU, flux_unit

@@ -4,7 +4,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import ModelWarning, argument_error, warn
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.units import FNU, WAVE, to_array
 

@@ -6,8 +6,8 @@ import types
 
 from miricigale.filters.band_names import find_filter
 from miricigale.filters.filter import Filter
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import error_column
 
 

@@ -6,18 +6,11 @@ from dataclasses import replace
 import numpy as np
 from astropy.utils.decorators import deprecated
 
+from miricigale.filters import as_photometry
 from miricigale.filters.band_names import known_filter
-from miricigale.fitting import fitted_bands
-from miricigale.fitting.defaults import (
-    DEFAULT,
-    axes_of,
-    chosen_calibration,
-    errors_and_priors,
-    models_and_bands,
-    own_curves,
-)
-from miricigale.fitting.grid_fit import GridFit
-from miricigale.fitting.likelihood import (
+from miricigale.filters.catalog_files import codes_of, warn_of_codes
+from miricigale.fitting.data import fitted_bands
+from miricigale.fitting.data.likelihood import (
     FitFlags,
     PhotometryReader,
     filter_names,
@@ -25,22 +18,33 @@ from miricigale.fitting.likelihood import (
     per_band,
     unused_bands,
 )
-from miricigale.fitting.priors import known_redshifts
-from miricigale.fitting.pulls import warn_of_pulls
-from miricigale.fitting.results import FitResults
-from miricigale.fitting.sample_flags import chi2_limit, chi2_step, with_high_chi2
+from miricigale.fitting.data.settings import GridSettings, SamplerSettings
+from miricigale.fitting.grid.grid_fit import GridFit
+from miricigale.fitting.posterior.priors import known_redshifts
+from miricigale.fitting.results.pulls import warn_of_pulls
+from miricigale.fitting.results.results import FitResults
+from miricigale.fitting.results.sample_flags import chi2_limit, chi2_step, with_high_chi2
 from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
-from miricigale.fitting.settings import GridSettings, SamplerSettings
+from miricigale.fitting.survey.defaults import (
+    DEFAULT,
+    axes_of,
+    chosen_calibration,
+    errors_and_priors,
+    models_and_bands,
+    own_curves,
+)
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.sed.presets import grid_name
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import FitWarning, argument_error, warn
+from miricigale.utils.ids import warn_of_duplicates
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
-from miricigale.utils.units import check_count
+from miricigale.utils.tables import error_column, read_ids
+from miricigale.utils.units import FNU, check_count
 
 logger = logging.getLogger(__name__)
 
@@ -132,7 +136,7 @@ class BayesFitter(Interactive):
         normalization of the likelihood counts. ``sigma`` of the results has that of the best model.
     outliers : float or dict of str to float, optional
         Of a grid: prior fraction of wrong fluxes and limits, for all bands or by filter, at least 0 and below 1.
-        Each is then a mixture of the stated error and a broad one (`miricigale.fitting.mixture`);
+        Each is then a mixture of the stated error and a broad one (`miricigale.fitting.grid.mixture`);
         ``outlier`` of the results, ``<band>_outlier`` in tables, is how likely a band is wrong. Not with
         ``compat``. ``rtol`` is then at least 1e-3, unless it is 0.
     calibration : `~miricigale.fitting.SurveyCalibration` or None, optional
@@ -167,11 +171,11 @@ class BayesFitter(Interactive):
         The calibration.
     grid : `~miricigale.sed.ModelGrid`
         The grid; None for a sampler.
-    priors : `~miricigale.fitting.priors.GridPriors` or dict
+    priors : `~miricigale.fitting.posterior.priors.GridPriors` or dict
         Priors of a grid, or that of each free parameter by name.
     n_bands_min : int
         Objects with fewer usable bands are not fitted.
-    backend : `~miricigale.fitting.grid_fit.GridFit` or `~miricigale.fitting.samplers.fit.SamplerFit`
+    backend : `~miricigale.fitting.grid.grid_fit.GridFit` or `~miricigale.fitting.samplers.fit.SamplerFit`
         What fits, with the priors and the derived quantities.
 
     Raises
@@ -475,7 +479,7 @@ class BayesFitter(Interactive):
             Bands that are not fitted are also in ``meta["fit"]["unused_bands"]`` of the results. And of numbers
             that look like codes for a missing value, such as -99 or 99 with an error of 99, by band and count. And
             of bands whose fluxes of S/N above 5, 30 at least, scatter about what the other bands predict by more
-            than 1.5 times their errors (`miricigale.fitting.pulls`).
+            than 1.5 times their errors (`miricigale.fitting.results.pulls`).
 
         Raises
         ------
@@ -501,9 +505,39 @@ class BayesFitter(Interactive):
         return with_high_chi2(results, chi2_limit(sample))
 
     __call__ = fit
-    _table_of = fitted_bands._table_of
-    _read_bands = fitted_bands._read_bands
-    _warn_of_bands = fitted_bands._warn_of_bands
+
+    def _table_of(self, photometry, unit=None):
+        """
+        The catalog by our names, fluxes without a unit in ``unit``, with what there is to warn of.
+
+        A band of ``filters`` that it lacks is a missing one of all objects.
+        """
+        table = as_photometry(photometry, self.filters or self.bands, units=unit)
+        lost = [name for name in self.filters or () if name not in table.colnames]
+        if lost and len(lost) < len(self.filters):
+            text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
+            warn(text, FitWarning)
+            table = table.copy(copy_data=False)
+            for name in lost:
+                table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
+        warn_of_duplicates(read_ids(table), "photometry")
+        warn_of_codes([codes_of(table, self._reader.fitted(table))], "photometry")
+        self._warn_of_bands(table)
+        return table
+
+    def _read_bands(self, photometry, bands):
+        """Photometry (`~miricigale.fitting.data.likelihood.FitData`) of bands, with zero points and its own
+        errors.
+        """
+        zero = dict.fromkeys(bands, 0.0)
+        return PhotometryReader(bands, bands, zero, zero, 1, self.zero_points).read(photometry)
+
+    def _warn_of_bands(self, photometry):
+        """Warn of bands that are not fitted, if the fitter does not name those that are."""
+        unused = unused_bands(photometry, self._reader.fitted(photometry))
+        if unused and self.filters is None:
+            text = "bands of the photometry that the grid lacks are not fitted"
+            warn(f"{text}: {', '.join(unused)}", FitWarning)
 
     def _fit_part(
         self, photometry, *, pairs, seed, parallel, chunk_size=None, repeated=None, **known

@@ -11,12 +11,12 @@ from miricigale.injection.light import light_on_file
 from miricigale.injection.population import fitted_shapes
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry import ForcedPhotometer, detect_sources
-from miricigale.photometry.arrays import nearest_values, pixel_scale
-from miricigale.photometry.catalogs import joined_sky
-from miricigale.photometry.file_inputs import Pixels
-from miricigale.photometry.kernel_files import image_psf
-from miricigale.photometry.packaging import new_ids
-from miricigale.photometry.repeated_pixels import own_pixels
+from miricigale.photometry.commands.file_inputs import Pixels
+from miricigale.photometry.commands.kernel_files import image_psf
+from miricigale.photometry.detection.catalogs import joined_sky
+from miricigale.photometry.fit.result_table import new_ids
+from miricigale.photometry.images.arrays import nearest_values, pixel_scale
+from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.psf import make_psf, psf_image, rotate_psf
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import match_sky
@@ -69,7 +69,7 @@ class PriorField:
 
     Parameters
     ----------
-    inputs : `~miricigale.photometry.file_inputs.Inputs`
+    inputs : `~miricigale.photometry.commands.file_inputs.Inputs`
         What the user measures: one image, the prior and all options.
     n_threads : int, optional
         Threads; they change nothing.
@@ -145,7 +145,7 @@ class PriorField:
         Returns
         -------
         measured : `Measured`
-        pixels : `~miricigale.photometry.file_inputs.Pixels`
+        pixels : `~miricigale.photometry.commands.file_inputs.Pixels`
         segments, catalog
             Of the prior, as the user's photometry takes them.
         """

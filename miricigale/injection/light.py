@@ -7,8 +7,8 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.instrument.sky_axes import grid_angle
-from miricigale.photometry.arrays import pixel_scale
-from miricigale.photometry.repeated_pixels import own_pixels
+from miricigale.photometry.images.arrays import pixel_scale
+from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.psf import make_psf, psf_image, rotate_psf
 from miricigale.scene import Scene
 from miricigale.utils.exceptions import PhotometryWarning

@@ -8,7 +8,7 @@ from miricigale.injection.results import BINNED_BY, QUESTIONS
 from miricigale.injection.trials import APART
 from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import new_figure
-from miricigale.utils.declared import declared
+from miricigale.utils.package_tables import declared
 from miricigale.utils.units import FNU
 
 #: Colors and names of the two questions in figures.

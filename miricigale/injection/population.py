@@ -6,12 +6,12 @@ from astropy.table import QTable
 from scipy.ndimage import find_objects
 
 from miricigale.photometry import SourceTemplates
-from miricigale.photometry.arrays import image_arrays, pixel_scale
-from miricigale.photometry.cutouts import own_segments
-from miricigale.photometry.shape_models import ShapeModels
+from miricigale.photometry.detection.cutouts import own_segments
+from miricigale.photometry.images.arrays import image_arrays, pixel_scale
+from miricigale.photometry.shapes.shape_models import ShapeModels
 from miricigale.scene import as_sources
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import plain_floats
+from miricigale.utils.missing_values import plain_floats
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import require_columns

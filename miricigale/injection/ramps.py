@@ -12,7 +12,7 @@ from miricigale.injection.light import light_on_image
 from miricigale.instrument import DQ
 from miricigale.psf import miri_psf
 from miricigale.reduction import RampFit, Reducer, reduce_files
-from miricigale.reduction.assumed import maps_of
+from miricigale.reduction.references.detector_model import maps_of
 from miricigale.reduction.results import rate_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import open_fits

@@ -10,9 +10,9 @@ from astropy.table import QTable
 
 from miricigale.injection.completeness import CompletenessCurve
 from miricigale.injection.trials import PLACES
-from miricigale.utils.declared import declared
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_choice
+from miricigale.utils.package_tables import declared
 from miricigale.utils.units import FNU
 
 #: What tables may be binned by.

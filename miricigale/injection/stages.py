@@ -24,12 +24,12 @@ from miricigale.injection.trials import (
     run_trial,
 )
 from miricigale.photometry import DetectionPreset, MosaicFile
-from miricigale.photometry.file_inputs import Inputs
+from miricigale.photometry.commands.file_inputs import Inputs
 from miricigale.psf import read_psf
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import as_table
 from miricigale.utils.units import ab_magnitude
@@ -103,7 +103,7 @@ class Task:
 
     Parameters
     ----------
-    inputs : `~miricigale.photometry.file_inputs.Inputs` or None
+    inputs : `~miricigale.photometry.commands.file_inputs.Inputs` or None
         What is measured on a prior; None without one.
     image : `~miricigale.photometry.MosaicFile`
         The image.

@@ -17,7 +17,7 @@ from miricigale.injection.population import (
 )
 from miricigale.instrument.image import Image
 from miricigale.photometry import ForcedFlags, detect_sources
-from miricigale.photometry.arrays import pixel_scale
+from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
@@ -169,7 +169,7 @@ def _negative(image):
 
 def _empty_pulls(result, field, seed):
     """Flux over error of points where the measurement left no light."""
-    from miricigale.photometry.page import empty_pulls
+    from miricigale.photometry.commands.page import empty_pulls
     from miricigale.psf import MatchingKernel
 
     if field.has_prior:

@@ -21,7 +21,6 @@ from .exposure import frame_pattern as frame_pattern
 from .exposure import frame_time as frame_time
 from .exposure import frames_per_group as frames_per_group
 from .exposure import readout_patterns as readout_patterns
-from .figures import imager_filters as imager_filters
 from .header_wcs import as_wcs as as_wcs
 from .history import REFERENCES as REFERENCES
 from .history import ExposureHistory as ExposureHistory
@@ -44,6 +43,7 @@ from .photometric import electron_rate as electron_rate
 from .photometric import electrons_per_brightness as electrons_per_brightness
 from .photometric import photmjsr as photmjsr
 from .photometric import psf_fwhm as psf_fwhm
+from .published_tables import imager_filters as imager_filters
 from .siaf import Aperture as Aperture
 from .siaf import aperture as aperture
 from .siaf import attitude_matrix as attitude_matrix

@@ -19,7 +19,7 @@ from miricigale.instrument.siaf import attitude_matrix, unit_vector, vector_angl
 from miricigale.instrument.sky_axes import pixel_to_radec
 from miricigale.instrument.wcs import scaled_fit
 from miricigale.utils.exceptions import file_errors
-from miricigale.utils.optional import require
+from miricigale.utils.optional_packages import require
 
 #: By which the official pipeline recognizes a file; it says nothing.
 _STUB = (

@@ -1,8 +1,8 @@
 """The exposures of the survey CEERS."""
 
 from miricigale.instrument.exposure import Exposure
-from miricigale.utils.declared import declared
 from miricigale.utils.options import check_names
+from miricigale.utils.package_tables import declared
 
 _COUNTS = declared("miricigale.instrument", "ceers.toml")
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from numpy.polynomial import polynomial as poly
 
-from miricigale.instrument.figures import filter_row, imager_filter, table
+from miricigale.instrument.published_tables import filter_row, imager_filter, table
 from miricigale.instrument.siaf import aperture, imager_columns
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
-from miricigale.instrument.figures import table
+from miricigale.instrument.published_tables import table
 from miricigale.instrument.siaf import aperture, imager_columns, vector_angles
 from miricigale.instrument.wcs import tangent_offset
 from miricigale.utils.caching import cached

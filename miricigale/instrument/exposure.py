@@ -10,8 +10,8 @@ from astropy.coordinates import SkyCoord
 
 from miricigale.instrument.detector import miri_detector
 from miricigale.instrument.dithers import dither_offsets
-from miricigale.instrument.figures import imager_filter, table
 from miricigale.instrument.photometric import electron_rate
+from miricigale.instrument.published_tables import imager_filter, table
 from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3, v2v3_to_sky
 from miricigale.instrument.wcs import imager_wcs, tangent_offset
 from miricigale.utils.exceptions import argument_error

@@ -7,8 +7,8 @@ import numpy as np
 from astropy.time import Time
 
 from miricigale.instrument.keywords import steps_done
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.package_tables import declared
 
 _STEPS = declared("miricigale.instrument", "keywords.toml")["references"].items()
 #: References in the order in which they are used, with the step after which each is not needed any more.

@@ -4,9 +4,9 @@ import re
 
 from astropy.io import fits
 
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.options import check_data
+from miricigale.utils.package_tables import declared
 
 #: Read-out patterns by the names that they had before the launch.
 READOUT_NAMES = {"FAST": "FASTR1", "SLOW": "SLOWR1"}

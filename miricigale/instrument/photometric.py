@@ -5,7 +5,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.instrument.detector import miri_detector
-from miricigale.instrument.figures import filter_row, table
+from miricigale.instrument.published_tables import filter_row, table
 from miricigale.refdata import locate
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error

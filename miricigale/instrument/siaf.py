@@ -12,7 +12,7 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates.matrix_utilities import rotation_matrix
 
-from miricigale.instrument.figures import table
+from miricigale.instrument.published_tables import table
 from miricigale.utils.caching import cached
 from miricigale.utils.options import check_names
 

@@ -8,7 +8,7 @@ import numpy as np
 from miricigale.pages import Page, SectionWriter, number, sentence
 from miricigale.planning.exposures import background_options
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, new_figure, plain_text
-from miricigale.utils.declared import declared
+from miricigale.utils.package_tables import declared
 from miricigale.workflow.background import background_text
 from miricigale.workflow.page.study_figures import redshift_figure
 

@@ -3,7 +3,7 @@
 import numpy as np
 import scipy
 
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 
 _IN_STAMP = 0.995  # of the light lies within the isophote that a stamp holds

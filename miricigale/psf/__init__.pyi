@@ -16,8 +16,8 @@ from .field import miri_psf_grid as miri_psf_grid
 from .field import psf_at as psf_at
 from .field import psf_grid as psf_grid
 from .files import read_psf as read_psf
-from .given_kernels import as_kernel as as_kernel
 from .hst import hst_psf as hst_psf
+from .kernel_arguments import as_kernel as as_kernel
 from .kernel_field import KernelField as KernelField
 from .kernels import MatchingKernel as MatchingKernel
 from .miri import MIRI_PIXEL_SCALE as MIRI_PIXEL_SCALE

@@ -9,7 +9,7 @@ from miricigale.psf.field import psf_at
 from miricigale.psf.miri import MIRI_PIXEL_SCALE
 from miricigale.psf.model import InstrumentPSF, PSFGrid
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.optional import require
+from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, to_array
 

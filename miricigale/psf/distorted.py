@@ -56,7 +56,7 @@ def undistorted_psf(psf):
     # light per cell, whose area is another
     factor = cell**2 * abs(np.linalg.det(inverse))
     data = _core.interpolate(np.asarray(psf.data), column, row) * factor
-    return psf.replaced(data, pixel_scale=MIRI_PIXEL_SCALE, origin=None)
+    return psf.replace(data, pixel_scale=MIRI_PIXEL_SCALE, origin=None)
 
 
 def imager_kernels(

@@ -10,8 +10,8 @@ from miricigale.instrument import imager_filters, psf_fwhm
 from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import enclosed_light, instrument_psf
-from miricigale.utils.declared import declared
 from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_columns
 from miricigale.utils.units import ANGLE, to_array
 

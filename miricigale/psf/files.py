@@ -8,10 +8,10 @@ from miricigale.instrument.sky_axes import grid_angle
 from miricigale.psf import _core
 from miricigale.psf.model import InstrumentPSF, make_psf
 from miricigale.utils.exceptions import PSFWarning, argument_error, data_error, warn
+from miricigale.utils.file_formats import register
 from miricigale.utils.files import file_place, open_fits, split_extension
 from miricigale.utils.options import check_that
 from miricigale.utils.store import open_parts, write_parts
-from miricigale.utils.unified import register
 from miricigale.utils.units import ANGLE, to_array
 
 #: Units of an `InstrumentPSF`'s quantities in files.

@@ -13,8 +13,8 @@ from miricigale.psf.field import psf_at
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.model import PSFGrid
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.file_formats import read_write
 from miricigale.utils.options import check_choice
-from miricigale.utils.unified import read_write
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -10,10 +10,10 @@ from miricigale.psf.files import fits_image
 from miricigale.psf.kernel_field import KernelField
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.utils.exceptions import data_error, file_errors
+from miricigale.utils.file_formats import register
 from miricigale.utils.files import open_fits, replacing, write_fits
 from miricigale.utils.meta import plain_value
 from miricigale.utils.store import native, open_parts, write_parts
-from miricigale.utils.unified import register
 from miricigale.utils.units import ANGLE
 
 #: Arrays of a `MatchingKernel` in files.

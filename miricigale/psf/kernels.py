@@ -11,13 +11,13 @@ from scipy.signal import fftconvolve
 
 from miricigale.instrument.image import Image
 from miricigale.psf.kernel_arrays import blended, convolved
+from miricigale.psf.kernel_inputs import named_psf, psf_pair, ready_arrays
 from miricigale.psf.model import instrument_psf
-from miricigale.psf.pairs import named_psf, psf_pair, ready_arrays
 from miricigale.psf.wiener import checked_square, choose, energy_error, energy_radii, wiener
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.file_formats import read_write
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_choice, check_that
-from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
 

@@ -11,9 +11,9 @@ from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
+from miricigale.utils.file_formats import read_write
 from miricigale.utils.files import write_fits
 from miricigale.utils.options import check_that
-from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
 #: Where a PSF's axes may stand: on the detector (angle on the sky not yet known) or the sky.

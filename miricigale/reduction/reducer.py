@@ -13,18 +13,17 @@ from miricigale.instrument import (
     as_wcs,
     miri_detector,
 )
-from miricigale.reduction.align import align_images, visit_of
-from miricigale.reduction.assumed import brightness_of, maps_of
-from miricigale.reduction.background import estimate_background, remove_background, subtractable
-from miricigale.reduction.calibration import calibrate
-from miricigale.reduction.combine import combine, drizzle, subtract_dithers
-from miricigale.reduction.files import opened, several
-from miricigale.reduction.images import own_grid, with_data
-from miricigale.reduction.reference_cache import ReferenceCache
-from miricigale.reduction.references import ReferenceFiles
-from miricigale.reduction.repeats import ExposureRecord
-from miricigale.reduction.results import rate_image
-from miricigale.reduction.settings import (
+from miricigale.reduction.combine.align import align_images, visit_of
+from miricigale.reduction.combine.combine import combine, drizzle, subtract_dithers
+from miricigale.reduction.images.files import opened, several
+from miricigale.reduction.images.images import own_grid, with_data
+from miricigale.reduction.images.repeats import ExposureRecord
+from miricigale.reduction.ramps.slopes import fit_slopes
+from miricigale.reduction.references.calibration import calibrate
+from miricigale.reduction.references.detector_model import brightness_of, maps_of
+from miricigale.reduction.references.reference_cache import ReferenceCache
+from miricigale.reduction.references.references import ReferenceFiles
+from miricigale.reduction.references.settings import (
     BACKENDS,
     KINDS,
     NEEDED,
@@ -32,9 +31,10 @@ from miricigale.reduction.settings import (
     MosaicSettings,
     RampSettings,
 )
-from miricigale.reduction.sky_flat import flattened
-from miricigale.reduction.slopes import fit_slopes
-from miricigale.reduction.stripes import remove_stripes
+from miricigale.reduction.results import rate_image
+from miricigale.reduction.sky.background import estimate_background, remove_background, subtractable
+from miricigale.reduction.sky.sky_flat import flattened
+from miricigale.reduction.sky.stripes import remove_stripes
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import (

@@ -9,12 +9,12 @@ from astropy.nddata import CCDData
 from miricigale.detector import Ramp
 from miricigale.detector.level1b import keywords
 from miricigale.instrument import Image, ImageFacts, kept_keywords
-from miricigale.reduction.assumed import history_of
-from miricigale.reduction.background import Background
-from miricigale.reduction.files import ImageFile
-from miricigale.reduction.image_writer import write_image
-from miricigale.reduction.images import exposure_values, flagged_image
-from miricigale.reduction.slopes import shares_charge
+from miricigale.reduction.images.files import ImageFile
+from miricigale.reduction.images.image_writer import write_image
+from miricigale.reduction.images.images import exposure_values, flagged_image
+from miricigale.reduction.ramps.slopes import shares_charge
+from miricigale.reduction.references.detector_model import history_of
+from miricigale.reduction.sky.background import Background
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import RATE

@@ -10,7 +10,7 @@ from astropy import config as _config
 
 from miricigale.refdata.registry import resource
 from miricigale.utils.configuration import conf
-from miricigale.utils.content import file_sha256
+from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import DataError, ReferenceWarning, data_error, warn
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.options import check_that

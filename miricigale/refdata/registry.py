@@ -3,8 +3,8 @@
 import dataclasses
 
 from miricigale.utils.caching import cached
-from miricigale.utils.declared import declared
 from miricigale.utils.options import check_names
+from miricigale.utils.package_tables import declared
 
 
 @dataclasses.dataclass(frozen=True)

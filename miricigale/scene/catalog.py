@@ -7,11 +7,11 @@ from astropy.table import QTable, Table
 from miricigale.filters.photometry_table import as_photometry
 from miricigale.filters.surveys import flux_bands, is_band
 from miricigale.profiles import SERSIC_INDEX_RANGE
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.ids import id_column, likely_ids
-from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.missing_values import plain_floats, without_codes
 from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import (
     Flags,

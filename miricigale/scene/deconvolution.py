@@ -4,7 +4,7 @@ import numpy as np
 import scipy.fft
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 
 

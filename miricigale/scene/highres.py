@@ -8,7 +8,7 @@ from astropy.nddata import StdDevUncertainty
 
 from miricigale.instrument import pixel_area_map
 from miricigale.scene.scene import Scene
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import positive
 

@@ -20,12 +20,12 @@ from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
-from miricigale.utils.missing import plain_floats
+from miricigale.utils.missing_values import plain_floats
 from miricigale.utils.options import check_kind, check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import Flags, described_columns
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 

@@ -8,7 +8,7 @@ from miricigale.filters import FilterSet
 from miricigale.sed import _core
 from miricigale.sed.component import ROLES
 from miricigale.utils.caching import cached
-from miricigale.utils.declared import declared
+from miricigale.utils.package_tables import declared
 
 #: Version of the numbers that follow from the components: raised when the chain, the derived
 #: quantities or the grids change, so that grids kept on the disk are made anew.

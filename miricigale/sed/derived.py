@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.sed.chain import COLOR_BANDS, COLORS, UV_WINDOWS
-from miricigale.utils.declared import declared
+from miricigale.utils.package_tables import declared
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from miricigale.filters.spectra import spectrum_arrays
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.caching import cached
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU
 

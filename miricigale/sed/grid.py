@@ -9,9 +9,9 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.file_formats import read_write, register
 from miricigale.utils.options import check_that
 from miricigale.utils.store import open_parts, write_parts
-from miricigale.utils.unified import read_write, register
 from miricigale.utils.units import Frozen, frozen_array
 
 _SPAN = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)um")

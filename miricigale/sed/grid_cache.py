@@ -12,7 +12,7 @@ from miricigale.refdata.lookup import cache_folder, fingerprint_of
 from miricigale.sed import chain
 from miricigale.sed.grid import ModelGrid
 from miricigale.utils.configuration import conf
-from miricigale.utils.content import content_sha256
+from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import DataError
 
 _log = logging.getLogger(__name__)

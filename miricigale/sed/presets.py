@@ -6,9 +6,9 @@ from astropy.utils.exceptions import AstropyDeprecationWarning
 from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.component import COMPONENTS
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error, warn
 from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
 
 #: Where a preset takes its libraries from.
 LIBRARIES = ("best", "bundled")

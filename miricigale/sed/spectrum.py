@@ -13,8 +13,8 @@ from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import full_meta
-from miricigale.utils.missing import floats
-from miricigale.utils.optional import require
+from miricigale.utils.missing_values import floats
+from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number, to_array

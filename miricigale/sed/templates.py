@@ -14,7 +14,7 @@ from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
 from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, file_errors, warn
 from miricigale.utils.meta import provenance
-from miricigale.utils.missing import floats, plain_floats
+from miricigale.utils.missing_values import floats, plain_floats
 from miricigale.utils.options import check_choice, check_data, check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_table

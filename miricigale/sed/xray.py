@@ -8,7 +8,7 @@ from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY, distance
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import without_mask
+from miricigale.utils.missing_values import without_mask
 from miricigale.utils.units import LUMINOSITY, to_array
 
 #: nu L_nu at 6 um that the samples of Stern 2015 span, roughly: Seyferts to luminous quasars.

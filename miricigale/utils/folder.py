@@ -6,7 +6,7 @@ import logging
 import operator
 from pathlib import Path, PurePosixPath
 
-from miricigale.utils.content import file_sha256
+from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import PARTIAL, replacing, writing
 from miricigale.utils.lock import FolderLock

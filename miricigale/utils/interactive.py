@@ -3,8 +3,8 @@
 import html
 import operator
 
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import sky_as_angles
 
 

@@ -8,7 +8,7 @@ from astropy.coordinates import SkyCoord
 from astropy.time import Time
 
 from miricigale.utils.exceptions import CatalogWarning, argument_error, units_error, warn
-from miricigale.utils.missing import floats, plain_floats, without_codes
+from miricigale.utils.missing_values import floats, plain_floats, without_codes
 from miricigale.utils.options import check_that
 
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"

@@ -7,7 +7,7 @@ from astropy.table import QTable
 
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import replacing
-from miricigale.utils.optional import require
+from miricigale.utils.optional_packages import require
 from miricigale.utils.positions import sky_as_angles
 from miricigale.utils.units import ANGLE, positive
 

@@ -11,11 +11,11 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from miricigale.utils.content import file_sha256
+from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import open_fits, reading, replacing, split_extension, unreadable
 from miricigale.utils.meta import plain_value
-from miricigale.utils.optional import require
+from miricigale.utils.optional_packages import require
 from miricigale.utils.table_files import (
     LDAC_HEADER,
     arrow_table,

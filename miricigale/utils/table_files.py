@@ -27,8 +27,8 @@ from miricigale.utils.files import (
 )
 from miricigale.utils.ids import ids_of_text, is_id_name
 from miricigale.utils.meta import fits_meta
-from miricigale.utils.missing import is_missing_word
-from miricigale.utils.optional import require
+from miricigale.utils.missing_values import is_missing_word
+from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
 from miricigale.utils.region_files import region_table

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error, units_error
-from miricigale.utils.missing import without_mask
+from miricigale.utils.missing_values import without_mask
 from miricigale.utils.options import check_that
 
 #: Units declared once; every array inside the package is in one of these.
@@ -74,7 +74,8 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     Parameters
     ----------
     value : `~astropy.units.Quantity`
-        Anything `~astropy.units.Quantity` accepts, masked or not (`miricigale.utils.missing.mask_of`); a bare
+        Anything `~astropy.units.Quantity` accepts, masked or not (`miricigale.utils.missing_values.mask_of`); a
+        bare
         number is refused unless ``unit`` is dimensionless.
     unit : `~astropy.units.Unit`
         The unit wanted.

@@ -8,6 +8,6 @@ from .engine.stage import Context as Context
 from .engine.stage import Stage as Stage
 from .engine.store import ProductStore as ProductStore
 from .patches import measure_patches as measure_patches
-from .stages import study_stages as study_stages
+from .stage_list import study_stages as study_stages
 from .study import check_study as check_study
 from .study import run_study as run_study

@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.instrument import imager_columns
-from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.grids import grid_of, patch_bands, study_patches
 from miricigale.workflow.stages.inputs import REDSHIFT_STEP, bright_sources, study_catalog

@@ -12,8 +12,8 @@ from scipy.ndimage import find_objects
 
 from miricigale import photometry
 from miricigale.instrument.sky_axes import grid_angle
-from miricigale.photometry.arrays import nearest_values, pixel_scale
-from miricigale.photometry.kernel_files import image_psf
+from miricigale.photometry.commands.kernel_files import image_psf
+from miricigale.photometry.images.arrays import nearest_values, pixel_scale
 from miricigale.profiles import sersic_radius
 from miricigale.psf import psf_image, rotate_psf
 from miricigale.scene import CatalogFlags, Cutout, check_catalog, deconvolve

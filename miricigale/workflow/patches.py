@@ -14,18 +14,23 @@ import numpy as np
 
 from miricigale import photometry
 from miricigale.pages import Link, Page, SectionWriter
-from miricigale.photometry.arrays import pixel_scale
-from miricigale.photometry.file_inputs import Inputs
-from miricigale.photometry.from_files import TABLE_KIND
-from miricigale.photometry.patches import PatchGrid, join_patches, measure_patch, patch_parts
-from miricigale.photometry.priors import read_catalog
+from miricigale.photometry.commands.file_inputs import Inputs
+from miricigale.photometry.commands.from_files import TABLE_KIND
+from miricigale.photometry.commands.patches import (
+    PatchGrid,
+    join_patches,
+    measure_patch,
+    patch_parts,
+)
+from miricigale.photometry.detection.prior_catalog import read_catalog
+from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.utils.caching import cached
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file, replacing
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_least
 from miricigale.utils.outputs import check_output
+from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.units import ANGLE, ab_magnitude, positive
 from miricigale.workflow.engine.runner import StudyRunner

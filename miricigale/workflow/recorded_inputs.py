@@ -9,7 +9,7 @@ import astropy.units as u
 
 from miricigale.instrument import DetectorProperties
 from miricigale.photometry import ErrorSettings, MemorySettings, MosaicFile
-from miricigale.photometry.file_inputs import Inputs
+from miricigale.photometry.commands.file_inputs import Inputs
 from miricigale.reduction import (
     BackgroundSettings,
     MosaicSettings,
@@ -92,7 +92,7 @@ def from_text(text):
 
 
 def inputs_text(inputs):
-    """Text of what is measured (`~miricigale.photometry.file_inputs.Inputs`)."""
+    """Text of what is measured (`~miricigale.photometry.commands.file_inputs.Inputs`)."""
     return as_text({one.name: getattr(inputs, one.name) for one in dataclasses.fields(inputs)})
 
 
@@ -108,7 +108,7 @@ def file_states(inputs, others=()):
 
     Parameters
     ----------
-    inputs : `~miricigale.photometry.file_inputs.Inputs`
+    inputs : `~miricigale.photometry.commands.file_inputs.Inputs`
         What is measured.
     others : iterable of path-like, optional
         Further files.

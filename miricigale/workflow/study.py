@@ -13,7 +13,7 @@ from miricigale.workflow.cost import disk_use
 from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.options import of_option
 from miricigale.workflow.sections import HighresSection
-from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.exposures import study_background, study_exposures
 from miricigale.workflow.stages.grids import grid_of
 from miricigale.workflow.stages.inputs import existing_bands, study_catalog

@@ -13,7 +13,7 @@ from helpers.errors import refuses
 from miricigale.filters import SURVEYS, CatalogMap, Filter, read_catalog_photometry
 from miricigale.filters.catalog_files import MappedRows, codes_of
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
-from miricigale.utils.missing import without_codes
+from miricigale.utils.missing_values import without_codes
 from miricigale.utils.row_files import open_rows
 
 BAND = "wfc3.f160w"

@@ -10,8 +10,8 @@ from scipy.stats import multivariate_normal, multivariate_t, qmc
 
 from helpers.grids import photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, _core
-from miricigale.fitting.adaptive import quasi_random, redshift_peaks
-from miricigale.fitting.quantities import DERIVED_LEVELS, draws_summary
+from miricigale.fitting.grid.adaptive import quasi_random, redshift_peaks
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, draws_summary
 from miricigale.sed import ModelGrid
 
 BANDS = tuple(f"band{i}" for i in range(6))
@@ -183,8 +183,8 @@ def test_names_and_places_in_a_catalog_are_no_matter(fitter, table, results):
 
 
 def test_what_is_not_converged_is_flagged(grid, table, monkeypatch):
-    monkeypatch.setattr("miricigale.fitting.adaptive._MOST_EACH", 1)
-    monkeypatch.setattr("miricigale.fitting.adaptive._LEAST_MOST", 512)
+    monkeypatch.setattr("miricigale.fitting.grid.adaptive._MOST_EACH", 1)
+    monkeypatch.setattr("miricigale.fitting.grid.adaptive._LEAST_MOST", 512)
     fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=1000))
     flags = fitter.fit(table).flags
     assert np.all(flags & int(FitFlags.NOT_CONVERGED))

@@ -16,7 +16,13 @@ from miricigale.fitting import (
     TemplateError,
     calibrate_bands,
 )
-from miricigale.fitting.band_errors import (
+from miricigale.fitting.catalogs.catalog_calibration import (
+    MAX_SOURCES,
+    SourceSample,
+    calibrate_file,
+)
+from miricigale.fitting.catalogs.from_files import calibrates_itself
+from miricigale.fitting.survey.band_errors import (
     DEFAULT_PRIOR,
     MIRI_PRIOR,
     PredictedFluxes,
@@ -25,8 +31,6 @@ from miricigale.fitting.band_errors import (
     long_instruments,
     prior_of_band,
 )
-from miricigale.fitting.catalog_calibration import MAX_SOURCES, SourceSample, calibrate_file
-from miricigale.fitting.from_files import calibrates_itself
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import OtherResultsError
 from miricigale.utils.row_files import open_rows
@@ -292,7 +296,7 @@ def test_a_catalog_on_disk_is_measured_once_and_by_pieces(
         for name in names:
             assert_allclose(found.bands[name], wanted[name], rtol=1e-9)
         assert calibrated.zero_points["nircam.f277w"] == found.bands["zero_point"][4]
-    monkeypatch.setattr("miricigale.fitting.catalog_calibration.calibrate_sample", None)
+    monkeypatch.setattr("miricigale.fitting.catalogs.catalog_calibration.calibrate_sample", None)
     again = calibrate_file(fitter, open_rows(path, 70), output, options=options)
     assert again.calibration.name == found.name
     # known redshifts, another catalog or other models are another fit

@@ -10,8 +10,8 @@ from numpy.testing import assert_array_less
 from scipy import stats
 
 from helpers.grids import cells, make_grid, node_fitter, photometry_table
-from miricigale.fitting.posterior import randomized_ranks
-from miricigale.fitting.quantities import DERIVED_LEVELS
+from miricigale.fitting.posterior.posterior import randomized_ranks
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS
 
 N = 3000
 

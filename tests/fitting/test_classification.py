@@ -21,8 +21,8 @@ from miricigale.fitting import (
     fit_file,
     red_dot_prior,
 )
-from miricigale.fitting.classes import red_dot_grid, write_table
-from miricigale.fitting.pulls import without_warnings
+from miricigale.fitting.catalogs.classes import red_dot_grid, write_table
+from miricigale.fitting.results.pulls import without_warnings
 from miricigale.sed import (
     SED,
     ModelGrid,

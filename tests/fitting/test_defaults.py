@@ -24,8 +24,8 @@ from miricigale.fitting import (
     fit_file,
     leave_out,
 )
-from miricigale.fitting.class_names import chosen_classes
-from miricigale.fitting.defaults import statement
+from miricigale.fitting.catalogs.class_names import chosen_classes
+from miricigale.fitting.survey.defaults import statement
 from miricigale.photometry import ErrorModel
 from miricigale.sed import SEDModel, presets
 from miricigale.utils.exceptions import FitWarning

@@ -17,7 +17,7 @@ from helpers.grids import (
     photometry_table,
 )
 from miricigale.fitting import GridSettings
-from miricigale.fitting import grid as engine_module
+from miricigale.fitting.grid import grid as engine_module
 
 #: As accurate as pruning leaves the sums.
 PRUNED = {"rtol": 1e-6, "atol": 1e-6, "std_rtol": 1e-4}

@@ -10,7 +10,7 @@ from scipy.stats import norm
 from helpers.errors import refuses
 from helpers.grids import draw_photometry, make_grid, node_fitter, photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, SamplerSettings, leave_out
-from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.sed import SEDModel
 from miricigale.sed.components import BC03, DelayedSFH
 from miricigale.utils.exceptions import CatalogWarning, FitWarning

@@ -22,10 +22,10 @@ from miricigale.fitting import (
     fit_catalog,
     open_results,
 )
-from miricigale.fitting.catalog_rows import open_catalog
-from miricigale.fitting.grid import GridEngine
-from miricigale.fitting.object_plots import write_plots
-from miricigale.fitting.page import fit_page
+from miricigale.fitting.catalogs.catalog_rows import open_catalog
+from miricigale.fitting.catalogs.page import fit_page
+from miricigale.fitting.grid.grid import GridEngine
+from miricigale.fitting.results.object_plots import write_plots
 from miricigale.sed import SEDModel, read_spectra, template_grid
 from miricigale.sed.foreground import band_extinction
 from miricigale.utils.exceptions import MiricigaleWarning
@@ -305,7 +305,7 @@ def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_p
     written = write_plots(results, tmp_path / "plots", table["id"][:2])
     assert [unquote(path.stem) for path in written] == table["id"][:2].tolist()
     refuses("no object with the id 'x'", write_plots, results, tmp_path, ["x"], error=KeyError)
-    monkeypatch.setattr("miricigale.fitting.page._MOST", 2)
+    monkeypatch.setattr("miricigale.fitting.catalogs.page._MOST", 2)
     few = fit_page(results, tmp_path / "cat.fits").to_html()
     assert "numbers and figures are of one object in 3, 2 of them" in few
     refuses("z_phot", fit_page, results, tmp_path / "cat.fits", z_spec="z_phot")
@@ -427,7 +427,7 @@ def test_a_catalog_is_calibrated_by_its_known_redshifts(tmp_path, capsys, monkey
     page = (tmp_path / "out" / "page.html").read_text()
     for text in ("cat.fits by zphot", "zero point", "in their 16-84 % interval"):
         assert text in page
-    monkeypatch.setattr("miricigale.fitting.survey.calibrate", None)
+    monkeypatch.setattr("miricigale.fitting.survey.survey.calibrate", None)
     assert main(argv) == 0
     kept = ["--calibration", str(tmp_path / "out" / "calibration.ecsv")]
     # of some of the sources

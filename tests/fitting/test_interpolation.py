@@ -7,9 +7,9 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from miricigale.fitting import BayesFitter
-from miricigale.fitting.interpolation import InterpolatedModels
-from miricigale.fitting.priors import grid_priors
-from miricigale.fitting.quantities import Quantities
+from miricigale.fitting.grid.interpolation import InterpolatedModels
+from miricigale.fitting.posterior.priors import grid_priors
+from miricigale.fitting.posterior.quantities import Quantities
 from miricigale.sed import SEDModel, quasar_axes, survey_axes, yang2021_axes
 
 BANDS = ["acs.f814w", "wfc3.f160w", "nircam.f444w", "miri.f770w", "miri.f1500w", "miri.f2100w"]

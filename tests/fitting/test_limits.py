@@ -26,7 +26,7 @@ from helpers.grids import (
 from miricigale.fitting import FitFlags, GridSettings, leave_out, mock_analysis
 from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.workspace import make_limits
-from miricigale.fitting.quantities import DERIVED_LEVELS
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS
 
 ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
 FLOOR = {"band2": 0.15, "band3": 0.02}

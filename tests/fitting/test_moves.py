@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from miricigale.fitting.moves import move_places, systematic
+from miricigale.fitting.grid.moves import move_places, systematic
 
 
 def _moved(log_density, score, group, active, seed=1):

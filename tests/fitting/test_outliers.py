@@ -13,7 +13,7 @@ from helpers.errors import refuses
 from helpers.grids import draw_photometry, make_grid, node_fitter
 from miricigale.fitting import BayesFitter, FitResults, GridSettings
 from miricigale.fitting._core.workspace import make_limits
-from miricigale.fitting.mixture import BandMixture
+from miricigale.fitting.grid.mixture import BandMixture
 
 BANDS = ("acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "miri.f770w", "miri.f1500w")
 PART = dict.fromkeys(BANDS[:4], 0.02) | {"miri.f770w": 0.2}

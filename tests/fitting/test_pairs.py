@@ -165,7 +165,7 @@ def test_nothing_else_changes_nor_does_the_cut(fitter, results, photometry, monk
     with ThreadPoolExecutor(2) as executor:
         assert_same(fitter.fit(photometry, pairs=pairs, chunk_size=3, executor=executor), whole)
     # one object at a time, as on large grids
-    monkeypatch.setattr("miricigale.fitting.grid_fit._JOINT_SIZE", 1)
+    monkeypatch.setattr("miricigale.fitting.grid.grid_fit._JOINT_SIZE", 1)
     assert_same(fitter.fit(photometry, pairs=pairs), whole)
     empty = fitter.fit(photometry[:0], pairs=pairs)
     assert empty.joint_pdf("age", "tau").shape == (0, 4, 5)

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from helpers.grids import make_grid
-from miricigale.fitting.posterior import cell_edges
-from miricigale.fitting.priors import density_log_prior, grid_priors
+from miricigale.fitting.posterior.posterior import cell_edges
+from miricigale.fitting.posterior.priors import density_log_prior, grid_priors
 
 LEVELS = np.array([0.16, 0.5, 0.84])
 NODES = {"steps": np.linspace(0.1, 10, 100), "ratios": np.geomspace(0.1, 10, 100)}

@@ -12,7 +12,7 @@ from scipy.special import log_ndtr
 from helpers.grids import make_grid, node_fitter, photometry_table
 from helpers.results import assert_same
 from miricigale.fitting import FitFlags, GridSettings
-from miricigale.fitting.quantities import DERIVED_LEVELS
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS
 
 N = 200
 SETTINGS = {

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from helpers.grids import make_grid, photometry_table
 from miricigale.fitting import BayesFitter, fit_file, leave_out
-from miricigale.fitting.pulls import left_out_pulls
+from miricigale.fitting.results.pulls import left_out_pulls
 from miricigale.utils.exceptions import FitWarning
 
 

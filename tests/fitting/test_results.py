@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.errors import refuses
 from helpers.grids import node_fitter, photometry_table
 from miricigale.fitting import FitResults
-from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import DataError
 

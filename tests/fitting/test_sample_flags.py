@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.grids import draw_photometry, make_grid, node_fitter
 from miricigale.fitting import FitFlags, fit_file, open_results
-from miricigale.fitting.sample_flags import chi2_limit, chi2_step
+from miricigale.fitting.results.sample_flags import chi2_limit, chi2_step
 
 
 def test_limit_of_a_sample_is_three_standard_deviations_of_its_logarithm():

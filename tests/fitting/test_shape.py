@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.grids import brute_force, node_fitter
 from helpers.results import assert_same
 from miricigale.fitting import FitResults, GridSettings
-from miricigale.fitting.posterior import cell_percentiles
-from miricigale.fitting.quantities import DERIVED_LEVELS, ShapeQuantities
+from miricigale.fitting.posterior.posterior import cell_percentiles
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, ShapeQuantities
 
 
 def with_shape(grid):

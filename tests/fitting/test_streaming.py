@@ -14,7 +14,7 @@ from helpers.errors import refuses
 from helpers.grids import draw_photometry, node_fitter
 from helpers.results import assert_joined, assert_same, assert_same_tables
 from miricigale.fitting import FitFlags, fit_file, open_results
-from miricigale.fitting.io import FitFolder
+from miricigale.fitting.results.io import FitFolder
 from miricigale.utils.exceptions import CatalogWarning, DataError
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.table_files import read_table

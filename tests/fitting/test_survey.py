@@ -17,7 +17,7 @@ from miricigale.fitting import (
     agn_fraction_prior,
     mock_analysis,
 )
-from miricigale.fitting.survey import SurveyCalibration, calibrate
+from miricigale.fitting.survey.survey import SurveyCalibration, calibrate
 from miricigale.sed import SEDModel
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import DataError

@@ -25,7 +25,7 @@ from miricigale.fitting import (
     measure_priors,
     measure_template_error,
 )
-from miricigale.fitting.band_errors import BandErrorPrior
+from miricigale.fitting.survey.band_errors import BandErrorPrior
 
 BANDS = ("acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "miri.f770w", "miri.f1500w")
 #: A prior that says next to nothing of the errors.

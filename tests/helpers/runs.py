@@ -13,8 +13,8 @@ from miricigale.psf import MatchingKernel
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.page.labels import end_bands
-from miricigale.workflow.stages import study_stages
+from miricigale.workflow.labels import end_bands
+from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.exposures import study_exposures
 from miricigale.workflow.stages.inputs import existing_bands, pieces
 from miricigale.workflow.stages.truth import add_agn, add_field_agn

@@ -8,7 +8,7 @@ from numpy.testing import assert_array_equal
 
 from miricigale.detector import Detector
 from miricigale.instrument import Exposure
-from miricigale.photometry.mosaics import as_mosaic
+from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.reduction import Reducer, write_image
 
 datamodels = pytest.importorskip(

@@ -7,7 +7,7 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
-from miricigale.photometry.draws import correlated_draws
+from miricigale.photometry.templates.normal_equations import correlated_draws
 
 
 def measured(tools, rows=slice(None), **options):

@@ -9,7 +9,7 @@ from astropy.table import QTable
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import ForcedFlags, ForcedPhotometer
-from miricigale.photometry.diagnostics import rim_pixels
+from miricigale.photometry.fit.diagnostics import rim_pixels
 from miricigale.psf import gaussian_psf
 from miricigale.reduction import drizzle_images
 

@@ -9,8 +9,8 @@ from helpers.errors import refuses
 from helpers.mosaics import stamps_of
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MemorySettings
-from miricigale.photometry.error_curves import measured_curve
-from miricigale.photometry.errors import (
+from miricigale.photometry.errors.error_curves import measured_curve
+from miricigale.photometry.templates.normal_equations import (
     LinearFit,
     noise_correlation,
     sandwich_matrix,
@@ -134,7 +134,7 @@ def direct_sandwich(bank, inverse_sigma, correlation):
 def test_errors_are_those_of_the_direct_convolution(tools, monkeypatch, max_bytes):
     # blends, an edge, masked pixels, and noise that is correlated over several pixels; with
     # little memory in several blocks
-    monkeypatch.setattr("miricigale.photometry.templates._PART", 5000)
+    monkeypatch.setattr("miricigale.photometry.templates.templates._PART", 5000)
     rng = np.random.default_rng(21)
     shape = (150, 160)
     wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
@@ -155,7 +155,7 @@ def test_errors_are_those_of_the_direct_convolution(tools, monkeypatch, max_byte
         seen.append(np.abs(difference / scale[:, None] / scale).max())
         return expected, projection
 
-    monkeypatch.setattr("miricigale.photometry.fit_errors.sandwich_matrix", direct)
+    monkeypatch.setattr("miricigale.photometry.fit.template_fit.sandwich_matrix", direct)
     truth = tools.measured(image, sky, **options)
     assert seen[0] < 1e-6
     assert_allclose(found.flux.value, truth.flux.value, rtol=1e-12)

@@ -21,7 +21,7 @@ from miricigale.photometry import (
     SourceTemplates,
     detect_sources,
 )
-from miricigale.photometry.errors import stated_correlation
+from miricigale.photometry.templates.normal_equations import stated_correlation
 from miricigale.psf import MatchingKernel
 
 #: Two dithers, the second at another roll, with another PSF (rms, arcsec), noise and sky (MJy/sr).

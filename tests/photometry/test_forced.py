@@ -20,7 +20,7 @@ from miricigale.photometry import (
     ForcedPhotometer,
     detect_sources,
 )
-from miricigale.photometry.catalogs import joined_sky
+from miricigale.photometry.detection.catalogs import joined_sky
 from miricigale.psf import MatchingKernel
 from miricigale.utils.exceptions import MiricigaleWarning
 
@@ -211,8 +211,8 @@ def test_galaxies_of_all_indices(tools, index, noise):
 
 def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     # noise of known variance in the cutout: expectation of the corrected power is that of the truth
-    from miricigale.photometry.cutouts import Cutout
-    from miricigale.photometry.templates import BankSources, FineTemplates, TemplateBank
+    from miricigale.photometry.detection.cutouts import Cutout
+    from miricigale.photometry.templates.templates import BankSources, FineTemplates, TemplateBank
 
     rng, sigma, n = np.random.default_rng(2), 0.02, 200
     fine = FineTemplates(tools.kernel.array, tools.kernel.target)
@@ -226,7 +226,7 @@ def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     at = np.full((n + 1, 2), 29.0)
     sources = BankSources(parts, at, np.full((n + 1, 2), 40.0), poly)
     bank = TemplateBank(fine, sources, (81, 81))
-    from miricigale.photometry.errors import normal_matrix
+    from miricigale.photometry.templates.normal_equations import normal_matrix
 
     matrix, _, power, _ = normal_matrix(bank, np.ones((81, 81)))
     assert_allclose(matrix.diagonal(), power, rtol=1e-6)
@@ -237,8 +237,8 @@ def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
 
 
 def test_templates_that_did_not_move_are_taken_as_they_are(tools, monkeypatch):
-    from miricigale.photometry.cutouts import Cutout
-    from miricigale.photometry.templates import BankSources, FineTemplates, TemplateBank
+    from miricigale.photometry.detection.cutouts import Cutout
+    from miricigale.photometry.templates.templates import BankSources, FineTemplates, TemplateBank
 
     rng, n = np.random.default_rng(4), 60
     fine = FineTemplates(tools.kernel.array, tools.kernel.target)
@@ -395,8 +395,8 @@ def test_blends_are_flagged_and_twins_not_counted_twice(tools):
 
 def test_threads_do_not_change_a_bit(tools, monkeypatch):
     # pieces so small that there are many for each thread
-    monkeypatch.setattr("miricigale.photometry.templates._PART", 5000)
-    monkeypatch.setattr("miricigale.photometry.errors._PAIRS", 7)
+    monkeypatch.setattr("miricigale.photometry.templates.templates._PART", 5000)
+    monkeypatch.setattr("miricigale.photometry.templates.normal_equations._PAIRS", 7)
     sky, _, high, low = galaxies(tools, noise=0.02, n=36, spacing=1.6)
     noise = np.random.default_rng(3).normal(0, 0.5, low.data.shape)
     low.data[:] += scipy.ndimage.gaussian_filter(noise, 1.0)

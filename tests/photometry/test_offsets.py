@@ -9,8 +9,8 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from miricigale.photometry import ForcedPhotometer, read_mosaic, read_prior
-from miricigale.photometry.offsets import source_offsets
-from miricigale.photometry.templates import Block
+from miricigale.photometry.fit.offsets import source_offsets
+from miricigale.photometry.templates.templates import Block
 from miricigale.utils.exceptions import MiricigaleWarning
 
 SHAPE, SIGMA = (400, 400), 0.02

@@ -17,9 +17,9 @@ from miricigale.photometry import (
     ForcedPhotometer,
     SourceTemplates,
     detect_sources,
-    residual_sources,
 )
-from miricigale.photometry.catalogs import joined_sky
+from miricigale.photometry.detection import residual_sources
+from miricigale.photometry.detection.catalogs import joined_sky
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def test_what_is_left_has_its_flux_and_place(tools, crowd, monkeypatch):
     """Two points that stand alone, and are not in the catalog, on the residual."""
     found, plain = [], residual_sources.residual_peaks
     keep = lambda *args: found.append(plain(*args)) or found[-1]  # noqa: E731
-    monkeypatch.setattr("miricigale.photometry.diagnostics.residual_peaks", keep)
+    monkeypatch.setattr("miricigale.photometry.fit.diagnostics.residual_peaks", keep)
     result = tools.measured(crowd.image, crowd.sky)
     xy = np.transpose(result.residual_image.wcs.world_to_pixel(crowd.hidden[-2:]))
     distance = np.linalg.norm(found[-1].refined - xy[:, None], axis=2)

@@ -6,9 +6,9 @@ from astropy.nddata import overlap_slices
 from numpy.testing import assert_allclose
 
 from helpers.light import gaussian_image
-from miricigale.photometry.light import cutouts
-from miricigale.photometry.shape_models import ShapeModels
-from miricigale.photometry.shapes import Beside, ShapeFitter
+from miricigale.photometry.shapes.shape_models import ShapeModels
+from miricigale.photometry.shapes.shapes import Beside, ShapeFitter
+from miricigale.photometry.shapes.template_choice import cutouts
 from miricigale.profiles import sersic_image
 
 SCALE = 0.06  # arcsec per pixel

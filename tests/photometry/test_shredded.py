@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.results import assert_equal_values
 from miricigale.photometry import ErrorSettings, ForcedFlags, ForcedPhotometer, SourceTemplates
-from miricigale.photometry.diagnostics import canceling
-from miricigale.photometry.shredded import divided, joined_groups, padded
+from miricigale.photometry.fit.diagnostics import canceling
+from miricigale.photometry.shapes.divided_galaxies import divided, joined_groups, padded
 
 #: A large galaxy, two small ones and two points: arcsec from the center, rms widths in arcsec, uJy.
 EAST = np.array([0.0, 2.2, -2.6, -2.4, 2.4])

@@ -20,7 +20,7 @@ from miricigale.photometry import (
     join_bands,
     measure_bands,
 )
-from miricigale.photometry.wcs_text import grid_text, text_grid
+from miricigale.photometry.images.fits_images import grid_text, text_grid
 from miricigale.profiles import sersic_stamp
 from miricigale.psf import KernelField, MatchingKernel, gaussian_psf
 from miricigale.utils.exceptions import DataError

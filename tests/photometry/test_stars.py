@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from helpers.light import gaussian_image
 from helpers.scenes import tan_wcs
 from miricigale.photometry import ForcedFlags, ForcedPhotometer, SourceTemplates
-from miricigale.photometry.page import star_texts
+from miricigale.photometry.commands.page import star_texts
 from miricigale.psf import MatchingKernel
 
 SIGMA = 0.004

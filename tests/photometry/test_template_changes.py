@@ -15,9 +15,9 @@ from miricigale.photometry import (
     SourceTemplates,
     detect_sources,
 )
-from miricigale.photometry.cutouts import Cutout
-from miricigale.photometry.shapes import not_fitted
-from miricigale.photometry.template_changes import TemplateChanges
+from miricigale.photometry.detection.cutouts import Cutout
+from miricigale.photometry.shapes.shapes import not_fitted
+from miricigale.photometry.templates.template_changes import TemplateChanges
 from miricigale.psf import MatchingKernel
 
 # a Gaussian profile has n = 0.5 and R_e = 1.1774 sigma
@@ -192,7 +192,7 @@ def test_terms_add_in_quadrature_and_are_columns(tools, blend):
 
 def test_a_blend_is_solved_as_by_dense_algebra(tools, blend, monkeypatch):
     """Least squares with the changes as columns and their priors as rows, all pixels written out."""
-    from miricigale.photometry import forced
+    from miricigale.photometry.fit import forced
 
     kept = []
     original = forced.package

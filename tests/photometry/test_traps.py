@@ -17,7 +17,7 @@ from helpers.errors import refuses, warned
 from helpers.mosaics import disks
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, read_mosaic
-from miricigale.photometry.from_files import measure_files
+from miricigale.photometry.commands.from_files import measure_files
 from miricigale.psf import (
     MatchingKernel,
     encircled_energy,
@@ -290,7 +290,7 @@ def test_catalogs_of_other_fields_and_missing_positions(field, tmp_path, monkeyp
     catalog.write(tmp_path / "gap.fits")
     found = fluxes(field, catalog=tmp_path / "gap.fits", **WITHOUT_STARS)
     assert np.flatnonzero(np.isnan(found)).tolist() == [3]
-    monkeypatch.setattr("miricigale.photometry.mosaics.MosaicFile.read", unread)
+    monkeypatch.setattr("miricigale.photometry.images.mosaics.MosaicFile.read", unread)
     ra = field.catalog["ra"]
     nowhere = r"none of the 16 sources of .*far.fits is on .*image.fits \('image'\): the"
     for wrong, message in ((ra + 1, nowhere), (ra / 15, "is ra in hours")):

@@ -7,7 +7,7 @@ from astropy.io import fits
 
 from helpers.errors import refuses
 from miricigale.photometry import MosaicFile
-from miricigale.photometry.kernel_files import image_psf
+from miricigale.photometry.commands.kernel_files import image_psf
 from miricigale.psf import MatchingKernel, read_psf
 from miricigale.psf.files import core_position, header_grid, read_planes
 from miricigale.utils.exceptions import DataError, PSFWarning

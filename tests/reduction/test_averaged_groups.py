@@ -22,7 +22,7 @@ from miricigale.detector import (
 )
 from miricigale.instrument import Exposure, frames_per_group
 from miricigale.reduction import DetectorMaps, Reducer, fit_groups, measure_noise
-from miricigale.reduction.reference_maps import READERS
+from miricigale.reduction.references.reference_maps import READERS
 from miricigale.utils.exceptions import DataError, DetectorWarning
 
 PLAIN = (Photons(flat=False), Nonlinearity(), Bias(), ReadNoise(), ADConversion())

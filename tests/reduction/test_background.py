@@ -19,8 +19,8 @@ from miricigale.reduction import (
     estimate_background,
     remove_background,
 )
-from miricigale.reduction.images import plain_mask
-from miricigale.reduction.sky_mesh import sky_boxes
+from miricigale.reduction.images.images import plain_mask
+from miricigale.reduction.sky.sky_mesh import sky_boxes
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import MiricigaleWarning
 

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.errors import refuses
 from miricigale.instrument import DQ, field_mask, flat_field, photmjsr
 from miricigale.reduction import calibrate
-from miricigale.reduction.images import flagged_image
+from miricigale.reduction.images.images import flagged_image
 
 SHAPE = (1024, 1032)
 FILTER = "miri.f1000w"

@@ -12,7 +12,7 @@ from miricigale.reduction import (
     dither_backgrounds,
     estimate_background,
 )
-from miricigale.reduction.outliers import nan_median
+from miricigale.reduction.mosaic.outliers import nan_median
 from miricigale.utils.units import ANGLE
 
 SHAPE = (192, 200)

@@ -23,8 +23,8 @@ from miricigale.reduction import (
     reduce_files,
     write_image,
 )
-from miricigale.reduction.images import sigma
-from miricigale.reduction.repeats import ExposureRecord
+from miricigale.reduction.images.images import sigma
+from miricigale.reduction.images.repeats import ExposureRecord
 from miricigale.utils.exceptions import MiricigaleWarning
 
 

@@ -19,7 +19,7 @@ from miricigale.reduction import (
     reject_outliers,
     weight_map,
 )
-from miricigale.reduction.mosaic import add_image
+from miricigale.reduction.mosaic.mosaic import add_image
 
 FULL = (1024, 1032)
 
@@ -327,7 +327,7 @@ def test_an_area_far_from_that_of_the_map_is_refused(monkeypatch):
 
     wcs = north_up_wcs(SkyCoord(53, -27, unit="deg"), 0.11 * u.arcsec, (60, 60))
     image = make(np.random.default_rng(3).normal(5, 1, (60, 60)), wcs, filter="miri.f770w")
-    monkeypatch.setattr("miricigale.reduction.mosaic.add_image", lose_half)
+    monkeypatch.setattr("miricigale.reduction.mosaic.mosaic.add_image", lose_half)
     for pixfrac in (1.0, 0.9):
         wanted = (
             r"'pixel_maps' must be a map that drizzle .* follows, got one of .* 18\d\d are covered"

@@ -11,7 +11,7 @@ from helpers.references import nameless, write_photom, write_reference, write_re
 from miricigale.detector import CosmicRays, Detector, InterpixelCapacitance, ResetAnomaly
 from miricigale.instrument import DQ, field_mask, flat_field, miri_detector, photmjsr
 from miricigale.reduction import RampSettings, Reducer, ReferenceFiles
-from miricigale.reduction.reference_maps import read_photom
+from miricigale.reduction.references.reference_maps import read_photom
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 SKY = 12.0

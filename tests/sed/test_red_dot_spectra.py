@@ -7,7 +7,7 @@ from astropy.modeling.models import BlackBody
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.fitting.interpolation import InterpolatedModels
+from miricigale.fitting.grid.interpolation import InterpolatedModels
 from miricigale.sed import SED, ModelGrid, SEDModel, red_dot, red_dot_axes, red_dots, template_grid
 
 #: A red dot of one part and no lines.

@@ -45,9 +45,9 @@ ARGUMENTS = {
     "sed.components.attenuation._exponents": (WAVE, "calzetti"),
     "sed.components.agn._polar_grid": (WAVE, "smc"),
     "sed.foreground._table": ("G23", 3.1),
-    "fitting.adaptive.quasi_random": (3, 6, 1),
-    "fitting.defaults._survey_calibration": (("miri.f770w",),),
-    "fitting.priors._declared": (("delayed",), "f_burst", "absent_at_zero"),
+    "fitting.grid.adaptive.quasi_random": (3, 6, 1),
+    "fitting.survey.defaults._survey_calibration": (("miri.f770w",),),
+    "fitting.posterior.priors._declared": (("delayed",), "f_burst", "absent_at_zero"),
     "instrument.dithers._cycling": ("cycling-small",),
     "instrument.wcs._sip": ("SUB64",),
     "instrument.detector._flat_pixels": (1,),
@@ -56,7 +56,7 @@ ARGUMENTS = {
     "psf.hst._hst_blur": (0.06,),
     "psf.hst._hst_optics": ("wfc3.f160w", 0.06, 11, 45.0),
     "psf.telescope.band_quantiles": ("miri.f770w",),
-    "utils.declared.declared": ("miricigale.fitting", "columns.toml"),
+    "utils.package_tables.declared": ("miricigale.fitting", "columns.toml"),
     "utils.compilation._digest": ("miricigale",),
     "workflow.background._named": ("miri.f770w", "low", None, None),
     "workflow.engine.stage._parts": ("a/b-1",),
@@ -81,7 +81,7 @@ ELSEWHERE = {
     "utils.compilation._warn_of_no_cache",
 }
 #: Modules that keep what nobody else gets: a function of the caller, transforms within one call.
-PRIVATE = {"utils/caching.py", "utils/parallel.py", "photometry/errors.py"}
+PRIVATE = {"utils/caching.py", "utils/parallel.py", "photometry/templates/normal_equations.py"}
 
 
 def cached_functions():
@@ -167,7 +167,7 @@ def test_every_cached_function_is_tried():
     known = free | set(ARGUMENTS) | ELSEWHERE
     with_defaults = {
         "instrument.siaf.aperture",
-        "instrument.figures.table",
+        "instrument.published_tables.table",
         "psf.optics.jwst_pupil",
     }
     with_defaults |= {"psf.optics.hst_pupil"}

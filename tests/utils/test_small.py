@@ -12,7 +12,7 @@ import miricigale
 from helpers.errors import refuses
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
-from miricigale.utils.optional import require
+from miricigale.utils.optional_packages import require
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded, thread_count, threads
 from miricigale.utils.progress import progress
 

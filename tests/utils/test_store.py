@@ -8,9 +8,9 @@ from astropy.table import QTable
 
 from helpers.errors import refuses
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.file_formats import read_write, register
 from miricigale.utils.files import replacing
 from miricigale.utils.store import open_parts, write_parts
-from miricigale.utils.unified import read_write, register
 
 
 def test_what_stood_there_stays_when_writing_fails(tmp_path):

@@ -13,7 +13,7 @@ from helpers.errors import refuses
 from miricigale.instrument import ceers_exposures
 from miricigale.utils.exceptions import ConfigError, DataError
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.exposures import dithers_text, study_exposures
 from miricigale.workflow.study import check_study
 

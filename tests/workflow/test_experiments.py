@@ -13,7 +13,8 @@ from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context, load_config
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.page.labels import texts_of
+from miricigale.workflow.labels import texts_of
+from miricigale.workflow.page.derived_sections import write_experiments
 from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import experiments
@@ -171,7 +172,7 @@ def page_of(folder, *names):
     """The section of the page on experiments."""
     report, context = Page("made up"), Context(config_of(*names), folder)
     study = StudyTables(Context(config_of(), folder), "agn40")
-    experiments.write_experiments(DeclaredPage(report, context), {"agn40": study})
+    write_experiments(DeclaredPage(report, context), {"agn40": study})
     return report.to_html()
 
 

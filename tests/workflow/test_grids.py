@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.instrument.image_files import read_image
 from miricigale.workflow import load_config, run_study
-from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.exposures import study_exposures
 from miricigale.workflow.stages.grids import (
     by_patch,

@@ -20,7 +20,7 @@ from miricigale.workflow import StudyRunner
 from miricigale.workflow.analysis_sections import FitSection
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.page.provenance import catalog_facts
-from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.fits import mock_photometry
 from miricigale.workflow.stages.inputs import existing_bands
 from miricigale.workflow.stages.sample import SampleFlags, add_selection, cut_flags, good_redshifts

@@ -20,7 +20,7 @@ from miricigale.cli import main
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.instrument.image_files import read_image
 from miricigale.photometry import ForcedFlags, MosaicFile, measure_files
-from miricigale.photometry.patches import PatchGrid, own_rows
+from miricigale.photometry.commands.patches import PatchGrid, own_rows
 from miricigale.workflow import measure_patches
 
 BAND, OTHER = "irac.ch4", "irac.ch3"

@@ -23,6 +23,7 @@ from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context, load_config
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.engine.stage import Units
+from miricigale.workflow.page.derived_sections import write_perturbed
 from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.perturbation import (
     Perturbation,
@@ -32,7 +33,7 @@ from miricigale.workflow.perturbation import (
 )
 from miricigale.workflow.stages.fits import mock_photometry
 from miricigale.workflow.stages.images import expose_and_reduce
-from miricigale.workflow.stages.perturbed import perturbation_costs, write_perturbed
+from miricigale.workflow.stages.perturbed import perturbation_costs
 from miricigale.workflow.truths import EFFECTS, study_truths
 
 SEED, BAND, PRIOR = 7, "miri.f770w", "wfc3.f160w"

@@ -13,6 +13,7 @@ from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import load_config
 from miricigale.workflow.engine.stage import Units
+from miricigale.workflow.page.derived_sections import write_rivals
 from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import rivals
 
@@ -129,7 +130,7 @@ def test_the_section_of_the_page(folder, tables):
     context, pages = Context(config_of("package"), folder), []
     for own in (tables, {}):
         report = Page("made up")
-        rivals.write_rivals(DeclaredPage(report, context), own)
+        write_rivals(DeclaredPage(report, context), own)
         pages.append(report.to_html())
     assert "Rival photometry" in pages[0]
     assert "F1500W" in pages[0]

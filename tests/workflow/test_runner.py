@@ -14,7 +14,7 @@ from miricigale.workflow.config import StudyConfig, load_config
 from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.engine.stage import Stage, Units
 from miricigale.workflow.engine.store import ProductStore
-from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stage_list import study_stages
 
 
 def write(context, unit):

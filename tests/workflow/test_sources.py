@@ -21,7 +21,7 @@ from miricigale.plotting.cutouts import N_GRAY, Cutouts
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.stages.sources import FLAGS
+from miricigale.workflow.page.sources_stage import FLAGS
 
 BANDS = ["miri.f770w", "miri.f2100w"]
 

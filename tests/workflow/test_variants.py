@@ -15,6 +15,7 @@ from miricigale.pages import Page
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.derived import changed_config
+from miricigale.workflow.page.derived_sections import write_variants
 from miricigale.workflow.page.study_page import DeclaredPage
 from miricigale.workflow.stages import variants
 from miricigale.workflow.stages.exposures import IMAGES, study_exposures
@@ -192,8 +193,8 @@ def test_the_report_says_what_each_costs(tmp_path):
         context.save_table(f"variants/{name}/{BAND}.ecsv", bands[BAND])
     report = Page("made up")
     nothing = DeclaredPage(report, Context(config_of([]), tmp_path))
-    assert variants.write_variants(nothing, matched, {BAND: 22.15}) is None
-    numbers = variants.write_variants(DeclaredPage(report, context), matched, {BAND: 22.15})
+    assert write_variants(nothing, matched, {BAND: 22.15}) is None
+    numbers = write_variants(DeclaredPage(report, context), matched, {BAND: 22.15})
     page = report.to_html()
     assert "residual noise</td>" in page
     assert "without the gradient</td>" in page

@@ -10,14 +10,6 @@ limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into mom
 `structs` says what the kernels take, `rows` where it stands there, `workspace` makes it.
 """
 
-from miricigale.fitting._core.between import (
-    SATURATION,
-    Light,
-    Part,
-    interpolate_columns,
-    interpolate_light,
-    make_work,
-)
 from miricigale.fitting._core.evaluate import sum_up
 from miricigale.fitting._core.histogram import (
     N_SHARE,
@@ -37,6 +29,14 @@ from miricigale.fitting._core.importance import (
     fit_parts,
     flatten,
     propose,
+)
+from miricigale.fitting._core.interpolation import (
+    SATURATION,
+    Light,
+    Part,
+    interpolate_columns,
+    interpolate_light,
+    make_work,
 )
 from miricigale.fitting._core.masses import weigh_masses
 from miricigale.fitting._core.mixture import find_models

@@ -11,9 +11,15 @@ import math
 import numpy as np
 
 from miricigale.fitting._core import structs as at
+from miricigale.fitting._core.batched_pairs import (
+    best_scale,
+    fill_up,
+    galaxy_products,
+    gather,
+    likelihoods,
+)
 from miricigale.fitting._core.floors import first_floor, second_floor
 from miricigale.fitting._core.histogram import add_model, widest
-from miricigale.fitting._core.lanes import best_scale, fill_up, galaxy_products, gather, likelihoods
 from miricigale.fitting._core.limits import limited_likelihoods
 from miricigale.fitting._core.pairs import agn_products, best_of_galaxy, list_runs, project
 from miricigale.fitting._core.single import single_likelihoods

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from miricigale.fitting._core.batched_pairs import galaxy_products
 from miricigale.fitting._core.functions import exponential, log10
-from miricigale.fitting._core.lanes import galaxy_products
 from miricigale.fitting._core.structs import BLOCK, KERNEL
 from miricigale.utils.compilation import njit
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from miricigale.fitting._core.lanes import best_mixture
+from miricigale.fitting._core.batched_pairs import best_mixture
 from miricigale.fitting._core.structs import KERNEL, PART
 from miricigale.utils.compilation import njit
 

@@ -16,7 +16,7 @@ single precision can amount to.
 import numpy as np
 
 from miricigale.fitting._core import structs as at
-from miricigale.fitting._core.lanes import best_scale
+from miricigale.fitting._core.batched_pairs import best_scale
 from miricigale.fitting._core.structs import BLOCK, DONE, KERNEL, KEY_BITS, PART
 from miricigale.utils.compilation import njit
 

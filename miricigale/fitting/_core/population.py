@@ -3,8 +3,8 @@
 import math
 from collections import namedtuple
 
-from miricigale.fitting._core.between import galaxy_light, with_agn
 from miricigale.fitting._core.functions import exponential
+from miricigale.fitting._core.interpolation import galaxy_light, with_agn
 from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.structs import NO_LIGHT, PART
 from miricigale.utils.compilation import njit

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from miricigale.fitting._core import structs as at
+from miricigale.fitting._core.batched_pairs import best_mixture, best_scale
 from miricigale.fitting._core.histogram import add_model
-from miricigale.fitting._core.lanes import best_mixture, best_scale
 from miricigale.fitting._core.single import pair_weight
 from miricigale.fitting._core.structs import BLOCK, PART
 from miricigale.utils.compilation import njit

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from miricigale.utils.optional import require
+from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_names
 from miricigale.utils.parallel import chunks
 

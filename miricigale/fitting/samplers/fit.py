@@ -7,15 +7,15 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet
-from miricigale.fitting.likelihood import FitFlags
-from miricigale.fitting.posterior import cell_edges, check_pairs
-from miricigale.fitting.priors import GridAxis
-from miricigale.fitting.quantities import DERIVED_LEVELS, FORMED_TEXT, plain
-from miricigale.fitting.results import FitResults
+from miricigale.fitting.data.likelihood import FitFlags
+from miricigale.fitting.data.settings import SamplerSettings
+from miricigale.fitting.posterior.posterior import cell_edges, check_pairs
+from miricigale.fitting.posterior.priors import GridAxis
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, FORMED_TEXT, plain
+from miricigale.fitting.results.results import FitResults
 from miricigale.fitting.samplers import CITATIONS, get_sampler
 from miricigale.fitting.samplers.run import Calls, FluxModel, positive_normal, systematic_draws
 from miricigale.fitting.samplers.space import Space, redshift_axis
-from miricigale.fitting.settings import SamplerSettings
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
@@ -130,7 +130,7 @@ class SamplerFit:
         """
         `Space` of every object, number of free parameters, and "fixed", "prior" or "free".
 
-        See `~miricigale.fitting.grid_fit.GridFit.redshifts`.
+        See `~miricigale.fitting.grid.grid_fit.GridFit.redshifts`.
         """
         space, kind = self.space, "free" if "redshift" in self.space.free else "fixed"
         if redshift is not None:

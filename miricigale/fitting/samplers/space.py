@@ -6,11 +6,11 @@ from functools import cached_property
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from miricigale.fitting.likelihood import FitFlags
-from miricigale.fitting.posterior import cell_edges
-from miricigale.fitting.priors import integrals_to, known_redshifts, read_density
+from miricigale.fitting.data.likelihood import FitFlags
+from miricigale.fitting.posterior.posterior import cell_edges
+from miricigale.fitting.posterior.priors import integrals_to, known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import floats
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names, check_that
 
 #: Part of a prior without limits that may lie outside the cells of its axis.

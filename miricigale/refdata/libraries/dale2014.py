@@ -9,9 +9,9 @@ from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.lookup import locate
 from miricigale.refdata.tables import load_ssp
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.options import check_data
+from miricigale.utils.package_tables import declared
 
 SPECTRA = "spectra.0.00AGN.dat"
 CALIBRATION = "dhcal.dat"

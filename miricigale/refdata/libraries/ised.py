@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.utils.declared import declared
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import unpacked_size
+from miricigale.utils.package_tables import declared
 
 #: Quantities after the spectra, in their order.
 QUANTITIES = declared("miricigale.refdata.libraries", "formats.toml")["ised"]["quantities"]

@@ -10,10 +10,10 @@ import numpy as np
 
 from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
-from miricigale.utils.content import file_sha256
-from miricigale.utils.declared import declared
+from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.options import check_data
+from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table
 from miricigale.utils.units import to_array
 

@@ -8,6 +8,7 @@ from miricigale.sed._core.attenuation import (
     smc_power_law,
 )
 from miricigale.sed._core.bands import band_means, band_tables
+from miricigale.sed._core.batched_models import block_fluxes, mix_light, weighted_sums
 from miricigale.sed._core.disk import DISK_BREAKS, DISKS, disk_nodes, disk_spectrum
 from miricigale.sed._core.histories import (
     YOUNG,
@@ -44,7 +45,6 @@ from miricigale.sed._core.polar import (
     polar_grid,
     polar_share,
 )
-from miricigale.sed._core.rows import block_fluxes, mix_light, weighted_sums
 from miricigale.sed._core.thermal import PLANCK_K, drude, modified_blackbody, planck_lambda
 from miricigale.sed._core.xray import power_law_energy, stern2015, stern2015_6um, xray_flux
 

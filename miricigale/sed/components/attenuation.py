@@ -6,7 +6,7 @@ from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.caching import cached
-from miricigale.utils.declared import declared
+from miricigale.utils.package_tables import declared
 
 # Cardelli et al. 1989, equation 5, in 1 um / lambda - 8: the highest power first
 _FAR = ((-0.070, 0.137, -0.628, -1.073), (0.374, -0.420, 4.257, 13.670))

@@ -5,7 +5,7 @@ import time
 from concurrent.futures import CancelledError
 
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.optional import require
+from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_data
 from miricigale.workflow.engine.schedule import Place
 

@@ -18,7 +18,7 @@ from miricigale.plotting.axes import (
 )
 from miricigale.plotting.comparison import plot_error_function, plot_offsets, plot_relation
 from miricigale.utils.units import ab_magnitude
-from miricigale.workflow.page.labels import band_label, band_title, by_wavelength
+from miricigale.workflow.labels import band_label, band_title, by_wavelength
 from miricigale.workflow.stages.conditions import has_flag
 
 #: Panels of one range.

@@ -4,8 +4,8 @@ import numpy as np
 from markupsafe import Markup
 
 from miricigale.pages import number
+from miricigale.workflow.labels import band_label, browse, color_bands, three_bands
 from miricigale.workflow.page import pictures, study_figures
-from miricigale.workflow.page.labels import band_label, browse, color_bands, three_bands
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.grids import of_patch
 from miricigale.workflow.stages.images import measured_mosaic, reducer_of

@@ -11,20 +11,21 @@ from miricigale.evaluation import (
     PUBLISHED_LIGHT,
     fraction_interval,
     integrated_light,
-    posterior_ranks,
     recovery_metrics,
     sigma_mad,
 )
 from miricigale.instrument import CEERS_FILTERS, ceers_exposures
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.stages.conditions import (
-    ConditionFlags,
+    _usable,
     band_conditions,
+    bright_isolated,
     detection_counts,
     fit_conditions,
     has_flag,
 )
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
+from miricigale.workflow.stages.fits import true_ranks
 from miricigale.workflow.stages.inputs import FitPieces
 from miricigale.workflow.stages.sample import NOT_COUNTED, SampleFlags
 
@@ -109,17 +110,6 @@ class StudyTables:
         return self.truth[known & self.inside if field else known]
 
 
-def true_ranks(results, sample, name, seed):
-    """
-    Ranks of the true values of a parameter in their posteriors.
-
-    Ranks are randomized within cells of the grid, for injected fractions lie on its nodes.
-    """
-    values, levels = results.cdf(name)
-    true = u.Quantity(sample[name]).to_value(values.unit)
-    return posterior_ranks(true, values.value, levels, seed=seed)
-
-
 def as_ceers(config, name):
     """Whether a band is exposed as CEERS did: readout, frames in each dither, number of dithers."""
     if name not in CEERS_FILTERS:
@@ -161,22 +151,6 @@ def as_paper(config):
     bands = config.exposures.filters
     alike = set(bands) == set(CEERS_FILTERS) and config.highres.filter == "wfc3.f160w"
     return alike and all(as_ceers(config, name) for name in bands)
-
-
-def _usable(matched, name):
-    """Sources that are measured in one band: in the field at all, and whole in the band."""
-    lost = SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED
-    off = photometry.ForcedFlags.EDGE | photometry.ForcedFlags.MASKED
-    return ~has_flag(matched, "selection", lost), ~has_flag(matched, f"{name}_flags", off)
-
-
-def bright_isolated(matched, name):
-    """Which sources are isolated and above 20 sigma in one band, whole and in the field."""
-    usable, whole = _usable(matched, name)
-    crowded = has_flag(matched, f"{name}_condition", ConditionFlags.CROWDED)
-    true, formal = (matched[f"{name}_{end}"].value for end in ("true", "formal_err"))
-    with np.errstate(invalid="ignore"):
-        return usable & whole & (true > 20 * formal) & ~crowded
 
 
 #: Exposure times, in units of that of one pointing, that limit the rows of depths.

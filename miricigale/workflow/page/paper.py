@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.evaluation import Estimate, StudyResults, TruthResults, compare_with_paper
 from miricigale.pages import number, sentence
-from miricigale.workflow.page.labels import texts_of
+from miricigale.workflow.labels import texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags, has_flag
 from miricigale.workflow.stages.sample import matched_errors
 

@@ -4,8 +4,8 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.pages import number
+from miricigale.workflow.labels import band_label, end_bands
 from miricigale.workflow.page import band_figures, pictures, study_figures
-from miricigale.workflow.page.labels import band_label, end_bands
 from miricigale.workflow.page.numbers import FEWEST
 from miricigale.workflow.stages.conditions import CONDITIONS, ConditionFlags
 from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf

@@ -12,7 +12,7 @@ from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_
 from miricigale.plotting.images import filled, mark_sky, plot_color, plot_image, plot_model_residual
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.psf.wiener import energy_error
-from miricigale.workflow.page.labels import band_title
+from miricigale.workflow.labels import band_title
 
 #: Error of the encircled energy (%) that counts as small.
 _SMALL_ERROR = 4

@@ -12,7 +12,7 @@ from miricigale.pages import sentence
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
 from miricigale.workflow.background import background_text
-from miricigale.workflow.page.labels import band_label, texts_of
+from miricigale.workflow.labels import band_label, texts_of
 from miricigale.workflow.stages.exposures import (
     IMAGE_RESOURCES,
     background_options,

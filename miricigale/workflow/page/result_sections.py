@@ -12,8 +12,7 @@ from miricigale.evaluation import (
 from miricigale.evaluation.estimates import outlier_share
 from miricigale.filters import Filter
 from miricigale.pages import Missing, number
-from miricigale.workflow.page import source_figures, study_figures
-from miricigale.workflow.page.labels import (
+from miricigale.workflow.labels import (
     SET_LABELS,
     band_label,
     browse,
@@ -21,9 +20,11 @@ from miricigale.workflow.page.labels import (
     parameter_label,
     truth_label,
 )
-from miricigale.workflow.page.numbers import FEWEST, true_ranks
+from miricigale.workflow.page import source_figures, study_figures
+from miricigale.workflow.page.numbers import FEWEST
 from miricigale.workflow.page.study_figures import CLASS_COLUMNS, FEATURES
 from miricigale.workflow.stages.conditions import CONDITIONS
+from miricigale.workflow.stages.fits import true_ranks
 from miricigale.workflow.stages.inputs import FitPieces
 from miricigale.workflow.stages.sample import typical_source
 from miricigale.workflow.stages.skies import NEAR, PER_WHOLE, sky_numbers

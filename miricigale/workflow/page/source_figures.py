@@ -9,7 +9,7 @@ from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_
 from miricigale.plotting.curves import plot_filters, plot_spectrum
 from miricigale.plotting.posteriors import plot_pdf_2d
 from miricigale.utils.units import FNU
-from miricigale.workflow.page.labels import SET_LABELS, band_label, by_wavelength
+from miricigale.workflow.labels import SET_LABELS, band_label, by_wavelength
 
 #: fracAGN of the spectra that are drawn over each other.
 SEQUENCE = (0.0, 0.2, 0.4, 0.6, 0.8, 0.99)

@@ -32,7 +32,7 @@ from miricigale.plotting.axes import (
 )
 from miricigale.plotting.comparison import plot_offsets, plot_redshifts
 from miricigale.utils.units import ab_magnitude
-from miricigale.workflow.page.labels import (
+from miricigale.workflow.labels import (
     SET_LABELS,
     band_title,
     class_label,

@@ -3,8 +3,8 @@
 import functools
 
 from miricigale.pages import SectionWriter
-from miricigale.utils.declared import declared
-from miricigale.workflow.page.labels import band_label, three_bands, truth_label
+from miricigale.utils.package_tables import declared
+from miricigale.workflow.labels import band_label, three_bands, truth_label
 from miricigale.workflow.page.numbers import FEWEST, MIPS_LIMIT
 from miricigale.workflow.truths import FIELD
 

@@ -124,3 +124,19 @@ def fit_conditions(sample, redshift, table, bands):
         groups[name] = {"n": found.n, "photoz_sigma_mad": found.sigma_mad}
         groups[name]["photoz_n_outliers"] = found.n_outliers
     return groups
+
+
+def _usable(matched, name):
+    """Sources that are measured in one band: in the field at all, and whole in the band."""
+    lost = SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED
+    off = photometry.ForcedFlags.EDGE | photometry.ForcedFlags.MASKED
+    return ~has_flag(matched, "selection", lost), ~has_flag(matched, f"{name}_flags", off)
+
+
+def bright_isolated(matched, name):
+    """Which sources are isolated and above 20 sigma in one band, whole and in the field."""
+    usable, whole = _usable(matched, name)
+    crowded = has_flag(matched, f"{name}_condition", ConditionFlags.CROWDED)
+    true, formal = (matched[f"{name}_{end}"].value for end in ("true", "formal_err"))
+    with np.errstate(invalid="ignore"):
+        return usable & whole & (true > 20 * formal) & ~crowded

@@ -5,14 +5,10 @@ import numpy as np
 from miricigale import photometry, sed
 from miricigale.evaluation import fraction_interval, photoz_metrics, recovery_metrics
 from miricigale.fitting import GridSettings
-from miricigale.pages import sentence
-from miricigale.photometry.surveys import HERSCHEL_DEPTHS
-from miricigale.utils.tables import described_rows
+from miricigale.photometry.errors.error_model import HERSCHEL_DEPTHS
 from miricigale.workflow.derived import rows_of
 from miricigale.workflow.engine.stage import stage
-from miricigale.workflow.page.labels import texts_of
-from miricigale.workflow.page.numbers import true_ranks
-from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
+from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample, true_ranks
 from miricigale.workflow.stages.inputs import fit_plan, plain_axes, sed_resources
 from miricigale.workflow.truths import study_truths
 
@@ -101,10 +97,10 @@ def fit_experiment(context, unit):
         options["settings"] = GridSettings(agn_error=AGN_ERROR)
     results = fit_mock(context, mock, bands, redshift=redshift, **options)
     context.save_result(f"{of}/experiments/{name}.fits", results)
-    context.save_table(f"{of}/experiments/{name}.ecsv", _ranked(results, sample, context.seed))
+    context.save_table(f"{of}/experiments/{name}.ecsv", ranked_table(results, sample, context.seed))
 
 
-def _ranked(results, sample, seed):
+def ranked_table(results, sample, seed):
     """The table of results with the ranks of the true values (``<name>_rank``), for coverage."""
     table = results.to_table()
     for name in RANKED:
@@ -162,34 +158,3 @@ def experiment_numbers(sample, table):
         inside = np.count_nonzero(np.abs(rank - 0.5) <= 0.34)
         found[f"{name}_coverage"] = fraction_interval(inside, rank.size)[0]
     return found
-
-
-def write_experiments(page, every):
-    """
-    Write the section on the further fits; ``every`` are the ``StudyTables`` of all truths by name.
-
-    Each is compared with the fit of the study with all bands of the same sources.
-    """
-    context, names = page.context, page.config.fit.experiments
-    if not names:
-        return
-    rows = []
-    for of, study in every.items():
-        own = _ranked(study.results["all"], study.sample, context.seed)
-        fits = [("study", own)]
-        for name, table in context.tables(f"{of}/experiments", names).items():
-            if 0 < len(table) < len(own):
-                fits.append(("study", rows_of(own, table["id"])))
-            fits.append((name, table))
-        for name, table in fits:
-            row = {"truth": of, "experiment": name, "n_sources": len(table)}
-            rows.append(row | experiment_numbers(study.sample, table))
-    texts = {key: key.replace("_", " ") for key in rows[0]}
-    texts |= {"truth": "Sky", "experiment": "Fit", "n_sources": "Sources"}
-    numbers = described_rows(rows, texts)
-    declared = texts_of("experiments")
-    sentences = " ".join(declared["sentences"][name] for name in names)
-    sentences = sentence(sentences, {"n_free": N_FREE, "agn_error": AGN_ERROR})
-    page.numbers("experiments", numbers, sentences=sentences)
-    labels = declared["labels"]
-    page.table("table", [dict(row) | {"fit": labels[row["experiment"]]} for row in numbers])

@@ -6,9 +6,9 @@ import astropy.units as u
 import numpy as np
 
 from miricigale import evaluation, fitting, photometry, sed
-from miricigale.photometry.catalogs import joined_sky
-from miricigale.photometry.error_model import add_noise
-from miricigale.photometry.surveys import fractional_error
+from miricigale.evaluation import posterior_ranks
+from miricigale.photometry.detection.catalogs import joined_sky
+from miricigale.photometry.errors.error_model import add_noise, fractional_error
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.perturbation import Perturbation
@@ -251,3 +251,14 @@ def fit_mock(context, mock, bands, *, redshift=None, **options):
     with ThreadPoolExecutor(context.n_threads) as executor:
         show = context.progress_bar
         return fitter.fit(mock, redshift=redshift, executor=executor, progress_bar=show)
+
+
+def true_ranks(results, sample, name, seed):
+    """
+    Ranks of the true values of a parameter in their posteriors.
+
+    Ranks are randomized within cells of the grid, for injected fractions lie on its nodes.
+    """
+    values, levels = results.cdf(name)
+    true = u.Quantity(sample[name]).to_value(values.unit)
+    return posterior_ranks(true, values.value, levels, seed=seed)

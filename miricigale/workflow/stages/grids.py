@@ -47,12 +47,12 @@ def _whole(key, pixel_scale):
 
 @cached(maxsize=4)
 def _patches(key, options, pixel_scale):
-    """`~miricigale.photometry.patches.PatchGrid` and `SkyPatch` by name."""
+    """`~miricigale.photometry.commands.patches.PatchGrid` and `SkyPatch` by name."""
     # whole fields need none of these, and commands that only read settings import nothing heavy
     from matplotlib.path import Path
     from matplotlib.transforms import Bbox
 
-    from miricigale.photometry.patches import PatchGrid
+    from miricigale.photometry.commands.patches import PatchGrid
 
     exposures, whole = all_exposures(*key), _whole(key, pixel_scale)
     side, rim = (math.ceil(x / pixel_scale) for x in (options.size, options.overlap))
@@ -85,7 +85,7 @@ def _patching(config):
 
 
 def patch_grid(config):
-    """The `~miricigale.photometry.patches.PatchGrid` of a study in patches, on the prior's grid."""
+    """The `~miricigale.photometry.commands.patches.PatchGrid` of a study in patches, on the prior's grid."""
     return _patching(config)[0]
 
 
@@ -117,7 +117,7 @@ def grid_of(config, pixel_scale, patch=""):
         return whole
     box, fine = study_patches(config)[patch].box, _whole(key, config.highres.pixel_scale)
     if pixel_scale != config.highres.pixel_scale:
-        from miricigale.photometry.patches import seen_part
+        from miricigale.photometry.commands.patches import seen_part
 
         box = seen_part(box, fine, whole, whole.pixel_shape[::-1])
     wcs = whole[box]

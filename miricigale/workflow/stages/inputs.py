@@ -14,7 +14,7 @@ from miricigale.refdata import resources
 from miricigale.refdata.lookup import fingerprint
 from miricigale.scene import read_catalog
 from miricigale.utils.caching import cached
-from miricigale.utils.content import file_sha256
+from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude

@@ -4,8 +4,8 @@ import numpy as np
 from astropy.table import vstack
 
 from miricigale import photometry, psf
-from miricigale.photometry.bands import spread_rows
-from miricigale.photometry.patches import RIM, own_rows
+from miricigale.photometry.commands.patches import RIM, own_rows
+from miricigale.photometry.fit.bands import spread_rows
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, KERNEL

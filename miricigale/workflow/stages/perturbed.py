@@ -5,14 +5,12 @@ from astropy.table import Table
 
 from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, outlier_share, scatter
-from miricigale.pages import Missing, number, sentence
-from miricigale.workflow.page.labels import band_label, by_wavelength, texts_of
-from miricigale.workflow.page.numbers import bright_isolated
-from miricigale.workflow.truths import ALL
+from miricigale.workflow.labels import by_wavelength, texts_of
+from miricigale.workflow.stages.conditions import bright_isolated
 
 #: Name of what no effect has changed.
 NONE = "none"
-_LABELS = texts_of("perturbations")["labels"]
+EFFECT_LABELS = texts_of("perturbations")["labels"]
 
 
 def _quantities(bands):
@@ -90,39 +88,3 @@ def perturbation_costs(truths, every, bands, *, seed):
                 rows.append((base, which, name, *cost))
     names = ["truth", "perturbation", "quantity", "n", "value", "value_err", "change", "change_err"]
     return Table(rows=rows, names=names) if rows else Table(names=names)
-
-
-def write_perturbed(page, truths, every):
-    """Write the section with one table, if there are perturbed truths."""
-    config = page.config
-    table = perturbation_costs(truths, every, config.exposures.filters, seed=page.context.seed)
-    if len(table) == 0:
-        return
-    found = set(table["perturbation"])
-    effects = [t for name, t in texts_of("perturbations")["effects"].items() if name in found]
-    effects = sentence("; ".join(effects), {"size": config.perturb})
-    together = " and together" if ALL in found else ""
-    page.numbers("perturbations", table, effects=effects, together=together)
-    rows = {}
-    for row in table:
-        known = {"sky": row["truth"], "perturbation": _LABELS[row["perturbation"]]}
-        cells = rows.setdefault((row["truth"], row["perturbation"]), known)
-        cells[_header(row["quantity"])] = _cell(row)
-    page.table("table", rows.values())
-
-
-def _header(quantity):
-    first, _, rest = quantity.partition(" ")
-    return f"{band_label(first)} {rest}" if "." in first else quantity
-
-
-def _cell(row):
-    """Text of a value and its change; per cent but for scatter of redshifts and fracAGN."""
-    share = "." in row["quantity"] or row["quantity"].endswith("outliers")
-    spec, alone = ".1f %" if share else ".4f", row["perturbation"] == NONE
-    signed = "+" if row["quantity"].endswith("offset") else ""
-    error = row["value_err"] if alone else None
-    cell = number(row["value"], signed + spec, "no source", error=error)
-    if alone or isinstance(cell, Missing):
-        return cell
-    return f"{cell} ({number(row['change'], f'+{spec}', '', error=row['change_err'])})"

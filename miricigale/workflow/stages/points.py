@@ -10,7 +10,7 @@ from miricigale.instrument import mosaic_wcs, tangent_offset
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
 from miricigale.workflow.engine.stage import stage
-from miricigale.workflow.page.labels import end_bands
+from miricigale.workflow.labels import end_bands
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,

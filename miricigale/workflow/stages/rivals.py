@@ -7,12 +7,9 @@ from astropy.table import QTable, vstack
 from miricigale import photometry
 from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_metrics
 from miricigale.evaluation.estimates import median
-from miricigale.pages import Missing, number
 from miricigale.utils.tables import described_rows, error_column
-from miricigale.workflow.derived import NO_SOURCE
 from miricigale.workflow.engine.stage import stage
-from miricigale.workflow.page.band_figures import rival_figure
-from miricigale.workflow.page.labels import band_label, texts_of
+from miricigale.workflow.labels import texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags
 from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, KERNEL, band_names, exposure_plan
 from miricigale.workflow.stages.measure import measure_band
@@ -182,7 +179,7 @@ def rival_counts(table):
     }
 
 
-def _se_offset(table, seed):
+def blind_offset(table, seed):
     """Source Extractor minus template fit (mag) of sources above 5 sigma: an `Estimate`."""
     blind, forced = table["source_extractor"].value, table["yang2021"].value
     good = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
@@ -211,7 +208,7 @@ def source_extractor_numbers(tables, seed):
     if SE_BAND not in tables:
         return {}
     table = tables[SE_BAND]
-    numbers = rival_counts(table) | {"offset": _se_offset(table, seed)}
+    numbers = rival_counts(table) | {"offset": blind_offset(table, seed)}
     # errors of white noise in the paper's steps, as T-PHOT has them
     flux, error = (table[name].value for name in ("yang2021", error_column("yang2021")))
     bright = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
@@ -219,36 +216,3 @@ def source_extractor_numbers(tables, seed):
     white = bootstrap(lambda values: np.percentile(values, 99, axis=-1), pulls, seed=seed)
     numbers = {f"source_extractor.{name}": number for name, number in numbers.items()}
     return numbers | {"errors.white": white}
-
-
-def write_rivals(page, tables):
-    """Write the section on rival photometry, unless there are no tables."""
-    if not tables:
-        return
-    numbers = rival_numbers(tables)
-    page.numbers("rivals", numbers)
-    # by group of each band: what is shown for each method
-    groups, bands = {}, {}
-    for row in numbers:
-        label = RIVALS[row["method"]]
-        cell = number(row["median"], "+.1f %", NO_SOURCE, error=row["scatter"])
-        if not isinstance(cell, Missing):
-            cell += f" ({row['n']})"
-        if row["band"] == "all" and row["kind"] != "all":
-            known = {"by": row["kind"], "sources": row["group"], "in the group": row["n_group"]}
-            groups.setdefault((row["kind"], row["group"]), known)[label] = cell
-        elif row["band"] != "all" and row["kind"] == "all":
-            known = {"band": band_label(row["band"]), "above 5 sigma": row["n_group"]}
-            pulls = number(row["pull_scatter"], ".1f", NO_SOURCE)
-            bands.setdefault(row["band"], known).update({label: cell, f"pulls, {label}": pulls})
-    shown = SE_BAND if SE_BAND in tables else next(iter(tables))
-    page.figure("figure", rival_figure(tables[shown]), band=band_label(shown))
-    page.table("groups", groups.values())
-    page.table("bands", bands.values())
-    rows = []
-    for name, table in tables.items():
-        counts, offset = rival_counts(table), _se_offset(table, page.context.seed)
-        row = {"band": band_label(name), "offset": offset.value, "offset_err": offset.error}
-        row |= {key: one.n for key, one in counts.items()}
-        rows.append(row | {"share": counts["missed"].value})
-    page.table("source_extractor", rows)

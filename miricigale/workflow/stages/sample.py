@@ -10,7 +10,7 @@ from astropy.wcs.utils import proj_plane_pixel_area, proj_plane_pixel_scales
 from scipy.ndimage import uniform_filter
 
 from miricigale.photometry import ErrorModel
-from miricigale.photometry.arrays import nearest_values
+from miricigale.photometry.images.arrays import nearest_values
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import Flags, error_column
 from miricigale.workflow.options import of_option, require

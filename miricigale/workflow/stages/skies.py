@@ -5,7 +5,7 @@ from astropy.table import QTable
 
 from miricigale import photometry, sed
 from miricigale.evaluation.classes import CLASS_LIMITS, quality_columns, sky_quality
-from miricigale.fitting.pulls import without_warnings
+from miricigale.fitting.results.pulls import without_warnings
 from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage

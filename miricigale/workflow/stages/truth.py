@@ -14,7 +14,7 @@ from miricigale.evaluation import (
     main_sequence_dust,
 )
 from miricigale.refdata.lookup import fingerprint
-from miricigale.utils.content import file_sha256
+from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import file_place
 from miricigale.utils.meta import provenance

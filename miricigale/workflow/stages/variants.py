@@ -6,13 +6,12 @@ from astropy.stats import biweight_scale
 
 from miricigale import psf, scene
 from miricigale.evaluation import PUBLISHED, Estimate, match_truth
-from miricigale.photometry.error_curves import limiting_flux, measured_curve
+from miricigale.photometry.errors.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import changed_config
 from miricigale.workflow.engine.stage import stage
-from miricigale.workflow.page.band_figures import variant_figure
-from miricigale.workflow.page.labels import band_label, texts_of
+from miricigale.workflow.labels import band_label, texts_of
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,
@@ -183,29 +182,6 @@ def variant_entries(table, changes):
         labels = {"band": band_label(row["band"]), "images": variant_label(row["images"], changes)}
         rows.append(dict(row) | labels | {"offset": row["limit"] - row["calculator"]})
     return rows
-
-
-def write_variants(page, matched, limits):
-    """
-    Write the section on variant images.
-
-    ``matched`` is of the reference truth, ``limits`` are those of the calculator by band.
-
-    Returns the numbers, or None where there are no variants.
-    """
-    context, config, changes = page.context, page.config, variant_changes(page.config)
-    if not changes:
-        return None
-    bands = band_names(config)
-    tables = {name: context.tables(f"variants/{name}", bands) for name in changes}
-    options = {"statistic": config.errors.statistic, "bin_size": config.errors.bin_size}
-    table = variant_numbers(matched, tables, limits, seed=context.seed, **options)
-    gradient = texts_of("optional")["gradient"] if "gradient" in changes else ""
-    page.numbers("variants", table, gradient=gradient)
-    labels = {name: variant_label(name, changes) for name in (STUDY, *changes)}
-    page.figure("figure", variant_figure(table, labels))
-    page.table("table", variant_entries(table, changes))
-    return table
 
 
 def measured_reasons(table, config):

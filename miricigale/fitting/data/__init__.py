@@ -1,0 +1,1 @@
+"""What is fitted: photometry with its flags, likelihood, settings, errors of templates."""

@@ -1,0 +1,433 @@
+"""From a catalog of photometry to fluxes, errors and flags that a fit can use, and the flags of fits."""
+
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.filters import Filter
+from miricigale.filters.library import SEDPY
+from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.object_rows import ObjectRows, PerObject
+from miricigale.utils.options import check_that
+from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
+from miricigale.utils.units import FNU, flux_unit, to_array
+
+#: S/N of the best model in all bands together below which an object is flagged, and reduced chi2 above which.
+LOW_SIGNAL, HIGH_CHI2 = 3.0, 100.0
+#: Stellar mass in solar masses below which an object is flagged.
+LOW_MASS = 3e6
+#: Least error in units of the flux: below it chi2 in double precision has no digits left.
+_LEAST_ERROR = 1e-6
+#: Least and largest error, and largest flux, in uJy; beyond, their squares are no numbers.
+_SMALL, _LARGE = 1e-60, 1e60
+#: Fluxes that are all 0 become negative by this part of their error; see `FitData.of_engine`.
+_DARK = 1e-8
+#: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
+_NO_SIGNAL = 1e-280
+_TRUE = ("true", "t", "1", "1.0")
+_FALSE = ("false", "f", "0", "0.0", "-0.0", "")
+_KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers"}
+
+
+class FitFlags(Flags):
+    """
+    Flags of a fitted catalog; `FitFlags.UNFITTED` is the sum of those that prevent a fit.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import FitFlags
+    >>> FitFlags(16384 | 32768)
+    <FitFlags.LOW_SIGNAL|ONE_NODE: 49152>
+    >>> FitFlags.UNFITTED & FitFlags.ALL_LIMITS     # such a row has no result
+    <FitFlags.ALL_LIMITS: 4096>
+    """
+
+    NO_BAND = 1, "No usable band."
+    FEW_BANDS = 2, "Fewer usable bands, upper limits among them, than asked for."
+    BAD_ERROR = (
+        4,
+        (
+            "A flux whose error is zero, negative, not finite or beyond 1e-60 to 1e60 uJy; the "
+            "band is left out."
+        ),
+    )
+    NO_REDSHIFT = (
+        8,
+        (
+            "A fixed redshift was asked for and is missing, not finite or not positive; or the "
+            "density of ``redshift_prior`` is missing, not finite or 0 throughout."
+        ),
+    )
+    REDSHIFT_OUTSIDE = 16, "The fixed redshift has no redshift of the grid within the tolerance."
+    DUPLICATE_ID = 32, "The id occurred before; only its first row is fitted."
+    HIGH_CHI2 = (
+        64,
+        (
+            "No model fits: the reduced chi2 of the best is above that of nearly all of the "
+            "sample (by three standard deviations of its logarithm; above 10 without 50 others), "
+            "and larger than errors make it."
+        ),
+    )
+    NO_SIGNAL = (
+        128,
+        (
+            "No model has a positive scale, the fluxes being zero or negative: the posterior is "
+            "the prior."
+        ),
+    )
+    REDSHIFT_EDGE = (
+        256,
+        "More than one per cent of the posterior lies on the first or last redshift.",
+    )
+    NO_MODEL = 512, "No model is left by the age of the universe and the priors."
+    BAD_FLUX = 1024, "A flux that is infinite or beyond 1e60 uJy; the band is left out."
+    FEW_FOR_PARAMETERS = (
+        2048,
+        (
+            "Fewer than three fluxes of 2 sigma or more (two if the redshift is known), or than "
+            "free parameters if these are fewer: but for mass, redshift and a color the posterior "
+            "is the prior. Limits are not counted."
+        ),
+    )
+    ALL_LIMITS = 4096, "Upper limits and no flux: any model that is faint enough fits."
+    NO_LIKELIHOOD = (
+        8192,
+        'With ``compat="cigale"``: the best chi2 is so high that every likelihood vanishes.',
+    )
+    LOW_SIGNAL = (
+        16384,
+        "The best model has S/N below 3 over all bands: take masses and luminosities from samples.",
+    )
+    ONE_NODE = (
+        32768,
+        (
+            "Of nodes alone (``interpolate=0``): more than 95 % of the posterior lies on one "
+            "galaxy model at one redshift."
+        ),
+    )
+    OFF_RELATION = (
+        65536,
+        (
+            "Less than 1 % of the posterior keeps ``max_dev_alpha_ox`` of CIGALE's module xray: "
+            "the result is without it."
+        ),
+    )
+    LOW_MASS = (
+        131072,
+        (
+            "The median stellar mass is below 3e6 solar masses at a redshift that was fitted, as "
+            "of few sources that a survey detects: rather another redshift, a star, or a little "
+            "red dot."
+        ),
+    )
+    NOT_CONVERGED = (
+        262144,
+        (
+            "The posterior between nodes is not converged: the effective number of models that "
+            "``interpolate`` asks for was not reached, in all or in a redshift peak or kind of "
+            "model with more than 2 % of the weight."
+        ),
+    )
+    BAND_OFF = (
+        524288,
+        (
+            "One band is off, that of the column ``band_off``: its residual to the best model is "
+            "above 4 errors and makes 40 % of chi2 or more. Look at that flux before you trust "
+            "the fit, or fit without it."
+        ),
+    )
+    OTHER_CLASS = (
+        1048576,
+        (
+            "In a table of classes: the class is not the first one, that of galaxies. The "
+            "redshift is that of the class; masses and all else that is of galaxies are of the "
+            "fit as one, at its redshift, ``redshift_p50_galaxy``."
+        ),
+    )
+    UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192, "Bits with which a row has no result."
+
+
+@dataclass(frozen=True, eq=False)
+class FitData(ObjectRows):
+    """
+    Photometry in arrays, which slices like `~miricigale.fitting.FitResults`.
+
+    Parameters
+    ----------
+    ids : `~numpy.ndarray`, shape (n,)
+        Ids of the objects, as they came.
+    flux, flux_err : `~numpy.ndarray`, shape (n, nb)
+        Measured fluxes and errors in uJy; NaN where there is none.
+    sigma : `~numpy.ndarray`, shape (n, nb)
+        Errors with the model error added in quadrature, of upper limits their own errors;
+        infinite in bands not used.
+    limit : `~numpy.ndarray` of bool, shape (n, nb)
+        Which of the bands used are upper limits.
+    flags : `~numpy.ndarray` of int, shape (n,)
+        `FitFlags`.
+    redshift : `~numpy.ndarray`, shape (n,), optional
+        Known redshifts; NaN where one is missing.
+    """
+
+    ids: PerObject
+    flux: PerObject
+    flux_err: PerObject
+    sigma: PerObject
+    limit: PerObject
+    flags: PerObject
+    redshift: PerObject = None
+
+    @property
+    def used(self):
+        """Which bands are used, shape (n, nb)."""
+        return np.isfinite(self.sigma)
+
+    @property
+    def measured(self):
+        """Which bands are used and no upper limits, shape (n, nb)."""
+        return self.used & ~self.limit
+
+    @property
+    def columns(self):
+        """What results take over: keywords of `~miricigale.fitting.FitResults`."""
+        taken = ("ids", "flux", "flux_err", "sigma", "limit")
+        return {name: getattr(self, name) for name in taken} | {"n_bands": self.used.sum(axis=1)}
+
+    def of_engine(self, log_prior):
+        """Keywords of `~miricigale.fitting.grid.grid.GridEngine.fit`; priors of redshift have the shape (n,
+        nz).
+        """
+        flux, measured, limit = np.nan_to_num(self.flux), self.measured, self.limit
+        signal = np.divide(flux, self.sigma, out=np.zeros(flux.shape), where=measured)
+        # the engine compares directions, of which zeros have none. Just below zero the best scale
+        # of every model is 0 as well, and chi2 is larger by 1e-16 a band
+        dark = measured & (np.sum(signal * signal, axis=1) < _NO_SIGNAL)[:, None]
+        flux = np.where(dark, -_DARK * self.sigma, flux)
+        out = {"flux": flux, "sigma": np.where(limit, np.inf, self.sigma), "log_prior": log_prior}
+        if np.any(limit):
+            out |= {"limit": flux, "limit_sigma": np.where(limit, self.sigma, np.inf)}
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class PhotometryReader:
+    """
+    How a fit takes fluxes and errors from catalogs.
+
+    Parameters
+    ----------
+    bands : tuple of str
+        Bands of the models, each a column of the arrays.
+    filters : tuple of str or None
+        Bands to fit; those that a catalog has by default.
+    model_error, error_floor : dict of str to float
+        Part of the flux that is added to its error in quadrature, and least error as a part of the
+        flux, by filter.
+    n_bands_min : int
+        Objects with fewer usable bands are flagged.
+    zero_point, error_factor : dict of str to float, optional
+        What fluxes and errors of a filter are multiplied by, and errors besides; 1 by default.
+    """
+
+    bands: tuple
+    filters: tuple | None
+    model_error: dict
+    error_floor: dict
+    n_bands_min: int
+    zero_point: dict = field(default_factory=dict)
+    error_factor: dict = field(default_factory=dict)
+
+    def fitted(self, table):
+        """Bands of a catalog that are fitted: tuple of str."""
+        require_columns(table, [], "photometry")
+        if self.filters is not None:
+            return self.filters
+        filters = tuple(name for name in self.bands if name in table.colnames)
+        wanted = f"a table with at least one of the columns {list(self.bands)}"
+        check_that(filters, "photometry", wanted, f"columns {table.colnames}")
+        return filters
+
+    def read(self, table, repeated=None):
+        """
+        Take fluxes and errors from a table.
+
+        Parameters
+        ----------
+        table : `~astropy.table.QTable`
+            As for `~miricigale.fitting.BayesFitter.fit`; masked values are missing bands too. No
+            error, of a limit or with all that is added to it, counts as less than 1e-6 of the flux,
+            and those beyond 1e-60 to 1e60 uJy are of no use.
+        repeated : `~numpy.ndarray` of bool, shape (n,), optional
+            Rows whose id is known from earlier parts of the catalog.
+
+        Returns
+        -------
+        data : `FitData`
+
+        Raises
+        ------
+        ValueError
+            If a column is missing or holds no numbers, one of limits holds something else than true
+            and false, or an id is masked.
+        `~astropy.units.UnitsError`
+            If a flux has no unit of flux density.
+        """
+        filters = self.fitted(table)
+        columns = [c for name in filters for c in (name, error_column(name))]
+        require_columns(table, ["id", *columns], "photometry")
+        for name in columns:
+            if getattr(table[name], "unit", None) is None:
+                how = "no unit: say it, as unit='uJy' of the fit or --flux-unit uJy of the command"
+                raise units_error("photometry", f"convertible to {FNU}", how, column=name)
+        require_columns(table, [], "photometry", units=dict.fromkeys(columns, FNU))
+        n = len(table)
+        shape = (n, len(self.bands))
+        flux, err, sigma = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.inf)
+        limit = np.zeros(shape, dtype=bool)
+        flags = np.zeros(n, dtype=int)
+        for name in filters:
+            i, floor = self.bands.index(name), self.error_floor[name]
+            point = self.zero_point.get(name, 1.0)
+            f = point * flux_column(table, name)
+            e = point * self.error_factor.get(name, 1.0) * flux_column(table, error_column(name))
+            has_flux = np.abs(f) < _LARGE
+            known = (e > _SMALL) & (e < _LARGE)
+            flags[~np.isnan(f) & ~has_flux] |= int(FitFlags.BAD_FLUX)
+            # a flux without error is a missing band; an error that cannot be used is flagged
+            flags[has_flux & ~known & ~np.isnan(e)] |= int(FitFlags.BAD_ERROR)
+            good = has_flux & known
+            flux[:, i], err[:, i] = f, e
+            size = np.abs(np.where(good, f, 0.0))
+            own = np.where(good, e, 1.0)
+            total = np.hypot(np.maximum(own, floor * size), self.model_error[name] * size)
+            limit[:, i] = good & limits(table, name)
+            total = np.maximum(np.where(limit[:, i], own, total), _LEAST_ERROR * size)
+            sigma[:, i] = np.where(good, total, np.inf)
+        n_bands = np.isfinite(sigma).sum(axis=1)
+        flags[(n_bands > 0) & (n_bands == limit.sum(axis=1))] |= int(FitFlags.ALL_LIMITS)
+        flags[n_bands == 0] |= int(FitFlags.NO_BAND)
+        flags[(n_bands > 0) & (n_bands < self.n_bands_min)] |= int(FitFlags.FEW_BANDS)
+        ids = read_ids(table)
+        first = np.zeros(n, dtype=bool)
+        first[np.unique(ids, return_index=True)[1]] = True
+        flags[~first if repeated is None else ~first | repeated] |= int(FitFlags.DUPLICATE_ID)
+        return FitData(ids, flux, err, sigma, limit, flags)
+
+
+def unused_bands(table, filters):
+    """
+    Names of the bands of a catalog that are not fitted (``filters``), in the order of the columns.
+
+    A column is a band if it has an error ``<name>_err`` and both are in a unit of flux
+    density, or if its name is that of a filter.
+    """
+    columns = set(table.colnames)
+
+    def measured(name):
+        pair = (name, error_column(name))
+        return columns.issuperset(pair) and all(_is_flux(table[column]) for column in pair)
+
+    others = (name for name in table.colnames if name not in filters)
+    return [name for name in others if is_filter(name) or measured(name)]
+
+
+def is_filter(name):
+    """Whether a column is called by a filter of the library; errors of any filter of astro-sedpy are not."""
+    if name in Filter.names():
+        return True
+    return name.startswith(SEDPY) and not name.endswith((error_column(""), "_limit"))
+
+
+def _is_flux(column):
+    """Whether a column has a unit of flux density."""
+    unit = getattr(column, "unit", None)
+    try:
+        return unit is not None and (flux_unit(unit) or u.Unit(unit)).is_equivalent(FNU)
+    except (TypeError, ValueError):
+        return False
+
+
+def limits(table, name):
+    """
+    Rows whose flux in a band is an upper limit: array of bool, shape (n,).
+
+    The column ``<name>_limit``, if it is there, is boolean, or holds 0 and 1 or ``true`` and
+    ``false`` as text files do; masked and empty values are no limits. A `ValueError` is raised for a column
+    that holds something else, such as the limit itself.
+    """
+    column = f"{name}_limit"
+    if column not in table.colnames:
+        return np.zeros(len(table), dtype=bool)
+    values = table[column]
+    mask = np.asarray(getattr(values, "mask", False))
+    plain = np.asarray(getattr(values, "unmasked", np.ma.getdata(values)))
+    text = np.char.strip(np.char.lower(plain.astype(str)))
+    limit, known = np.isin(text, _TRUE), np.isin(text, (*_TRUE, *_FALSE))
+    if getattr(values, "unit", None) is not None:
+        known = limit = np.zeros(len(table), dtype=bool)
+    if plain.shape != (len(table),) or not np.all(known | mask):
+        wanted = f"a table whose column {column!r} is boolean"
+        some = ", ".join(str(value) for value in values[:3])
+        raise argument_error("photometry", wanted, f"{some}, ...")
+    return limit & ~mask
+
+
+def filter_names(argument, filters):
+    """Names of a `~miricigale.filters.FilterSet` or list of names: tuple of str."""
+    if isinstance(filters, str):
+        raise argument_error(argument, "a list of names or a FilterSet", repr(filters))
+    return tuple(getattr(filters, "names", filters))
+
+
+def per_band(value, filters, name):
+    """A setting by filter, dict of str to float: given as a number or by name."""
+    given = value if isinstance(value, dict) else dict.fromkeys(filters, value)
+    unknown = sorted(set(given) - set(filters))
+    check_that(not unknown, name, f"a dict with keys among {list(filters)}", unknown)
+    # 10 % is 0.1
+    unit = u.dimensionless_unscaled
+    out = {f: float(to_array(given.get(f, 0.0), unit, name, ndim=0)) for f in filters}
+    if not all(np.isfinite(part) and part >= 0 for part in out.values()):
+        raise argument_error(name, "finite and not negative", f"{value}")
+    return out
+
+
+def flux_column(table, name):
+    """
+    Fluxes of a column in uJy, NaN where masked: a new array, shape (n,).
+
+    A `ValueError` is raised for one without real numbers, or with several in a row.
+    """
+    column = table[name]
+    column = getattr(column, "unmasked", column)
+    kind = getattr(column, "dtype", np.dtype(float)).kind
+    if kind not in "fiuO":
+        wanted = f"a table with numbers in column {name!r}"
+        raise argument_error("photometry", wanted, _KINDS.get(kind, str(column.dtype)))
+    array = to_array(column, FNU, name, ndim=1).copy()
+    array[np.broadcast_to(np.asarray(getattr(table[name], "mask", False)), array.shape)] = np.nan
+    return array
+
+
+def flags_of_fits(results, measured, edge_weight):
+    """
+    Flags of results, with those that the fits show.
+
+    ``measured`` are the bands with a flux, shape (n, nb); ``edge_weight`` is the weight of the first
+    or last redshift above which an object is flagged, None where redshifts were fixed.
+    """
+    flags, fitted, pdf = np.array(results.flags), results.fitted, results.pdf["redshift"]
+    signal = np.where(measured, results.best_flux / results.sigma, 0.0)
+    with np.errstate(invalid="ignore"):
+        flags[fitted & (results.band_off != "")] |= FitFlags.BAND_OFF
+        flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
+        faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
+        flags[fitted & faint] |= FitFlags.LOW_SIGNAL
+        if edge_weight is not None and pdf.shape[1] > 2:
+            edge = np.maximum(pdf[:, 0], pdf[:, -1]) > edge_weight
+            flags[fitted & edge] |= FitFlags.REDSHIFT_EDGE
+        if edge_weight is not None and "stellar_mass" in results.quantities:
+            flags[fitted & (results.median("stellar_mass").value < LOW_MASS)] |= FitFlags.LOW_MASS
+    flags[~fitted & ((flags & FitFlags.UNFITTED) == 0)] |= FitFlags.NO_SIGNAL
+    return flags

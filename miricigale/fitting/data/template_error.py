@@ -1,0 +1,93 @@
+"""Errors of models by rest wavelength, as a part of the flux."""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.utils.decorators import deprecated
+
+from miricigale.filters import FilterSet
+from miricigale.refdata import locate
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
+from miricigale.utils.options import check_kind
+from miricigale.utils.table_files import read_table
+from miricigale.utils.units import WAVE, frozen_array, to_array
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateError:
+    """
+    How well models represent real galaxies, by rest wavelength (Brammer et al. 2008, ApJ 686, 1503).
+
+    At every redshift of a grid the flux of a band has this part of it added to its error in quadrature, at
+    the band's pivot wavelength over 1 + z. The likelihood keeps its normalization: a redshift is not
+    preferred for putting bands where errors are large.
+
+    Parameters
+    ----------
+    wave : `~astropy.units.Quantity`, shape (n,)
+        Ascending rest wavelengths.
+    error : array_like, shape (n,)
+        Error as a part of the flux; linear between logarithms of wavelength, constant outside.
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`
+        If wavelengths have no unit of length.
+    ValueError
+        If wavelengths do not ascend from above 0, or errors are negative, not finite or not as many.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.fitting import SurveyCalibration, TemplateError
+    >>> error = TemplateError([0.1, 1.0, 10.0] * u.um, [0.15, 0.05, 0.30])
+    >>> error([0.1, 3.0] * u.um).round(3)
+    array([0.15 , 0.169])
+    >>> SurveyCalibration.survey().template_error([0.5, 8.0] * u.um).round(3)
+    array([0.059, 0.47 ])
+    """
+
+    wave: u.Quantity
+    error: np.ndarray
+
+    def __post_init__(self):
+        wave, error = to_array(self.wave, WAVE, "wave", ndim=1), floats(self.error)
+        if wave.size == 0 or not (wave[0] > 0 and np.all(np.diff(wave) > 0)):
+            raise argument_error("wave", "ascending values above 0", f"{wave}")
+        if error.shape != wave.shape or not np.all(np.isfinite(error) & (error >= 0)):
+            raise argument_error("error", f"{wave.size} finite values, 0 or more", f"{error}")
+        self.__dict__.update(wave=frozen_array(wave) * WAVE, error=frozen_array(error))
+
+    def __call__(self, wave):
+        """Error at rest wavelengths (`~astropy.units.Quantity`): `~numpy.ndarray` of their shape."""
+        wave = to_array(wave, WAVE, "wave")
+        return np.interp(np.log(wave), np.log(self.wave.to_value(WAVE)), self.error)
+
+    @classmethod
+    def from_meta(cls, values):
+        """Template error of the plain values (``um`` and ``error``) in the file of a `SurveyCalibration`."""
+        return cls(values["um"] * WAVE, values["error"])
+
+    @classmethod
+    @deprecated("1.0", alternative="SurveyCalibration.survey().template_error")
+    def survey(cls):
+        """Template error of `~miricigale.sed.SEDModel.survey`: that of `SurveyCalibration.survey`."""
+        # the file is read here too: the calibration knows template errors, not the other way round
+        table = read_table(locate("survey.ceers"), wanted="a calibration", form="ascii.ecsv")
+        return cls.from_meta(table.meta["template_error"])
+
+
+def pivots(filters):
+    """Pivot wavelengths of a `FilterSet`, or of bands by name."""
+    filters = filters if isinstance(filters, FilterSet) else FilterSet.from_names(filters)
+    return u.Quantity([one.pivot for one in filters]).to(WAVE)
+
+
+def grid_errors(template_error, filters, redshift):
+    """Template errors of bands at the redshifts of a grid, 0 without: shape (nz, nb)."""
+    if template_error is None:
+        return np.zeros((len(redshift), len(filters)))
+    check_kind(template_error, "template_error", TemplateError)
+    return template_error(pivots(filters) / (1.0 + np.asarray(redshift)[:, None]))

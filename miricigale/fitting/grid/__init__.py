@@ -1,0 +1,1 @@
+"""Fits on grids of models, and between their nodes."""

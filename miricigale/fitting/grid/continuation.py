@@ -1,0 +1,623 @@
+"""Grids with what lies between their nodes, and the posteriors of objects there."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.special import log_ndtr, ndtri
+from scipy.stats import qmc
+
+from miricigale.fitting import _core
+from miricigale.fitting.data.likelihood import FitFlags
+from miricigale.fitting.grid.adaptive import AdaptiveSampler, places_to_values, redshift_peaks
+from miricigale.fitting.grid.grid import GridEngine
+from miricigale.fitting.grid.interpolation import InterpolatedModels, grid_models
+from miricigale.fitting.posterior.priors import GridAxis
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, draws_summary, node_shares
+from miricigale.fitting.results.results import FitResults
+from miricigale.utils.units import Frozen
+
+
+def between_results(fit, data, posteriors, pairs):
+    """
+    Results of objects that all have a posterior between the nodes.
+
+    Parameters
+    ----------
+    fit : `~miricigale.fitting.grid.grid_fit.GridFit`
+        The fit.
+    data : `~miricigale.fitting.data.likelihood.Photometry`
+        Photometry of n objects.
+    posteriors : list of `~miricigale.fitting.grid.continuation.BetweenPosterior`
+        Their posteriors.
+    pairs : tuple of tuple of str
+        Parameters whose joint posteriors are asked for.
+
+    Returns
+    -------
+    results : `~miricigale.fitting.FitResults`
+    """
+    axes = fit.priors.axes
+    n = len(posteriors)
+    # of a grid without AGN it has one fraction
+    fractions = fit.grid.frac_agn.size
+    size = {name: axis.values.size for name, axis in axes.items()} | {"frac_agn": fractions}
+    arrays = {
+        "pdf": {name: np.empty((n, size[name])) for name in axes},
+        "pairs": {(x, y): np.empty((n, size[x], size[y])) for x, y in pairs},
+        "pdf_2d": np.empty((n, size["redshift"], fractions)),
+        "axis_moments": np.empty((n, len(axes), 2)),
+        "axis_quantiles": np.empty((n, len(axes), DERIVED_LEVELS.size)),
+    }
+    for i, posterior in enumerate(posteriors):
+        _put_parameters(arrays, i, posterior)
+    flags = np.array(data.flags)
+    converged = np.array([posterior.converged for posterior in posteriors], bool)
+    flags[~converged] |= int(FitFlags.NOT_CONVERGED)
+    node = np.array([posterior.best_node for posterior in posteriors]).reshape(n, -1)
+    log_errors = fit.log_errors(data)
+    data = fit.with_template_error(data, node[:, 0])
+    moments, quantiles = _derived_summaries(fit.engine.quantities, posteriors)
+    flux = np.array([posterior.flux for posterior in posteriors])
+    outlier = None
+    if fit.engine.mixture is not None:
+        wrong = np.array([posterior.wrong for posterior in posteriors])
+        used = np.isfinite(data.sigma) | data.limit
+        outlier = np.where(used, wrong, np.nan)
+    return FitResults(
+        **data.columns,
+        **arrays,
+        **fit.result_settings(),
+        flags=flags,
+        chi2=_column(posteriors, "chi2"),
+        log_evidence=_column(posteriors, "log_sum") - log_errors,
+        best_index=fit.between.index_of_nodes(node),
+        best_scale=_column(posteriors, "best_scale"),
+        best=_best(fit, posteriors),
+        moments=moments,
+        quantiles=quantiles,
+        model_flux=flux[:, 0],
+        model_flux_std=flux[:, 1],
+        best_flux=_column(posteriors, "best_flux"),
+        outlier=outlier,
+    )
+
+
+def with_axis_summaries(results):
+    """Results on nodes, not converged, with the moments and quantiles of parameters that others have."""
+    names = list(results.axes)
+    n = len(results)
+    moments = np.full((n, len(names), 2), np.nan)
+    quantiles = np.full((n, len(names), DERIVED_LEVELS.size), np.nan)
+    flags = np.array(results.flags)
+    fitted = np.isfinite(results.chi2)
+    flags[fitted] |= int(FitFlags.NOT_CONVERGED)
+    for i in np.flatnonzero(fitted):
+        single = results[i]
+        for j, name in enumerate(names):
+            moments[i, j] = single.mean(name).value, single.std(name).value
+            quantiles[i, j] = single.percentile(name, DERIVED_LEVELS).value
+    return replace(results, flags=flags, axis_moments=moments, axis_quantiles=quantiles)
+
+
+def _put_parameters(arrays, i, posterior):
+    """Put the posterior of the parameters in row ``i`` of arrays."""
+    node = posterior.node
+    weight = posterior.weight
+    for j, (name, table) in enumerate(arrays["pdf"].items()):
+        table[i] = node_shares((node[name],), table.shape[1:], weight)
+        moments, quantiles = draws_summary(posterior.values[name], weight=weight)
+        arrays["axis_moments"][i, j] = moments[:2]
+        arrays["axis_quantiles"][i, j] = quantiles
+    joint = arrays["pairs"] | {("redshift", "frac_agn"): arrays["pdf_2d"]}
+    for (x, y), table in joint.items():
+        table[i] = node_shares((node[x], node[y]), table.shape[1:], weight)
+
+
+def _derived_summaries(quantities, posteriors):
+    """Moments, (n, n_quantities, 3), and quantiles, (n, n_quantities, n_levels), of derived quantities."""
+    n = len(posteriors)
+    moments = np.full((n, len(quantities.names), 3), np.nan)
+    quantiles = np.full((n, len(quantities.names), DERIVED_LEVELS.size), np.nan)
+    for j, name in enumerate(quantities.names):
+        with_log = name not in quantities.intensive
+        for i, posterior in enumerate(posteriors):
+            if name in posterior.derived:
+                summary = draws_summary(
+                    posterior.derived[name], with_log=with_log, weight=posterior.weight
+                )
+                moments[i, j], quantiles[i, j] = summary
+    return moments, quantiles
+
+
+def _best(fit, posteriors):
+    """Parameters and derived quantities of the best models: dict of str to array."""
+    out = {}
+    for name in (*fit.priors.axes, *fit.engine.quantities.names):
+        values = [posterior.best.get(name, np.nan) for posterior in posteriors]
+        out[name] = np.array(values, float)
+    return out
+
+
+def _column(posteriors, name):
+    """An attribute of all posteriors as an array."""
+    return np.array([getattr(posterior, name) for posterior in posteriors])
+
+
+#: Draws of the posterior on nodes that sampling begins with.
+N_START = 256
+#: Fluxes of galaxies that differ by less than this part, along an axis, are the same.
+_SAME_FLUX = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Continuation(Frozen):
+    """
+    A grid with what lies between its nodes; picklable.
+
+    Parameters
+    ----------
+    engine : `~miricigale.fitting.grid.grid.GridEngine`
+        Its models and priors.
+    models : `~miricigale.fitting.grid.interpolation.InterpolatedModels`
+        Models between its nodes.
+    agn_error : float
+        Error of the AGN's light as a part of it.
+    scramble : int, optional
+        Seed of the quasi-random points, which are those of all objects.
+    """
+
+    engine: GridEngine
+    models: InterpolatedModels
+    agn_error: float = 0.0
+    scramble: int = 1
+
+    @cached_property
+    def axes(self):
+        """`GridAxis` of redshift, AGN fraction, galaxies and AGN, in this order: dict by name."""
+        known, grid = self.engine.priors.axes, self.engine.grid
+        out = {}
+        for name, values in (("redshift", grid.redshift), ("frac_agn", grid.frac_agn)):
+            equal = np.full(values.size, 1.0 / values.size)
+            out[name] = known.get(name) or GridAxis(name, values, 1, name, equal)
+        for kind in ("galaxy", "agn"):
+            out |= {name: axis for name, axis in known.items() if axis.kind == kind}
+        return out
+
+    @cached_property
+    def _models(self):
+        """Model of each combination of values of the axes, (n_1, n_2, ...), -1 where there is none: by kind."""
+        grid = self.engine.grid
+        axes = self.engine.priors.axes
+        return {
+            "galaxy": grid_models(axes, "galaxy", grid.n_galaxies),
+            "agn": grid_models(axes, "agn", grid.n_agn),
+        }
+
+    @cached_property
+    def space(self):
+        """`_core.Space` of the cells."""
+        axes = list(self.axes.values())
+        size = np.array([axis.values.size for axis in axes], np.int64)
+        low, high, log_prior = np.zeros((3, len(size), max(size)))
+        for i, axis in enumerate(axes):
+            n, values = size[i], axis.values
+            # none beyond the outermost
+            low[i, :n], high[i, :n] = np.clip(axis.cells(), values[0], values[-1])
+            if axis.kind in ("frac_agn", "agn"):
+                log_prior[i, :n] = _log(axis.weights)
+        galaxy = self._models["galaxy"]
+        light = self.models.light
+        return _core.Space(size, low, high, log_prior, galaxy.ravel(), galaxy.ndim, light)
+
+    @cached_property
+    def labels(self):
+        """`LabelTable` of objects whose redshift is free."""
+        return LabelTable.of_axes(list(self.axes.values()), self._without_effect)
+
+    @cached_property
+    def labels_at_redshift(self):
+        """The same where it is known: redshift is then no axis."""
+        return self.labels.without_first_axis()
+
+    @cached_property
+    def _without_effect(self):
+        """Which axes (columns) have no effect where what others (rows) measure is absent: (n_axes, n_axes)."""
+        axes = list(self.axes.values())
+        out = np.zeros((len(axes), len(axes)), bool)
+        for kind in ("galaxy", "agn"):
+            own = [i for i, axis in enumerate(axes) if axis.kind == kind]
+            model = self._models[kind]
+            for k, i in enumerate(own):
+                if not axes[i].absent_at_zero:
+                    continue
+                absent = model.take([0], axis=k)
+                for m, j in enumerate(own):
+                    first = absent.take([0], axis=m)
+                    out[i, j] = j != i and self._same(kind, absent, first)
+        out[1, [axis.kind == "agn" for axis in axes]] = True
+        return out
+
+    def _same(self, kind, models, first):
+        """Whether models have the fluxes of others, which broadcast; where both are there."""
+        both = (models >= 0) & (first >= 0)
+        a, b = np.broadcast_arrays(models, first)
+        a, b = a[both], b[both]
+        if kind == "galaxy":
+            dust = self.engine.grid.dust_luminosity
+            if not np.allclose(dust[a], dust[b], rtol=_SAME_FLUX, atol=0):
+                return False
+        table = getattr(self.engine, kind)
+        for z in {0, len(table) // 2, len(table) - 1}:
+            top = np.abs(table[z, b]).max(axis=-1, keepdims=True, initial=0.0)
+            if np.any(np.abs(table[z, a] - table[z, b]) > _SAME_FLUX * top):
+                return False
+        return True
+
+    def _work(self):
+        return self.models.make_work()
+
+    @cached_property
+    def _values(self):
+        """Values of the models of the grid by kind: dicts by name; of those with several values the first."""
+        out = {}
+        axes = self.engine.priors.axes
+        for kind in ("galaxy", "agn"):
+            names = [name for name, axis in axes.items() if axis.kind == kind]
+            # of models that stand for several values the first
+            first = [axes[name].share.argmax(axis=0) for name in names]
+            out[kind] = {name: axes[name].values[i] for name, i in zip(names, first, strict=True)}
+        return out
+
+    def at_redshift(self, redshift, node):
+        """`GridEngine` of all models of the grid at one redshift; what else depends on it is that of a node."""
+        engine = self.engine
+        new = {"usable": engine.usable[node : node + 1]}
+        for kind, values in self._values.items():
+            z = np.full(getattr(engine, kind).shape[1], redshift)
+            if not z.size:
+                new[kind] = engine.agn[:1]
+            elif kind == "galaxy":
+                flux = self.models.galaxy_fluxes(values, z)
+                # galaxies older than the universe there, if not at the node
+                exists = np.isfinite(flux).all(axis=1)
+                new["usable"] = new["usable"] & exists
+                new[kind] = np.where(exists[:, None], flux, 0.0)[None]
+            else:
+                new[kind] = self.models.agn_fluxes(values, z)[None]
+        density, prior = engine.density, engine.mass_prior
+        new["template_error"] = engine.template_error[node : node + 1]
+        if density is not None:
+            new["density"] = replace(density, table=density.table[node : node + 1])
+        new["mass_prior"] = prior and (lambda formed, _: prior(formed, [node]))
+        return replace(engine, **new)
+
+    @cached_property
+    def _log_usable(self):
+        """2 ln(prior) of the galaxies, shape (nz, nG)."""
+        prior = self.engine.priors.galaxy
+        return np.where(self.engine.usable, 2.0 * _log(prior / prior.sum()), _core.NEVER)
+
+    @cached_property
+    def _masses(self):
+        """`_core.Masses` of the grid."""
+        density = self.engine.density
+        if density is None:
+            n_z, n_galaxies = self.engine.usable.shape
+            return _core.Masses(np.zeros((n_z, 2)), np.zeros(n_galaxies), 0.0)
+        return _core.Masses(density.table, density.log_stars, density.per_dex)
+
+    def place(self, n_effective, posteriors, node, redshift, known):
+        """
+        Put models between the nodes, with the weights of the posterior of an object.
+
+        Parameters
+        ----------
+        n_effective : int
+            Effective number of models.
+        posteriors : dict
+            Gets, at the row of the object, a `BetweenPosterior`, or None if no model is possible.
+        node : int or None
+            Node that stands for the redshift; None if that is free.
+        redshift : float
+            Redshift of the object; 0 if it is free.
+        known : `~miricigale.fitting.grid.grid.ObjectOnNodes`
+            What is known of the object.
+        """
+        start = known.start
+        mixture = known.wrong and self._mixture(*known.wrong)
+        log_usable = known.log_usable
+        masses = self._masses
+        if log_usable is None:
+            log_usable = self._log_usable
+        else:
+            # these have the prior of mass
+            masses = masses._replace(table=np.zeros((len(masses.table), 2)), per_dex=0.0)
+        if node is not None:
+            masses = masses._replace(table=masses.table[node : node + 1])
+            if known.log_usable is None:
+                log_usable = log_usable[node : node + 1]
+        one = _core.Object(
+            known.target, known.limits, mixture, log_usable, masses, redshift, self.agn_error
+        )
+        if redshift:
+            labels, borders, weights = self.labels_at_redshift, np.zeros(0), np.ones(1)
+        else:
+            labels = self.labels
+            borders, weights = redshift_peaks(self.engine.grid.redshift, start.zf.sum(axis=1))
+        given = self.space, labels.kernel, self._work(), one, borders, weights
+        sampler = AdaptiveSampler(
+            *given, wanted=n_effective, scramble=self.scramble, pursue=start.larger_errors
+        )
+        label, score = labels.of_nodes(self._cells_of(start.index))
+        peak = np.searchsorted(borders, self.engine.grid.redshift[start.index[:, 0]])
+        models = sampler.run(label, score, peak)
+        posteriors[known.row] = models and self._describe(models, one, known)
+
+    def _cells_of(self, drawn):
+        """Nodes of the axes of draws from the posterior on nodes: (n, n_axes)."""
+        z, g, k, f = drawn.T
+        columns = []
+        for axis in self.axes.values():
+            if axis.share is None:
+                columns.append(z if axis.kind == "redshift" else f)
+            else:
+                node = axis.share.argmax(axis=0)
+                columns.append(node[g if axis.kind == "galaxy" else np.maximum(k, 0)])
+        return np.stack(columns, axis=1)
+
+    def _mixture(self, stated, sigma, broad):
+        """`_core.Mixture` of an object."""
+        used, part = stated.bands, self.engine.mixture.part[stated.bands]
+        narrow, wide = np.take(stated.weight, used, axis=1), broad[used]
+        odds = part / (1.0 - part) / np.sqrt(narrow) / wide
+        # of fluxes in units of the errors without that of templates
+        level = 0.5 * np.log(narrow * np.square(sigma[used])).sum(axis=1)
+        return _core.Mixture(narrow, wide**-2.0, odds, level, np.zeros(len(broad)))
+
+    def index_of_nodes(self, node):
+        """Redshift, galaxy, AGN model and fraction of nodes of the axes, (n, n_axes): (n, 4), -1 for none."""
+        index = np.full((len(node), 4), -1)
+        index[:, 0] = node[:, 0]
+        index[:, 3] = node[:, 1]
+        kinds = np.array([axis.kind for axis in self.axes.values()])
+        for column, kind in ((1, "galaxy"), (2, "agn")):
+            models = self._models[kind]
+            own = node[:, kinds == kind]
+            if own.shape[1]:
+                index[:, column] = models[tuple(own.T)]
+            else:
+                index[:, column] = models.ravel()[0]
+        without_agn = self.engine.grid.frac_agn[node[:, 1]] == 0.0
+        index[without_agn, 2] = -1
+        return index
+
+    def _describe(self, models, one, known):
+        """`BetweenPosterior` of models."""
+        values = {}
+        node = {}
+        for j, name in enumerate(self.axes):
+            node[name], values[name] = places_to_values(self.space, j, models.place[:, j])
+        weight = models.weight
+        z = node["redshift"]
+        if one.redshift:
+            values["redshift"] = np.full(len(weight), one.redshift)
+            z = np.zeros(len(weight), int)
+        flux, _ = self.models.fluxes(values, values["redshift"], values["frac_agn"])
+        scale = self.engine.drawn_scale(models.scale, models.variance, models.uniform)
+        drawn_flux = flux * scale[:, None]
+        share = None
+        if known.wrong:
+            stated, _, broad = known.wrong
+            given = drawn_flux, stated, broad, one.limits, z, weight
+            share = self.engine.mixture.shares(*given)
+        mean = weight @ drawn_flux
+        variance = weight @ np.square(drawn_flux - mean)
+        # the best model is that of the highest likelihood, at its own scale
+        best = int(np.argmax(models.log_likelihood))
+        best_flux = flux[best] * models.scale[best]
+        stated = known.wrong[0] if known.wrong else one.target
+        return BetweenPosterior(
+            values=values,
+            node=node,
+            derived=self._derived(values, models, scale),
+            weight=weight,
+            wrong=share,
+            flux=np.array([mean, np.sqrt(variance)]),
+            best=self._best(values, models, best),
+            best_node=np.array([node[name][best] for name in self.axes]),
+            best_scale=models.scale[best],
+            best_flux=best_flux,
+            chi2=_chi2(stated, one.limits, z[best], best_flux),
+            log_sum=models.log_evidence + known.zero + known.log_norm,
+            converged=models.converged,
+        )
+
+    def _derived(self, values, models, scale):
+        """Derived quantities by name, shape (n,), of models with scales (n,)."""
+        return self.models.describe(values, values["redshift"], models.power, scale)
+
+    def _best(self, values, models, best):
+        """Parameters and derived quantities of the best model: dict of str to float."""
+        row = slice(best, best + 1)
+        own = {name: value[row] for name, value in values.items()}
+        derived = self.models.describe(own, own["redshift"], models.power[row], models.scale[row])
+        out = {name: float(value[0]) for name, value in (own | derived).items()}
+        if not out["frac_agn"] > 0:
+            # without AGN light there is no template
+            for name, axis in self.axes.items():
+                if axis.kind == "agn":
+                    out[name] = np.nan
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class BetweenPosterior:
+    """
+    Posterior of an object between nodes.
+
+    Parameters
+    ----------
+    values, node, derived : dict of str to `~numpy.ndarray`, shape (n,)
+        Values of parameters, nodes in whose cells these are, and derived quantities, of n models.
+    weight : `~numpy.ndarray`, shape (n,)
+        Weights of the models; they sum to 1.
+    wrong : `~numpy.ndarray` or None, shape (nb,)
+        How likely each band is wrong.
+    flux : `~numpy.ndarray`, shape (2, nb)
+        Mean and standard deviation of the fluxes of the models.
+    best : dict of str to float
+        Parameters and derived quantities of the model of the highest likelihood.
+    best_node : `~numpy.ndarray` of int, shape (n_axes,)
+        Nodes in whose cells that is.
+    best_scale : float
+        Its scale.
+    best_flux : `~numpy.ndarray`, shape (nb,)
+        Its fluxes.
+    chi2 : float
+        Its chi2.
+    log_sum : float
+        Ln of the sum of prior exp(-chi2 / 2).
+    converged : bool
+        Whether the effective number of models is what was asked for.
+    """
+
+    values: dict
+    node: dict
+    derived: dict
+    weight: np.ndarray
+    wrong: np.ndarray | None
+    flux: np.ndarray
+    best: dict
+    best_node: np.ndarray
+    best_scale: float
+    best_flux: np.ndarray
+    chi2: float
+    log_sum: float
+    converged: bool
+
+
+def _chi2(target, limits, z, flux):
+    """Chi2 of the fluxes of a model, with errors at a node of redshift."""
+    chi2 = np.sum(target.weight[z] * np.square(target.flux - flux))
+    if limits is not None:
+        faint = limits.level - flux[limits.bands] * limits.inverse
+        chi2 -= 2.0 * log_ndtr(faint).sum()
+    return chi2
+
+
+@dataclass(frozen=True, eq=False)
+class LabelTable:
+    """
+    What posteriors between nodes tell apart: components that are absent or present, and values that are labels.
+
+    Parameters
+    ----------
+    kernel : `_core.Labels`
+        Ranges of cells and active axes of each.
+    of_range : `~numpy.ndarray` of int, shape (n_ranges_1, n_ranges_2, ...)
+        Label of each combination of the ranges of the axes; -1 where there is no prior weight.
+    range_of : list of `~numpy.ndarray` of int
+        Range of each cell, by axis.
+    """
+
+    kernel: tuple
+    of_range: np.ndarray
+    range_of: list
+
+    @classmethod
+    def of_axes(cls, axes, without_effect):
+        """Of `GridAxis`, and which have no effect where others are absent; see `Continuation`."""
+        n_axes = len(axes)
+        largest = max(axis.values.size for axis in axes)
+        ranges = [axis.ranges for axis in axes]
+        below, log_share = np.zeros((n_axes, largest + 1)), np.zeros((n_axes, largest))
+        for i, axis in enumerate(axes):
+            n = axis.values.size
+            # what is known of redshift comes with each object
+            weight = np.full(n, 1.0 / n) if axis.kind == "redshift" else axis.weights
+            below[i, 1 : n + 1] = np.cumsum(weight)
+            below[i, n + 1 :] = below[i, n]
+            log_share[i, :n] = _log(weight)
+        of_range = np.full([len(r) for r in ranges], -1)
+        known, rows = {}, []
+        for index in np.ndindex(of_range.shape):
+            absent = [axes[i].absent_at_zero and index[i] == 0 for i in range(n_axes)]
+            inert = without_effect[np.array(absent, bool)].any(axis=0)
+            cells = []
+            for i in range(n_axes):
+                cells.append((0, axes[i].values.size) if inert[i] else ranges[i][index[i]])
+            key = tuple(cells)
+            if key not in known:
+                first, count = np.array(cells).T
+                share = below[np.arange(n_axes), first + count] - below[np.arange(n_axes), first]
+                known[key] = len(rows) if np.all(share > 0) else -1
+                if known[key] >= 0:
+                    rows.append((first, count, inert | (count == 1)))
+            of_range[index] = known[key]
+        first, count, still = (np.array(column) for column in zip(*rows, strict=True))
+        kernel = _labels(first, count, still, below, log_share)
+        range_of = [np.repeat(np.arange(len(r)), [n for _, n in r]) for r in ranges]
+        return cls(kernel, of_range, range_of)
+
+    def without_first_axis(self):
+        """The same, but for the first axis, which has one cell."""
+        own = self.kernel
+        first, count = own.first.copy(), own.count.copy()
+        below, log_share = own.below.copy(), own.log_share.copy()
+        first[:, 0], count[:, 0] = 0, 1
+        below[0], log_share[0] = 1.0, 0.0
+        below[0, 0] = 0.0
+        still = np.ones(first.shape, bool)
+        for i, n in enumerate(own.n_active):
+            still[i, own.axes[i, :n]] = False
+        still[:, 0] = True
+        kernel = _labels(first, count, still, below, log_share)
+        return LabelTable(kernel, self.of_range, self.range_of)
+
+    def of_nodes(self, node):
+        """
+        Labels and scores of places anywhere in the cells of nodes.
+
+        Parameters
+        ----------
+        node : `~numpy.ndarray` of int, shape (n, n_axes)
+            Nodes of the axes.
+
+        Returns
+        -------
+        label : `~numpy.ndarray` of int, shape (n,)
+            Their labels.
+        score : `~numpy.ndarray`, shape (n, n_axes)
+            Quasi-random scores, the same for the same nodes; standard normal in axes without effect.
+        """
+        n, n_axes = node.shape
+        index = tuple(self.range_of[i][node[:, i]] for i in range(n_axes))
+        label, every = self.of_range[index], np.arange(n_axes)
+        uniform = qmc.Sobol(n_axes, seed=2).random(n)
+        own, below = self.kernel, self.kernel.below
+        first, count = own.first[label], own.count[label]
+        inside = (node >= first) & (node < first + count)
+        cell = np.where(inside, node, first)
+        start = below[every, first]
+        whole = below[every, first + count] - start
+        place = below[every, cell] + uniform * (below[every, cell + 1] - below[every, cell])
+        score = ndtri(np.clip((place - start) / whole, 1e-6, 1.0 - 1e-6))
+        active = np.zeros(own.first.shape, bool)
+        for i, k in enumerate(own.n_active):
+            active[i, own.axes[i, :k]] = True
+        return label, np.where(active[label], score, ndtri(np.clip(uniform, 1e-6, 1.0 - 1e-6)))
+
+
+def _labels(first, count, still, below, log_share):
+    """`_core.Labels` of ranges, of which some axes have no effect."""
+    axes, n_active = np.zeros(first.shape, np.int64), (~still).sum(axis=1)
+    for i, row in enumerate(~still):
+        axes[i, : n_active[i]] = np.flatnonzero(row)
+    first, count = first.astype(np.int64), count.astype(np.int64)
+    return _core.Labels(first, count, axes, n_active.astype(np.int64), below, log_share)
+
+
+def _log(weights):
+    """Logarithms of weights; of 0 a number that is none."""
+    return np.log(weights, where=weights > 0, out=np.full(np.shape(weights), _core.NEVER))

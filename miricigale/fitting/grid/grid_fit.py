@@ -1,0 +1,455 @@
+"""Fits on a model grid: priors of redshift, joint posteriors, and what the engine finds as results."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from miricigale.filters import FilterSet
+from miricigale.fitting.data.likelihood import FitFlags, filter_names
+from miricigale.fitting.data.settings import GridSettings
+from miricigale.fitting.data.template_error import TemplateError, grid_errors
+from miricigale.fitting.grid.continuation import (
+    N_START,
+    Continuation,
+    between_results,
+    with_axis_summaries,
+)
+from miricigale.fitting.grid.grid import GridEngine
+from miricigale.fitting.grid.interpolation import InterpolatedModels
+from miricigale.fitting.grid.mixture import BandMixture
+from miricigale.fitting.posterior.populations import MassPrior, expected_sfr, sfr_log_prior
+from miricigale.fitting.posterior.posterior import check_pairs, joint_names, joint_tables
+from miricigale.fitting.posterior.priors import (
+    density_log_prior,
+    fixed_log_prior,
+    grid_priors,
+    known_redshifts,
+)
+from miricigale.fitting.posterior.quantities import Quantities, plain
+from miricigale.fitting.results.results import CIGALE_LEAST_STD, FitResults
+from miricigale.fitting.results.samples import Samples
+from miricigale.sed import ModelGrid, SEDModel
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.random import stream
+from miricigale.utils.units import MASS
+
+#: Best chi2 above which exp(-chi2 / 2) is below the smallest normal number for every model.
+VANISHING_CHI2 = 1417.0
+#: Numbers of joint sums that a piece may have at once (32 MB).
+_JOINT_SIZE = 1 << 22
+#: Weight of one galaxy model, and of one redshift, above which an object is flagged.
+_ALONE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class GridFit:
+    """
+    How `~miricigale.fitting.BayesFitter` fits with every model of a grid; picklable.
+
+    ``given`` are the settings of the fitter, without the model of a finer grid, which ``between`` has made.
+    """
+
+    engine: GridEngine
+    given: GridSettings
+    compat: str | None
+    template_error: TemplateError | None = None
+    between: Continuation | None = None
+
+    #: Weight of the first or last redshift above which an object is flagged.
+    edge_weight = 0.01
+
+    @classmethod
+    def of_model(
+        cls,
+        model,
+        filters,
+        priors,
+        settings,
+        *,
+        axes,
+        scale_error,
+        compat,
+        template_error,
+        outliers,
+        calibration,
+    ):
+        """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
+        check_choice(compat, "compat", (None, "cigale"))
+        finer = settings.finer
+        interpolate = 0 if compat == "cigale" else settings.interpolate
+        grid = model
+        if isinstance(model, SEDModel):
+            if finer not in (None, model):
+                raise argument_error("finer", "left out when 'model' is an SEDModel", "another one")
+            grid, finer = model.grid(axes, filters), model if interpolate else None
+        elif axes is not None:
+            raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
+        elif not isinstance(model, ModelGrid):
+            wanted = "a ModelGrid, an SEDModel or a list of bands"
+            raise argument_error("model", wanted, type(model).__name__)
+        if settings.agn_error and compat:
+            raise argument_error("agn_error", "0 with 'compat'", f"{settings.agn_error}")
+        check_that(outliers is None or not compat, "outliers", "None with 'compat'", outliers)
+        if calibration is not None:
+            known = {name: axis.values for name, axis in grid_priors(grid).axes.items()}
+            priors = calibration.grid_priors(known) | (priors or {})
+        priors = grid_priors(grid, priors, prior_f=settings.prior_f)
+        bands = grid.filters if model is grid else filters
+        if calibration is not None and outliers is None and not compat:
+            outliers = calibration.of_bands("outlier", filter_names("filters", bands), 0.0)
+        engine = GridEngine(
+            grid=grid,
+            priors=priors,
+            quantities=Quantities.of_grid(grid),
+            galaxy=grid.galaxy,
+            agn=grid.agn,
+            usable=grid.allowed & (priors.galaxy > 0),
+            template_error=grid_errors(template_error, bands, grid.redshift),
+            mass_prior=sfr_log_prior(settings.sfr_prior, grid),
+            density=MassPrior.of_grid(settings.mass_function, grid),
+            rtol=float(settings.rtol),
+            scale_error=scale_error,
+            mixture=BandMixture.of_bands(outliers, bands),
+        )
+        out = cls(engine, replace(settings, finer=None), compat, template_error)
+        # neither a single model nor templates have anything between
+        several = {name for name, axis in priors.axes.items() if axis.values.size > 1}
+        if not interpolate or not several or "template" in several:
+            return out
+        if finer is None:
+            models = InterpolatedModels.of_grid(grid, priors.axes)
+        else:
+            same = isinstance(filters, FilterSet) and tuple(filters.names) == grid.filters
+            bands = filters if same else grid.filters
+            models = InterpolatedModels.of_model(finer, grid, bands, out.constants, priors.axes)
+        return replace(out, between=Continuation(engine, models, float(settings.agn_error)))
+
+    @property
+    def chunk_size(self):
+        """Objects in a piece of the catalog."""
+        return int(min(max(1e6 // max(self.engine.n_models, 1), 64), 1024))
+
+    @property
+    def grid(self):
+        """The `~miricigale.sed.ModelGrid`."""
+        return self.engine.grid
+
+    @property
+    def priors(self):
+        """`~miricigale.fitting.posterior.priors.GridPriors`."""
+        return self.engine.priors
+
+    @property
+    def filters(self):
+        """Bands of the models."""
+        return self.grid.filters
+
+    @property
+    def content(self):
+        """What makes a fit another one, besides `settings`: name to anything with a checksum."""
+        return {"grid": self.grid, "priors": self.priors}
+
+    @property
+    def constants(self):
+        """Parameters of the grid that have one value, which have no posterior: name to float."""
+        tables = self.grid.galaxy_parameters, self.grid.agn_parameters
+        first = {name: plain(table[name])[:1] for table in tables for name in table.colnames}
+        return {n: float(v[0]) for n, v in first.items() if n not in self.priors.axes and v.size}
+
+    def settings(self):
+        """Return the settings of the fit as plain values."""
+        error, prior, between = self.template_error, self.engine.mass_prior, self.between
+        out = {
+            "prior_f": self.given.prior_f,
+            "rtol": self.engine.rtol,
+            "scale_error": self.engine.scale_error,
+            "compat": self.compat,
+            "n_models": int(self.engine.n_models),
+            "interpolate": 0 if between is None else int(self.given.interpolate),
+            "agn_error": 0.0 if between is None else between.agn_error,
+            "constants": self.constants,
+        }
+        if error is not None:
+            wave = error.wave.value.tolist()
+            out["template_error"] = {"wave": wave, "error": error.error.tolist()}
+        if self.engine.mixture is not None:
+            part = self.engine.mixture.part.tolist()
+            out["outliers"] = dict(zip(self.filters, part, strict=True))
+        if self.engine.density is not None:
+            out["mass_function"] = repr(self.engine.density.mass_function)
+        if prior is not None:
+            relation, scatter, z = prior.args[:3]
+            # a function is known by its values at some masses
+            mass = [1e8, 1e10, 1e12] * MASS
+            rates = [expected_sfr(relation, mass, one).tolist() for one in z[[0, -1]]]
+            out["sfr_prior"] = {"scatter": scatter, "sfr": rates}
+        if between is not None:
+            out["tables"] = between.models.sizes
+        return out
+
+    def provenance(self):
+        """Return what results say of the grid, and what to cite for it."""
+        known = {key: value for key, value in self.grid.meta.items() if key != "axes"}
+        return {"citations": known.pop("citations", ()), "grid": known}
+
+    def check_data(self, data):
+        """Refuse limits in bands in which a model has negative flux."""
+        for i in np.flatnonzero(data.limit.any(axis=0) & self.engine.negative):
+            wanted = "without limits in bands in which a model has negative flux"
+            raise argument_error("photometry", wanted, f"some in {self.filters[i]}")
+
+    def redshifts(self, photometry, redshift, redshift_prior, flags):
+        """
+        ln(prior) of the grid's redshifts for every object.
+
+        ``flags``, of the n objects, are added to in place. Returned are the priors, shape (n, nz), the
+        number of free parameters (the mass among them) and "fixed" or "free".
+        """
+        z, prior = self.grid.redshift, self.priors.redshift
+        allowed = self.engine.usable.any(axis=1) & (prior > 0)
+        if redshift_prior is not None:
+            log_prior = density_log_prior(redshift_prior, z, allowed, flags)
+        elif redshift is not None:
+            # on nodes alone a redshift of 0 is a node like others
+            zero = bool(z[0] == 0) and self.between is None
+            values = known_redshifts(photometry, redshift, zero=zero)
+            log_prior = fixed_log_prior(values, z, allowed, self.given.redshift_tolerance, flags)
+        else:
+            if not allowed.any():
+                flags |= int(FitFlags.NO_MODEL)
+            one = np.log(prior, where=allowed, out=np.full(z.size, -np.inf))
+            log_prior = np.tile(one, (len(flags), 1))
+        log_prior[(flags & int(FitFlags.UNFITTED)) != 0] = -np.inf
+        n_free = 1 + sum(axis.values.size > 1 for axis in self.priors.axes.values())
+        n_free -= redshift is not None and z.size > 1
+        return log_prior, n_free, "free" if redshift is None else "fixed"
+
+    # ------------------------------------------------------------------------- fit
+
+    def check_pairs(self, pairs):
+        """Check pairs of parameters; see `~miricigale.fitting.posterior.posterior.check_pairs`."""
+        derived = self.engine.quantities.names
+        wanted = "of parameters of the grid ('sample' draws derived quantities jointly)"
+        return check_pairs(pairs, self.priors.axes, self.constants, derived, wanted)
+
+    def task(self, pairs, _seed, _log_prior):
+        """Function that fits a piece of the catalog; nothing is drawn, and the prior comes with it."""
+        return partial(self._fit_piece, self.check_pairs(pairs))
+
+    def _fit_piece(self, pairs, piece):
+        """`FitResults` of a piece: its photometry and priors of redshift."""
+        data, log_prior = piece
+        if self.between is not None:
+            return self._between_nodes(data, log_prior, pairs)
+        return self._on_nodes(data, log_prior, pairs)
+
+    def _on_nodes(self, data, log_prior, pairs):
+        """Results on nodes alone."""
+        joint = joint_names(pairs, self.priors.axes)
+        options = {}
+        if joint:
+            workspace = self.engine.workspace(joint=joint)
+            options = {"joint": joint, "workspace": workspace}
+        # joint sums are large: those of a few objects are reduced before the next are made
+        size = self.engine.size
+        each = sum(size[x] * size[y] for x, y in joint)
+        step = max(1, min(_JOINT_SIZE // max(each, 1), len(data)))
+        parts = []
+        for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
+            some = data[rows]
+            out = self.engine.fit(**some.of_engine(log_prior[rows]), **options)
+            parts.append(self._results(some, out, pairs))
+        return FitResults.concatenate(parts)
+
+    def _between_nodes(self, data, log_prior, pairs):
+        """Results between nodes, and on nodes of objects that no model between them is possible for."""
+        posteriors = {}
+        sampled = partial(self.between.place, self.given.interpolate)
+        at_redshift = data.redshift is not None and self.grid.redshift.size > 1
+        if at_redshift:
+            for i in np.flatnonzero(np.isfinite(log_prior).any(axis=1)):
+                row = slice(i, i + 1)
+                posterior = self._posterior_at_redshift(sampled, data[row], log_prior[row])
+                if posterior is not None:
+                    posteriors[i] = posterior
+        else:
+            self.engine.fit(
+                **data.of_engine(log_prior),
+                n_draws=N_START,
+                each=partial(sampled, posteriors, None, 0.0),
+                workspace=self.engine.workspace(N_START),
+            )
+        posteriors = {i: posterior for i, posterior in posteriors.items() if posterior is not None}
+        parts = []
+        rows = np.array(sorted(posteriors), int)
+        if rows.size:
+            found = [posteriors[i] for i in rows]
+            parts.append(between_results(self, data[rows], found, pairs))
+        others = np.setdiff1d(np.arange(len(data)), rows)
+        if others.size or not parts:
+            on_nodes = self._on_nodes
+            if at_redshift:
+                on_nodes = self._at_redshifts
+            results = on_nodes(data[others], log_prior[others], pairs)
+            parts.append(with_axis_summaries(results))
+        order = np.argsort(np.concatenate([rows, others]), kind="stable")
+        return FitResults.concatenate(parts)[order]
+
+    def _posterior_at_redshift(self, sampled, data, log_prior):
+        """`BetweenPosterior` of an object at its own redshift; None if no model is possible."""
+        z = float(data.redshift[0])
+        node = int(np.argmax(log_prior[0]))
+        engine = self.between.at_redshift(z, node)
+        posteriors = {}
+        engine.fit(
+            **data.of_engine(log_prior[:, node : node + 1]),
+            n_draws=N_START,
+            each=partial(sampled, posteriors, node, z),
+        )
+        return posteriors.get(0)
+
+    def _at_redshifts(self, data, log_prior, pairs):
+        """Results on nodes of objects at their own redshifts."""
+        parts = []
+        for rows in list(chunks(len(data), 1)) or [slice(0, 0)]:
+            if len(data[rows]):
+                parts.append(self._at_redshift(data[rows], log_prior[rows], pairs))
+            else:
+                parts.append(self._on_nodes(data[rows], log_prior[rows], pairs))
+        return FitResults.concatenate(parts)
+
+    def _at_redshift(self, data, log_prior, pairs):
+        """Results on nodes of an object at its own redshift, which stand at the nearest node."""
+        z, n_z = float(data.redshift[0]), log_prior.shape[1]
+        fitted = np.isfinite(log_prior).any()
+        node = int(np.argmax(log_prior[0]))
+        engine = self.between.at_redshift(z if fitted else self.grid.redshift[0], node)
+        joint = joint_names(pairs, self.priors.axes)
+        workspace = engine.workspace(joint=joint)
+        photometry = data.of_engine(log_prior[:, node : node + 1])
+        out = engine.fit(**photometry, joint=joint, workspace=workspace)
+        if fitted:
+            out.index[:, 0] = node
+        here = (np.arange(n_z) == node)[:, None]
+
+        def all_redshifts(table):
+            return np.where(here, table, table * 0.0)
+
+        joint = {k: all_redshifts(v) if k[0] == "z" else v for k, v in out.joint.items()}
+        out = out._replace(zf=all_redshifts(out.zf), joint=joint)
+        results = self._results(data, out, pairs)
+        best = results.best | {"redshift": 0.0 * results.best["redshift"] + z}
+        return results._changed(best=best)
+
+    def _results(self, data, out, pairs):
+        """From models to parameters and derived quantities."""
+        flags = np.array(data.flags)
+        if self.compat == "cigale":
+            vanished = out.chi2 > VANISHING_CHI2
+            flags[vanished] |= int(FitFlags.NO_LIKELIHOOD)
+            for array in (*out[:-1], *out.joint.values()):
+                array[vanished] = -1 if array.dtype.kind == "i" else np.nan
+        axes = self.priors.axes
+        pdf = {"redshift": out.zf.sum(axis=2)}
+        if self.between is None:
+            alone = np.minimum(out.galaxy.max(axis=1), pdf["redshift"].max(axis=1)) > _ALONE
+            flags[alone & (out.galaxy.shape[1] > 1)] |= int(FitFlags.ONE_NODE)
+        if "frac_agn" in axes:
+            pdf["frac_agn"] = out.zf.sum(axis=1)
+        for name, axis in axes.items():
+            if axis.share is not None:
+                models = out.galaxy if axis.kind == "galaxy" else out.agn
+                # not a matrix product, whose last digits depend on how many rows there are
+                pdf[name] = np.einsum("ng,vg->nv", models, axis.share)
+        known = self.engine.quantities
+        moments, quantiles = known.summarize(out)
+        log_sigma = self.log_errors(data)
+        data = self.with_template_error(data, np.where(np.isnan(out.chi2), -1, out.index[:, 0]))
+        return FitResults(
+            **data.columns,
+            **self.result_settings(),
+            flags=flags,
+            chi2=out.chi2,
+            log_evidence=out.log_sum - log_sigma,
+            pdf=pdf,
+            pdf_2d=out.zf,
+            pairs=joint_tables(out, pairs, axes),
+            best_index=out.index,
+            best_scale=out.best_scale,
+            best=self._best(out),
+            moments=moments,
+            quantiles=quantiles,
+            model_flux=out.band[:, 0],
+            model_flux_std=out.band[:, 1],
+            best_flux=out.best_flux,
+            outlier=None if self.engine.mixture is None else out.outlier,
+        )
+
+    def log_errors(self, data):
+        """Ln of the product of the errors that likelihoods are divided by, shape (n,)."""
+        # limits are probabilities, which have no unit
+        log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
+        return log_sigma + 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
+
+    def with_template_error(self, data, node):
+        """Photometry whose errors have that of the templates at nodes of redshift, (n,); -1 is none."""
+        if self.template_error is None:
+            return data
+        more = self.engine.template_error[np.maximum(node, 0)] * data.flux
+        more[~data.measured | (node < 0)[:, None]] = 0.0
+        return data._changed(sigma=np.hypot(data.sigma, more))
+
+    def result_settings(self):
+        """Keywords of `FitResults` that are the same for all objects."""
+        quantities = self.engine.quantities
+        axes = {name: replace(axis, share=None) for name, axis in self.priors.axes.items()}
+        return {
+            "filters": self.filters,
+            "axes": axes,
+            "quantities": quantities.names,
+            "units": quantities.units,
+            "descriptions": quantities.descriptions,
+            "intensive": quantities.intensive,
+            "constants": self.constants,
+            "least_std": CIGALE_LEAST_STD if self.compat == "cigale" else 0.0,
+        }
+
+    def _best(self, out):
+        """Parameters and derived quantities of the best models: name to array."""
+        grid = self.grid
+        ok, known = np.isfinite(out.chi2), self.engine.quantities
+        z, g, k, f = np.where(ok[:, None], out.index, 0).T
+        frac = grid.frac_agn[f]
+        values = {"redshift": grid.redshift[z], "frac_agn": frac}
+        values |= {name: plain(column)[g] for name, column in grid.galaxy_parameters.items()}
+        for name, column in grid.agn_parameters.items() if grid.n_agn else ():
+            # without AGN light there is no template
+            values[name] = np.where(frac > 0, plain(column)[k], np.nan)
+        best = {name: np.where(ok, values[name], np.nan) for name in self.priors.axes}
+        scale = np.where(ok, out.best_scale, np.nan)
+        return best | {n: known.evaluate(n, grid, g, k, frac, scale) for n in known.names}
+
+    # ----------------------------------------------------------------------- draws
+
+    def sample(self, data, log_prior, n_draws, seed, **parallel):
+        """`~miricigale.fitting.Samples` of objects; ``parallel`` is for `parallel_map`."""
+        keys = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
+        keys = np.array(keys, dtype=np.int64)
+        rows = list(chunks(len(data), 16)) or [slice(0, 0)]
+        pieces = [(data[some], log_prior[some], keys[some]) for some in rows]
+        task = partial(_draw_piece, self.engine, n_draws)
+        parts = parallel_map(task, pieces, desc="draws", **parallel)
+        index, scale = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        flags = np.array(data.flags)
+        unfitted = ~np.isfinite(scale).all(axis=1) & ((flags & int(FitFlags.UNFITTED)) == 0)
+        flags[unfitted] |= int(FitFlags.NO_SIGNAL)
+        axes = self.priors.axes
+        return Samples(self.grid, data.ids, flags, index, scale, axes=axes, seed=seed)
+
+
+def _draw_piece(engine, n_draws, piece):
+    data, log_prior, seeds = piece
+    return engine.draw(n_draws=n_draws, seeds=seeds, **data.of_engine(log_prior))

@@ -1,0 +1,211 @@
+"""
+Photometry of which each band may be wrong: a mixture of the stated error and a broad one.
+
+The likelihood of a flux F of a model m is (1 - p) N(F; m, sigma) + p N(F; m, Sigma), that of an upper limit
+(1 - p) P + p with P the probability of the limit (Press 1997, in Unsolved Problems in Astrophysics; Hogg, Bovy &
+Lang 2010, arXiv:1008.4686, section 3). Over the squared residual -2 ln of a flux's likelihood is concave, so that
+its tangents are upper bounds, which are those of a Gaussian: ``chi2 <= w r^2 + constant`` with
+w = (1 - q) / sigma^2 + q / Sigma^2 and q the share of the broad part where the tangent touches (Jaakkola & Jordan
+2000, Stat. Comput. 10, 25). At every redshift it touches at a model that fits best with some bands wrong.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit, log_ndtr
+
+from miricigale.filters import FilterSet
+from miricigale.fitting import _core
+from miricigale.fitting.data.likelihood import per_band
+from miricigale.utils.options import check_that
+
+#: Least width of the broad part, in units of the stated error.
+_WIDE = 10.0
+#: Galaxies looked at for the model at which the tangents touch: at each redshift, and at those that matter.
+_FEW, _MORE = 64, 512
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BandMixture:
+    """
+    Prior fraction and place of each band.
+
+    Parameters
+    ----------
+    part : `~numpy.ndarray`, shape (nb,)
+        Prior fraction of wrong fluxes.
+    order : `~numpy.ndarray` of int, shape (nb,)
+        The bands by wavelength.
+    """
+
+    part: np.ndarray
+    order: np.ndarray
+
+    @classmethod
+    def of_bands(cls, outliers, filters):
+        """Make it of ``outliers`` of a fitter and its filters; None where there are none."""
+        names = tuple(getattr(filters, "names", filters))
+        part = {} if outliers is None else per_band(outliers, names, "outliers")
+        part = np.array(list(part.values()))
+        check_that(np.all(part < 1), "outliers", "at least 0 and below 1", outliers)
+        if not part.any():
+            return None
+        known = filters if isinstance(filters, FilterSet) else FilterSet.from_names(names)
+        return cls(part, np.argsort(known.pivot.to_value("um"), kind="stable"))
+
+    def broad(self, flux, sigma):
+        """
+        Widths of the broad parts in uJy, infinite in bands without a flux: shape (n, nb).
+
+        The larger, in quadrature, of 10 sigma and of the largest flux of the band and the measured ones next
+        to it: data alone say it, and a flux of 0 between bright ones is wrong too.
+        """
+        out = np.full(np.shape(flux), np.inf)
+        for i in range(len(flux)):
+            used = self.order[np.isfinite(sigma[i, self.order])]
+            size = np.pad(np.abs(flux[i, used]), 1)
+            top = np.maximum(size[1:-1], np.maximum(size[:-2], size[2:]))
+            out[i, used] = np.hypot(_WIDE * sigma[i, used], top)
+        return out
+
+    def log_likelihood(self, model, flux, sigma, broad, limit=None, limit_sigma=None):
+        """
+        Ln of the likelihood of models, and how likely each band is wrong for each.
+
+        Parameters
+        ----------
+        model : `~numpy.ndarray`, shape (..., nb)
+            Fluxes of models in uJy.
+        flux, sigma, broad : `~numpy.ndarray`, shapes that broadcast with it
+            Fluxes, errors (infinite where there is none) and widths of the broad parts.
+        limit, limit_sigma : `~numpy.ndarray`, optional
+            Upper limits and their errors, infinite where there is none.
+
+        Returns
+        -------
+        log : `~numpy.ndarray`, shape (...)
+            Of fluxes in units of their errors, without the factors of 2 pi: -chi2 / 2 without wrong bands.
+        wrong : `~numpy.ndarray`, shape (..., nb)
+            0 in bands without data.
+        """
+        used = np.isfinite(sigma)
+        part = np.broadcast_to(self.part, used.shape)
+        own, wide = np.where(used, sigma, 1.0), np.where(used, broad, 1.0)
+        square = np.where(used, np.square(flux - model), 0.0)
+        with np.errstate(divide="ignore"):
+            good = np.log1p(-part) - 0.5 * square / np.square(own)
+            bad = np.log(part) - 0.5 * square / np.square(wide) + np.log(own / wide)
+            log = np.where(used, np.logaddexp(good, bad), 0.0)
+            wrong = np.where(used, expit(bad - good), 0.0)
+            if limit is not None:
+                some = np.isfinite(limit_sigma)
+                below = log_ndtr(np.where(some, (limit - model) / limit_sigma, 0.0))
+                good, bad = np.log1p(-self.part) + below, np.log(self.part)
+                log = np.where(some, np.logaddexp(good, bad), log)
+                wrong = np.where(some, expit(bad - good), wrong)
+        return log.sum(axis=-1), wrong
+
+    def shares(self, model, target, broad, limits, z, weight):
+        """
+        How likely each band is wrong, shape (nb,), over models, (n, nb), at nodes ``z`` of redshift.
+
+        ``weight``, shape (n,), are the weights of the models, which sum to 1.
+        """
+        with np.errstate(divide="ignore"):
+            own = 1.0 / np.sqrt(target.weight[z])
+        more = np.array([np.zeros(len(broad)), np.full(len(broad), np.inf)])
+        if limits is not None:
+            more[:, limits.bands] = limits.level / limits.inverse, 1.0 / limits.inverse
+        wrong = self.log_likelihood(model, target.flux, own, broad, *more)[1]
+        return np.sum(weight[:, None] * wrong, axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Tangents:
+    """
+    Finds, for each object, the models at which the tangents touch.
+
+    Parameters
+    ----------
+    bands : `BandMixture`
+        The bands.
+    tables : `~miricigale.fitting._core.Tables`
+        The grid.
+    few : tuple of `~numpy.ndarray`
+        Galaxies that are looked at: the first fields of ``Few``.
+    """
+
+    bands: BandMixture
+    tables: tuple
+    few: tuple
+
+    @classmethod
+    def of_tables(cls, bands, tables):
+        """Choose galaxies of every redshift, spread over all axes."""
+        n_z, n_galaxy, n_bands = tables.galaxy.shape
+        n_wide = -(-n_galaxy // _core.BLOCK) * _core.BLOCK
+        order = np.argsort(np.arange(n_galaxy) * _GOLDEN % 1.0, kind="stable")
+        index = np.zeros((n_z, n_wide), np.int64)
+        flux = _core.aligned(n_z, n_bands, n_wide, dtype=np.float32)
+        ratio = _core.aligned(n_z, tables.agn.shape[1], n_wide, dtype=np.float32)
+        for z in range(n_z):
+            some = order[tables.log_usable[z, order] > -1e200]
+            index[z, : some.size] = some
+            flux[z, :, : some.size] = tables.galaxy32[z][:, some]
+            size = tables.of_galaxy[0, some] / tables.galaxy_unit[z, some]
+            ratio[z, :, : some.size] = np.clip(size * tables.agn_unit[z, :, None], 0.0, 1e15)
+        return cls(bands, tables, (index, flux, ratio))
+
+    def touch(self, target, log_prior, sigma, broad, limit=None, limit_sigma=None):
+        """
+        Weights of the tangents of one object.
+
+        Parameters
+        ----------
+        target : `~miricigale.fitting._core.Target`
+            Its data with the stated errors.
+        log_prior : `~numpy.ndarray`, shape (nz,)
+            2 ln(prior) of the redshifts.
+        sigma, broad : `~numpy.ndarray`, shape (nb,)
+            Errors of fluxes, and widths of the broad parts.
+        limit, limit_sigma : `~numpy.ndarray`, shape (nb,), optional
+            Upper limits and their errors.
+
+        Returns
+        -------
+        target : `~miricigale.fitting._core.Target`
+            The data with the tangents' errors.
+        wrong : `~numpy.ndarray`, shape (nz, nb)
+            How likely each band is wrong for the models at which they touch.
+        """
+        tables, bands, part = self.tables, target.bands, self.bands.part
+        own = 1.0 / np.sqrt(np.take(target.weight, bands, axis=1))
+        narrow = own / broad[bands]
+        odds = part[bands] / (1.0 - part[bands]) * narrow
+        n_z, ratio = len(log_prior), tables.of_frac[0]
+        ends = 0.0 if tables.zero_frac else ratio.min(initial=1e9), min(ratio.max(initial=0.0), 1e9)
+        index, scale = np.full((n_z, 2), -1), np.zeros((n_z, 2))
+        # likelihoods are of fluxes in units of the errors without that of the templates
+        rise = 2.0 * np.log(own / sigma[bands]).sum(axis=1)
+        found = np.ones(odds.shape), np.zeros(n_z), index, scale
+        n = self.few[0].shape[1]
+        sizes, few = np.array([min(_FEW, n), min(_MORE, n), n]), _core.make_few(*self.few)
+        _core.find_models(
+            tables, target, few, odds, narrow**2, rise - log_prior, np.array(ends), sizes, *found
+        )
+        model = scale[:, :1] * tables.galaxy[np.arange(n_z), np.maximum(index[:, 0], 0)]
+        some = np.flatnonzero(index[:, 1] >= 0)
+        model[some] += scale[some, 1:] * tables.agn[some, index[some, 1]]
+        square = np.square(target.flux - model)[:, bands]
+        full = np.full((n_z, len(sigma)), np.inf)
+        full[:, bands] = own
+        log, wrong = self.bands.log_likelihood(model, target.flux, full, broad)
+        if limit_sigma is not None:
+            more = np.full(sigma.shape, np.inf), broad, limit, limit_sigma
+            wrong = wrong + self.bands.log_likelihood(model, target.flux, *more)[1]
+        weight = target.weight.copy()
+        weight[:, bands] *= 1.0 - wrong[:, bands] * (1.0 - narrow**2)
+        level = 2.0 * log - rise
+        level += np.sum(weight[:, bands] * square, axis=1)
+        return _core.weighed(target.flux, weight, level, log_prior, bands), wrong

@@ -1,0 +1,378 @@
+"""Tables of the parts of a model's light, finer than its grid, and derived quantities that follow from them."""
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.fitting import _core
+from miricigale.fitting.grid.part_tables import (
+    LEAST,
+    MAX_MODELS,
+    PartAxes,
+    empty_part,
+    finer_redshifts,
+    logarithms,
+    make_part,
+    part_columns,
+    with_columns,
+)
+from miricigale.sed.grid_cache import grid_key, is_own
+from miricigale.sed.light_parts import (
+    FORMED_COLUMNS,
+    LightParts,
+    part_parameters,
+    quantities_of_parts,
+)
+from miricigale.utils.content_hash import content_sha256
+from miricigale.utils.options import check_that
+
+#: Part of a parameter's first step at which dust that may be absent is evaluated in place of 0.
+_HARDLY_ANY_DUST = 1e-3
+#: Error of masses formed in the last 10 and 100 Myr; and parts of the stars, for each Gyr, that do not matter.
+_TOLERANCE_OF_COLUMNS = 0.01
+_HARDLY_FORMED = 0.01
+#: Redshifts at which axes are refined.
+_N_LINE_REDSHIFTS = 5
+#: Largest step of the tables in ln(1 + z): lines, breaks and features of dust cross the edges of bands.
+_REDSHIFT_STEP = 0.01
+#: Bursts differ by less than this along an axis that has no effect on them.
+_NO_EFFECT = 1e-6
+#: Tables that are kept for further fitters of a process (some 50 MB each), the last used at the end.
+_MOST_KEPT = 2
+_kept = OrderedDict()
+_lock = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class ModelGalaxies:
+    """Derived quantities of galaxies from columns of their parts; see `LightParts`."""
+
+    stars: tuple
+    burst: tuple
+    dust: tuple
+    n_sums: int
+    constant_age: float
+    reference_row: int
+
+    def quantities(self, light, values):
+        """Quantities for one solar mass formed: dict of name to array, of values (n, n_parameters)."""
+        n = len(values)
+        share = np.zeros(n) if light.mixing < 0 else values[:, light.mixing]
+        age = np.full(n, self.constant_age) if light.age < 0 else values[:, light.age]
+        starlight = part_columns(self.stars, values)
+        starlight *= (1.0 - share)[:, None]
+        if self.burst.table.shape[1]:
+            starlight += share[:, None] * part_columns(self.burst, values)
+        absorbed = starlight[:, -1].copy()
+        if light.amount >= 0:
+            absorbed *= -np.expm1(-_core.SATURATION * values[:, light.amount])
+        if light.excess >= 0:
+            absorbed *= values[:, light.excess]
+        dust = np.zeros((n, self.n_sums))
+        if self.dust.table.shape[1]:
+            dust = part_columns(self.dust, values)
+        quantities = quantities_of_parts(starlight, absorbed, dust, age, self.reference_row)
+        if light.by_dust:
+            quantities["reference"] = absorbed
+        return quantities
+
+
+class ModelTables:
+    """Tables of the parts of a model, refined; see `InterpolatedModels.of_model`."""
+
+    def __init__(self, model, filters, constants, axes, place, redshift):
+        self.model = model
+        self.filters = filters
+        self.axes = axes
+        self.place = place
+        self.redshift = np.asarray(redshift, float)
+        free = {name: axis.values for name, axis in axes.items()}
+        self.constants = {name: value for name, value in constants.items() if name not in free}
+        self.names = {}
+        for part, names in part_parameters(model).items():
+            self.names[part] = {name: free[name] for name in names if name in free}
+        self.mixing = model.component("sfh").linear
+        if self.mixing not in self.names["starlight"]:
+            self.mixing = ""
+        self.amount = self._amount_of_dust()
+
+    def light_at(self, redshift):
+        """`LightParts` at some redshifts."""
+        return LightParts(self.model, self.filters, redshift, self.constants)
+
+    def _amount_of_dust(self):
+        """Axis of starlight whose value 0 is no dust; "" if there is none."""
+        axes = self.names["starlight"]
+        light = self.light_at(self.redshift[:1])
+        for name, values in axes.items():
+            if values[0] != 0.0 or len(values) < 2:
+                continue
+            row = {other: float(nodes[-1]) for other, nodes in axes.items()}
+            absorbed = light.starlight([row | {name: 0.0}, row]).columns[:, -1]
+            if absorbed[0] == 0.0 and absorbed[1] > 0.0:
+                return name
+        return ""
+
+    def check(self, grid):
+        """Refuse a model that did not make the grid."""
+        rng = np.random.default_rng(1)
+        some = rng.choice(grid.n_galaxies, min(grid.n_galaxies, 20), replace=False)
+        z = self.redshift[:: max(len(self.redshift) // 2, 1)]
+        table = grid.galaxy_parameters[some]
+        rows = [dict(zip(table.colnames, map(_number, row), strict=True)) for row in table]
+        light = self.light_at(z)
+        index = np.searchsorted(self.redshift, z)
+        starlight = light.starlight(rows)
+        dust = light.dust(rows)
+        power = starlight.columns[:, -1] * [row.get("dust_excess", 1.0) for row in rows]
+        flux = starlight.flux + power[:, None, None] * dust.flux
+        same = _nearly_equal(flux, np.moveaxis(grid.galaxy[index][:, some], 0, 1))
+        reference = power
+        if self.model.frac_agn_definition != "dust":
+            dust_reference = dust.columns[:, self.model.chain.reference_row]
+            reference = starlight.columns[:, self._reference_column] + power * dust_reference
+        same = same and _nearly_equal(reference, grid.dust_luminosity[some])
+        if grid.n_agn:
+            some = rng.choice(grid.n_agn, min(grid.n_agn, 5), replace=False)
+            table = grid.agn_parameters[some]
+            rows = [dict(zip(table.colnames, map(_number, row), strict=True)) for row in table]
+            expected = np.moveaxis(grid.agn[index][:, some], 0, 1)
+            same = same and self.model.has_agn and _nearly_equal(light.agn(rows).flux, expected)
+        check_that(
+            same, "finer", "the model that made the grid", "one with other fluxes at its nodes"
+        )
+
+    def _refuses(self, name, row):
+        """Whether a component that a parameter concerns refuses the values of a row."""
+        values = self.model.defaults | self.constants | row
+        for component in self.model.components:
+            concerned = name in component.parameters or name in component.others
+            if component.refuses and concerned and component.invalid(values):
+                return True
+        return False
+
+    # ------------------------------------------------------------------------- parts
+
+    def _starlight_logs(self, light, rows):
+        """Return ln of fluxes, of what AGN fractions may refer to, and of the dust's power over its saturation."""
+        return self._starlight_tables(*self._starlight(light, rows), light.redshift)[0]
+
+    def _starlight_tables(self, flux, columns, ratio, redshift):
+        """Logarithms that fluxes follow from, and of the columns, the last being the dust's power."""
+        reference = columns[:, self._reference_column]
+        logs = logarithms(flux, np.column_stack([reference, ratio]), redshift)
+        columns = np.column_stack([columns[:, :-1], ratio])
+        return logs, np.log(np.maximum(columns, LEAST))
+
+    @property
+    def _reference_column(self):
+        n = len(self.model.chain.functionals)
+        return -1 - n + self.model.chain.reference_row % n
+
+    def _starlight(self, light, rows, share=0.0):
+        """Fluxes, columns, and the dust's power over its saturation, at a mass fraction of the burst."""
+        if self.mixing:
+            rows = [row | {self.mixing: share} for row in rows]
+        table = light.starlight(rows)
+        excess = self.constants.get("dust_excess", 1.0)
+        power = excess * table.columns[:, -1]
+        if not self.amount:
+            return table.flux, table.columns, power
+        amounts = np.array([row[self.amount] for row in rows])
+        without = np.flatnonzero(amounts == 0.0)
+        if without.size:
+            # the limit of the ratio
+            little = _HARDLY_ANY_DUST * float(self.names["starlight"][self.amount][1])
+            amounts[without] = little
+            some = [rows[i] | {self.amount: little} for i in without]
+            power[without] = excess * light.absorbed(some)
+        return table.flux, table.columns, power / -np.expm1(-_core.SATURATION * amounts)
+
+    def _dust_logs(self, light, rows):
+        table = light.dust(rows)
+        reference = table.columns[:, [self.model.chain.reference_row]]
+        return logarithms(table.flux, reference, light.redshift)
+
+    def _agn_logs(self, light, rows):
+        flux = light.agn(rows).flux
+        return logarithms(flux, np.zeros((len(rows), 0)), light.redshift)
+
+    def _part(self, name):
+        evaluate = {
+            "starlight": self._starlight_logs,
+            "dust": self._dust_logs,
+            "agn": self._agn_logs,
+        }
+        axes = {n: values for n, values in self.names[name].items() if n != self.mixing}
+        return PartAxes(axes, evaluate[name], self._refuses)
+
+    def tables(self):
+        """
+        `_core.Light`, derived quantities of galaxies, and properties of AGN.
+
+        A process keeps the last two: fits of the same models and bands, such as a calibration and the fit after
+        it, share them. No caller may change the arrays. They are not marked read-only, because numba would compile
+        the kernels once more for read-only arrays.
+        """
+        if not is_own(self.model):
+            return self._evaluated()
+        key = self._key()
+        with _lock:
+            tables = _kept.pop(key, None)
+        if tables is None:
+            tables = self._evaluated()
+        with _lock:
+            _kept[key] = tables
+            while len(_kept) > _MOST_KEPT:
+                _kept.popitem(last=False)
+        return tables
+
+    def _key(self):
+        """Checksum of all that tables depend on."""
+        axes = {
+            name: [axis.kind, np.asarray(axis.values, float)] for name, axis in self.axes.items()
+        }
+        content = [self.constants, axes, list(self.place), self.redshift]
+        return grid_key(self.model, {}, self.filters), content_sha256(content)
+
+    def _evaluated(self):
+        n_lines = min(_N_LINE_REDSHIFTS, len(self.redshift))
+        picked = np.linspace(0, len(self.redshift) - 1, n_lines + 2)[1:-1]
+        lines = self.light_at(self.redshift[np.unique(np.rint(picked).astype(int))])
+        chain = self.model.chain
+        n_bands = len(self.filters)
+        n_sums = len(chain.functionals)
+
+        light = self.light_at(finer_redshifts(self.redshift, _REDSHIFT_STEP))
+        stars, star_columns, axes, powers = self._stars(light, lines)
+        burst = empty_part(n_bands + 2)
+        burst_columns = empty_part(star_columns.table.shape[2])
+        if self.mixing:
+            burst, burst_columns = self._burst(light, axes, powers)
+        dust = empty_part(n_bands + 1)
+        dust_columns = empty_part(n_sums)
+        if self.model.component("dust") is not None:
+            dust, dust_columns = self._dust(light, lines)
+        agn = empty_part(n_bands)
+        agn_columns = empty_part(0)
+        if any(axis.kind == "frac_agn" for axis in self.axes.values()):
+            agn, agn_columns = self._agn(light, lines)
+        place = self.place
+        universe = self.model.cosmology.age(light.redshift).to_value(u.Gyr)
+        parts = _core.Light(
+            stars=stars,
+            burst=burst,
+            dust=dust,
+            agn=agn,
+            mixing=place.get(self.mixing, -1),
+            amount=place.get(self.amount, -1),
+            excess=place.get("dust_excess", -1),
+            age=place.get("age", -1),
+            youth=universe,
+            by_dust=self.model.frac_agn_definition == "dust",
+        )
+        galaxies = ModelGalaxies(
+            stars=star_columns,
+            burst=burst_columns,
+            dust=dust_columns,
+            n_sums=n_sums,
+            constant_age=float(lines.values["age"]),
+            reference_row=chain.reference_row,
+        )
+        return parts, galaxies, agn_columns
+
+    def _stars(self, light, lines):
+        part = self._part("starlight")
+        axes, powers = part.refined(lines)
+        rows = part.rows(axes)
+        logs, _ = self._starlight_tables(*self._starlight(light, rows), light.redshift)
+        stars = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
+        return stars, self._star_columns(axes, powers, lines), axes, powers
+
+    def _star_columns(self, axes, powers, lines):
+        """
+        Table of the columns of starlight.
+
+        Star-formation rates have a kink where galaxies are as old as the span of their mean: axes are refined once
+        more for them, which costs little without redshifts and bands.
+        """
+        light = self.light_at(lines.redshift[:1])
+
+        def formed(light, rows):
+            columns = self._starlight(light, rows)[1]
+            some = [np.log(columns[:, [j]] + _HARDLY_FORMED * s) for j, s in FORMED_COLUMNS.items()]
+            # in place of fluxes
+            return np.concatenate(some, axis=1)[:, None]
+
+        part = PartAxes(axes, formed, self._refuses, 2 * MAX_MODELS, _TOLERANCE_OF_COLUMNS, powers)
+        axes, powers = part.refined(light)
+        rows = part.rows(axes)
+        _, columns = self._starlight_tables(*self._starlight(light, rows), light.redshift)
+        return make_part(tuple(axes), axes, powers, columns[:, None], [0.0], self.place)
+
+    def _burst(self, light, axes, powers):
+        """The burst alone, from two of its mass fractions."""
+        top = self.model.parameters[self.mixing].bounds[1]
+        effective = self._axes_of_burst(axes, top)
+        fixed = {name: float(values[-1]) for name, values in axes.items() if name not in effective}
+        rows = [fixed | row for row in PartAxes(effective, None, None).rows(effective)]
+        if not effective:
+            rows = [fixed]
+
+        def alone(numbers, others):
+            return np.maximum((numbers - (1.0 - top) * others) / top, 0.0)
+
+        with_burst = self._starlight(light, rows, top)
+        without = self._starlight(light, rows)
+        numbers = [alone(*pair) for pair in zip(with_burst, without, strict=True)]
+        logs, columns = self._starlight_tables(*numbers, light.redshift)
+        names = tuple(effective)
+        burst = make_part(names, effective, powers, logs, light.redshift, self.place)
+        return burst, with_columns(burst, columns)
+
+    def _axes_of_burst(self, axes, top):
+        """Axes that have an effect on a burst alone."""
+        rng = np.random.default_rng(2)
+        light = self.light_at(self.redshift[:1])
+        effective = {}
+        for name, values in axes.items():
+            row = {other: float(rng.choice(nodes)) for other, nodes in axes.items()}
+            rows = [row | {name: float(value)} for value in values]
+            flux = self._starlight(light, rows, top)[0]
+            flux = flux - (1.0 - top) * self._starlight(light, rows)[0]
+            change = np.abs(flux - flux[-1:]).max()
+            if change > _NO_EFFECT * np.abs(flux).max():
+                effective[name] = values
+        return effective
+
+    def _dust(self, light, lines):
+        part = self._part("dust")
+        axes, powers = part.refined(lines)
+        rows = part.rows(axes)
+        logs = self._dust_logs(light, rows)
+        dust = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
+        columns = lines.dust(rows).columns
+        return dust, with_columns(dust, np.log(np.maximum(columns, LEAST)))
+
+    def _agn(self, light, lines):
+        part = self._part("agn")
+        axes, powers = part.refined(lines)
+        rows = part.rows(axes)
+        logs = self._agn_logs(light, rows)
+        agn = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
+        columns = lines.agn(rows).columns
+        return agn, with_columns(agn, np.log(np.maximum(columns, LEAST)))
+
+
+def _nearly_equal(values, expected):
+    """Whether arrays agree, to a part of the largest value along the last axis."""
+    if values.shape != expected.shape:
+        return False
+    return bool(np.all(np.abs(values - expected) <= 1e-6 * expected.max(axis=-1, keepdims=True)))
+
+
+def _number(value):
+    return float(getattr(value, "value", value))

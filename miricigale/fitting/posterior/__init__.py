@@ -1,0 +1,1 @@
+"""Posteriors of parameters and derived quantities, and their priors."""

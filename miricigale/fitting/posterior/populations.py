@@ -1,0 +1,206 @@
+"""Priors of what galaxies are like: black holes that grow, numbers by mass and redshift, rates given mass."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.fitting.posterior.posterior import cell_edges
+from miricigale.fitting.posterior.quantities import plain
+from miricigale.sed.spectrum import COSMOLOGY
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
+from miricigale.utils.options import check_that
+from miricigale.utils.units import MASS, is_number, to_array
+
+#: Of `agn_fraction_prior`: galaxies with lambda above 0.01, solar luminosities of dust for each solar mass of
+#: stars, those at the Eddington limit for each of a black hole, and solar masses of stars for each of it.
+_ACTIVE, _DUST, _EDDINGTON, _PER_HOLE = 0.1, 10.0, 3.3e4, 500.0
+#: Median redshift of little red dots, and the width of their distribution in ln(1 + z).
+_RED_DOT_REDSHIFT, _RED_DOT_WIDTH = 5.5, 0.25
+
+
+def agn_fraction_prior(frac_agn):
+    """
+    Prior of AGN fractions from how fast black holes grow in galaxies, for ``priors`` of `BayesFitter`.
+
+    The specific accretion rate lambda (L_bol over 1.26e38 erg/s for each 500 solar masses of stars) is taken to
+    exceed 0.01 in a tenth of the galaxies, with a number for each dex that falls as lambda^-0.5, and
+    exponentially above 1: simplified from what Aird et al. 2018 (MNRAS 474, 1225) find in X-rays for
+    star-forming galaxies of 10^10 to 10^11 solar masses. Half of the light is taken up by dust, beside 10 solar
+    luminosities of dust for each solar mass of stars, those of star formation in 1 Gyr. What is fainter has the
+    fraction 0.
+
+    Parameters
+    ----------
+    frac_agn : array_like, shape (n,)
+        Ascending fractions of a grid, the first 0.
+
+    Returns
+    -------
+    weights : `~numpy.ndarray`, shape (n,)
+        Prior weight of the cell of each fraction; they sum to 1.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import agn_fraction_prior
+    >>> agn_fraction_prior([0.0, 0.1, 0.3, 0.6, 0.9]).round(4)
+    array([0.9247, 0.0497, 0.017 , 0.0073, 0.0013])
+    """
+    frac = floats(frac_agn)
+    if frac.ndim != 1 or frac.size < 2 or frac[0] != 0 or not np.all(np.diff(frac) > 0):
+        raise argument_error("frac_agn", "ascending values from 0", f"{frac_agn}")
+    edges = cell_edges(frac, (0.0, 1.0))[1:-1]
+    log = np.linspace(-2.0, 2.0, 4001)
+    number = 10.0 ** (-0.5 * log) * np.exp(-(10.0**log))
+    steps = 0.5 * (number[1:] + number[:-1])
+    above = 1.0 - np.concatenate([[0.0], np.cumsum(steps)]) / np.sum(steps)
+    # 33,000 solar luminosities for each solar mass of black hole
+    rate = edges / (1.0 - edges) * _DUST / (0.5 * _EDDINGTON / _PER_HOLE)
+    exceeding = _ACTIVE * np.interp(np.log10(rate), log, above)
+    return -np.diff(np.concatenate([[1.0], exceeding, [0.0]]))
+
+
+def red_dot_prior(redshift):
+    """
+    Prior of the redshifts of little red dots, for ``priors`` of `BayesFitter`.
+
+    Log-normal in 1 + z about z = 5.5 with a width of 0.25: 16 and 84 % lie below 4.1 and 7.3. Surveys find few of
+    them at z < 4 and at z > 8. Of 260 selected by photometry (Kokorev et al. 2024, arXiv:2401.09981) 16, 50 and
+    84 % have photometric redshifts below 4.6, 5.6 and 7.1; of 116 with spectra (de Graaff et al. 2025,
+    arXiv:2511.21820) spectroscopic ones below 3.7, 5.0 and 6.7. Three or four bands with signal leave much of the
+    range open, and then the prior counts.
+
+    Parameters
+    ----------
+    redshift : array_like, shape (n,)
+        Ascending redshifts of a grid.
+
+    Returns
+    -------
+    weights : `~numpy.ndarray`, shape (n,)
+        Prior weight of the cell of each redshift; they sum to 1.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two, or they do not ascend from 0 or more.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import red_dot_prior
+    >>> red_dot_prior([2.0, 4.0, 6.0, 8.0, 10.0]).round(2)
+    array([0.01, 0.38, 0.43, 0.15, 0.03])
+    """
+    z = np.asarray(redshift, dtype=float)
+    if z.ndim != 1 or z.size < 2 or not (z[0] >= 0 and np.all(np.diff(z) > 0)):
+        raise argument_error("redshift", "two or more, ascending from 0 or more", f"{redshift}")
+    apart = (np.log1p(z) - np.log1p(_RED_DOT_REDSHIFT)) / _RED_DOT_WIDTH
+    weights = np.exp(-0.5 * apart**2) * np.diff(cell_edges(np.log1p(z)))
+    return weights / weights.sum()
+
+
+@dataclass(frozen=True)
+class MassFunction:
+    """
+    Number density of galaxies by stellar mass and redshift, for ``mass_function`` of `GridSettings`.
+
+    (M / M*)^(alpha + 1) exp(-M / M*) (1 + z)^evolution for each dex of mass and comoving volume (Schechter 1976,
+    ApJ 203, 297), with any factor. The defaults are of a prior that is flat in log mass below M*; M* and the power
+    of (1 + z) are those of fewest outliers among a few that were tried on CEERS sources.
+
+    Parameters
+    ----------
+    log_mass : float, optional
+        log10 of M* in solar masses.
+    alpha : float, optional
+        Slope at low mass.
+    evolution : float, optional
+        Power of (1 + z) of the density.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.fitting import MassFunction
+    >>> MassFunction()([1e9, 1e11] * u.Msun, 1.0).round(3)
+    array([0.492, 0.102])
+    """
+
+    log_mass: float = 10.8
+    alpha: float = -1.0
+    evolution: float = -1.0
+
+    def __call__(self, mass, redshift):
+        """Density at masses (`~astropy.units.Quantity`) and redshifts, which broadcast: `~numpy.ndarray`."""
+        x = to_array(mass, MASS, "mass") / 10.0**self.log_mass
+        return x ** (self.alpha + 1.0) * np.exp(-x) * (1.0 + np.asarray(redshift)) ** self.evolution
+
+
+@dataclass(frozen=True, eq=False)
+class MassPrior:
+    """Prior of mass and redshift as the kernels take it: see `~miricigale.fitting._core.weigh_masses`."""
+
+    #: Values of the table for a factor of ten, and log10 of the largest mass.
+    per_dex, last = 100.0, 16.0
+
+    mass_function: object
+    table: np.ndarray
+    log_stars: np.ndarray
+
+    @classmethod
+    def of_grid(cls, mass_function, grid):
+        """Of a density, that of the comoving volume in the cell of each redshift; None without one."""
+        if mass_function is None:
+            return None
+        wanted = "a function of stellar mass and redshift, such as MassFunction()"
+        check_that(callable(mass_function), "mass_function", wanted, repr(mass_function))
+        z, stars = grid.redshift, plain(grid.galaxy_properties["stellar_mass"])
+        mass = 10.0 ** (np.arange(cls.last * cls.per_dex + 1) / cls.per_dex)
+        density = mass_function(mass * MASS, z[:, None])
+        density = to_array(density, u.dimensionless_unscaled, "mass_function")
+        if not np.all(np.isfinite(density) & (density >= 0)):
+            raise argument_error("mass_function", "densities of 0 or more and finite", "others")
+        cells = np.diff(cell_edges(z, (0.0, np.inf))) if z.size > 1 else np.ones(1)
+        volume = COSMOLOGY.differential_comoving_volume(z).value * cells
+        table = np.log(np.maximum(density, 1e-300)) + np.log(volume)[:, None]
+        return cls(mass_function, np.ascontiguousarray(table), np.log10(np.maximum(stars, 1e-290)))
+
+
+def sfr_log_prior(sfr_prior, grid):
+    """
+    Prior of star-formation rates given mass and redshift, for `~miricigale.fitting.grid.grid.GridEngine`.
+
+    ``sfr_prior`` is that of `~miricigale.fitting.GridSettings`: a relation and its scatter, or None. Anything
+    else is a `ValueError`.
+    """
+    if sfr_prior is None:
+        return None
+    pair = isinstance(sfr_prior, tuple) and len(sfr_prior) == 2
+    relation, scatter = sfr_prior if pair else (None, None)
+    wanted = "a function of stellar mass and redshift, and a scatter in dex above 0"
+    good = callable(relation) and is_number(scatter) and scatter > 0
+    check_that(good, "sfr_prior", wanted, repr(sfr_prior))
+    rate = grid.galaxy_properties["sfr_100myr"].to_value(u.Msun / u.yr / MASS)
+    stars = plain(grid.galaxy_properties["stellar_mass"])
+    return partial(_log_normal_sfr, relation, float(scatter), grid.redshift[:, None], stars, rate)
+
+
+def expected_sfr(relation, mass, redshift):
+    """Star-formation rates of a relation in Msun/yr; a `ValueError` where they are not positive and finite."""
+    rate = to_array(relation(mass, redshift), u.Msun / u.yr, "sfr_prior")
+    bad = ~((rate > 0) & np.isfinite(rate))
+    if np.any(bad):
+        # a rate of 0 would leave no galaxy any prior
+        every = np.broadcast_arrays(rate, mass.to_value(MASS), redshift)
+        value, mass, z = (array[bad][0] for array in every)
+        got = f"{value:g} Msun/yr at {mass:.3g} Msun and redshift {z:g}"
+        raise argument_error("sfr_prior", "a relation to rates above 0 and finite", got)
+    return rate
+
+
+def _log_normal_sfr(relation, scatter, redshift, stars, rate, formed, rows):
+    expected = expected_sfr(relation, formed * stars * MASS, redshift[rows])
+    with np.errstate(divide="ignore"):
+        apart = np.log10(formed * rate / expected)
+    return -0.5 * np.square(apart / scatter)

@@ -1,0 +1,324 @@
+"""Parameters and derived quantities of the models of a grid."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.fitting.posterior.posterior import cell_percentiles
+from miricigale.utils.options import check_that
+from miricigale.utils.units import LUMINOSITY, MASS, frozen_array
+
+#: Levels at which the distributions of derived quantities are kept.
+DERIVED_LEVELS = frozen_array(
+    [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.16, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5]
+    + [0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.84, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999]
+)
+#: Values of a shape quantity closer than this part of their range are one.
+_SAME = 1e-9
+#: Shape quantities whose outermost cells end at 0.
+_NOT_NEGATIVE = ("a_v", "age_mass", "age_light")
+_IR = ("AGN share of 3-1000 um light", "ir_luminosity_agn", "ir_luminosity_galaxy")
+_DUST = ("AGN power over the sum with the dust luminosity", "agn_power", "dust_luminosity")
+#: AGN fractions by name: what they are, the AGN's part in them and the galaxy's.
+FRACTIONS = {"frac_agn_dust": _DUST, "frac_agn_ir": _IR}
+_ALL = 1e30
+
+
+#: Other codes quote the mass of living stars, which is 0.2 to 0.3 dex less.
+FORMED_TEXT = (
+    "mass of all stars formed; that of living stars, which other codes quote, is stellar_mass"
+)
+
+
+def plain(column):
+    """Values of a column as an array of float, without its unit."""
+    return np.asarray(getattr(column, "value", column), dtype=float)
+
+
+def unit_of(column):
+    """Unit of a column; dimensionless if it has none."""
+    return getattr(column, "unit", None) or u.dimensionless_unscaled
+
+
+def draws_summary(value, *, with_log=True, weight=None):
+    """
+    Mean, standard deviation and mean log10, and quantiles at `DERIVED_LEVELS`, of finite draws.
+
+    The mean log10, of draws above 0, is NaN without ``with_log``: for quantities that do not scale with mass.
+    Draws have the same weight, or the weights ``weight``.
+    """
+    finite = np.isfinite(value)
+    if weight is not None:
+        return _weighted_summary(value[finite], weight[finite], with_log)
+    value = value[finite]
+    if not value.size:
+        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
+    lit = value[value > 0]
+    log = np.mean(np.log10(lit)) if with_log and lit.size else np.nan
+    place = DERIVED_LEVELS * (value.size - 1)
+    quantiles = np.interp(place, np.arange(value.size), np.sort(value))
+    return np.array([value.mean(), value.std(), log]), quantiles
+
+
+def _weighted_summary(value, weight, with_log):
+    """Do what `draws_summary` does, of finite draws with weights."""
+    total = weight.sum()
+    if not total > 0:
+        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
+    weight = weight / total
+    mean = np.sum(weight * value)
+    std = np.sqrt(np.sum(weight * np.square(value - mean)))
+    lit, log = value > 0, np.nan
+    if with_log and np.any(lit):
+        log = np.sum(weight[lit] * np.log10(value[lit])) / weight[lit].sum()
+    order = np.argsort(value, kind="stable")
+    weight = weight[order]
+    # a value stands for half of its weight on either side
+    place = np.cumsum(weight) - 0.5 * weight
+    return np.array([mean, std, log]), np.interp(DERIVED_LEVELS, place, value[order])
+
+
+def put_draws(results, new, i, values, weight=None):
+    """
+    Put moments and quantiles of derived quantities of draws, by name, into arrays of results, row ``i``.
+
+    Draws have the same weight, or the weights ``weight``.
+    """
+    for j, name in enumerate(results.quantities):
+        if name in values:
+            with_log = np.isfinite(results.moments[i, j, 2])
+            found = draws_summary(values[name], with_log=with_log, weight=weight)
+            new["moments"][i, j], new["quantiles"][i, j] = found
+
+
+def node_shares(nodes, shape, weight=None):
+    """
+    Part of the draws at each combination of nodes: arrays of indices, one for each axis of ``shape``.
+
+    Draws have the same weight, or the weights ``weight``.
+    """
+    place = np.ravel_multi_index(nodes, shape)
+    total = len(place) if weight is None else weight.sum()
+    return np.bincount(place, weight, minlength=np.prod(shape)).reshape(shape) / total
+
+
+def kept_percentiles(name, levels, kept):
+    """
+    Percentiles of a quantity, shape (n, n_levels), linear between its kept quantiles.
+
+    ``kept`` has those at `DERIVED_LEVELS`, shape (n, n_kept). A `ValueError` is raised for levels beyond
+    these: nothing is known of the tails.
+    """
+    low, high = DERIVED_LEVELS[[0, -1]]
+    wanted = f"from {low:g} to {high:g} for {name!r}, whose distribution is kept there"
+    check_that(not np.any((levels < low) | (levels > high)), "levels", wanted, f"{levels.tolist()}")
+    i = np.maximum(np.searchsorted(DERIVED_LEVELS, levels) - 1, 0)
+    part = (levels - DERIVED_LEVELS[i]) / (DERIVED_LEVELS[i + 1] - DERIVED_LEVELS[i])
+    return kept[:, i] * (1.0 - part) + kept[:, i + 1] * part
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeQuantities:
+    """
+    What is derived from a galaxy model and does not scale with its mass: attenuation, ages, colors.
+
+    ``values``, shape (n_quantities, nG), has one for each galaxy model, so that their posterior follows
+    from the marginal weights of the galaxy models; those that are not finite are left out.
+    """
+
+    names: tuple
+    values: np.ndarray
+
+    @cached_property
+    def _nodes(self):
+        """For each quantity: galaxies by ascending value, starts of equal values, the values."""
+        out = []
+        for row in self.values:
+            finite = np.flatnonzero(np.isfinite(row))
+            order = finite[np.argsort(row[finite], kind="stable")]
+            value = row[order]
+            width = np.ptp(value) if value.size else 0.0
+            start = np.flatnonzero(np.diff(value, prepend=-np.inf) > _SAME * width)
+            out.append((order, start, value[start]))
+        return out
+
+    def summarize(self, weights, levels):
+        """
+        Moments, shape (n, n_quantities, 3), and quantiles, from posterior weights of galaxies (n, nG).
+
+        The moments are mean, standard deviation, and NaN (a mean of log10 has no meaning here); the
+        quantiles, at ``levels``, those of the distribution over the different values, linear within each
+        cell. Rows of NaN give NaN.
+        """
+        shape = len(weights), len(self.names)
+        out, quantiles = np.full((*shape, 3), np.nan), np.full((*shape, len(levels)), np.nan)
+        for i, (order, start, nodes) in enumerate(self._nodes):
+            if nodes.size == 0:
+                continue
+            # sums along rows in memory, so that pieces of a catalog give the same digits
+            part = np.take(weights, order, axis=1)
+            total = part.sum(axis=1, keepdims=True)
+            # an object may have all its weight on models without a value
+            part = np.divide(part, total, out=np.full(part.shape, np.nan), where=total > 0)
+            value = self.values[i, order]
+            mean = np.sum(part * value, axis=1)
+            out[:, i, 0] = mean
+            out[:, i, 1] = np.sqrt(np.sum(part * (value - mean[:, None]) ** 2, axis=1))
+            pdf = np.add.reduceat(part, start, axis=1)
+            bounds = (0.0 if self.names[i] in _NOT_NEGATIVE else -np.inf, np.inf)
+            quantiles[:, i] = cell_percentiles(nodes, pdf, levels, bounds)
+        return out, quantiles
+
+
+@dataclass(frozen=True, eq=False)
+class OtherFraction:
+    """
+    AGN fraction of every model in a second definition: y / (1 + y), y = c galaxy[g] agn[k].
+
+    c = f / (1 - f) is that of the grid's own fraction f. If the latter refers to the dust
+    luminosity the other is the AGN's share of 3-1000 um light, and the other way round. It does
+    not scale with mass. ``galaxy``, shape (nG,), and ``agn``, shape (nA,), are the factors of y.
+    """
+
+    name: str
+    galaxy: np.ndarray
+    agn: np.ndarray
+
+    @classmethod
+    def of_grid(cls, grid):
+        """Of a `~miricigale.sed.ModelGrid`; None if it has no AGN or not the quantities needed."""
+        by_dust = grid.frac_agn_definition == "dust"
+        of_galaxy = "ir_luminosity" if by_dust else "dust_luminosity"
+        of_agn = "ir_luminosity" if by_dust else "agn_power"
+        tables = (grid.galaxy_properties, of_galaxy), (grid.agn_properties, of_agn)
+        if not (grid.n_agn and all(column in table.colnames for table, column in tables)):
+            return None
+        galaxy, agn = (_in_watt(table[column])[0] for table, column in tables)
+        reference = grid.dust_luminosity
+        # where a galaxy has none of it all of it is the AGN's
+        ratio = np.where(reference > 0, _ALL, 0.0)
+        np.divide(reference, galaxy, out=ratio, where=galaxy > 0)
+        return cls("frac_agn_ir" if by_dust else "frac_agn_dust", ratio, agn)
+
+
+@dataclass(frozen=True, eq=False)
+class Quantities:
+    """
+    What is derived from the models of a grid, and how.
+
+    The order is: the galaxy's quantities (for each solar mass formed), the AGN's (for each W of
+    AGN power), the one that both have a part in (``mixed``), then those that do not scale with mass
+    (``shape``), and the AGN fraction in the definition that the grid does not use, if it has one. Arrays of
+    galaxies have the shape (n_quantities, nG) or (nG,), those of the AGN likewise.
+    """
+
+    names: tuple
+    units: tuple
+    descriptions: tuple
+    galaxy_scale: np.ndarray
+    agn_scale: np.ndarray
+    mixed_galaxy: np.ndarray
+    mixed_agn: np.ndarray
+    shape: ShapeQuantities
+    fraction: OtherFraction | None
+
+    @classmethod
+    def of_grid(cls, grid):
+        """
+        Quantities of a model grid.
+
+        All columns of its property tables are taken. A column of both tables (``ir_luminosity``)
+        gives three quantities: the sum, and the parts ``<name>_galaxy`` and ``<name>_agn``;
+        without one, the sum is ``total_luminosity``, dust luminosity and AGN power.
+        """
+        n_agn = grid.n_agn
+        of_galaxy, of_agn = grid.galaxy_properties, grid.agn_properties
+        both = [n for n in of_galaxy.colnames if n_agn and n in of_agn.colnames]
+        # name, unit and meaning of each
+        found = [("mass", MASS, FORMED_TEXT)]
+        galaxy_scale, agn_scale = [np.ones(grid.n_galaxies)], []
+        mixed_galaxy, mixed_agn = grid.dust_luminosity, np.ones(n_agn)
+        mixed = ("total_luminosity", LUMINOSITY, "dust luminosity and AGN power")
+        for column in of_galaxy.itercols():
+            name, text = column.info.name, _text(column, ", for one solar mass formed")
+            values, unit = _in_watt(column)
+            found.append((f"{name}_galaxy" if name in both else name, unit, text))
+            galaxy_scale.append(values)
+            if name in both[:1]:
+                mixed, mixed_galaxy = (name, LUMINOSITY, f"{text}; and of the AGN"), values
+        for column in of_agn.itercols() if n_agn else ():
+            name, unit = column.info.name, unit_of(column)
+            unit = LUMINOSITY if unit == u.dimensionless_unscaled else unit * LUMINOSITY
+            text = _text(column, ", W for each W of AGN power")
+            found.append((f"{name}_agn" if name in both else name, unit, text))
+            agn_scale.append(plain(column))
+            if name in both[:1]:
+                mixed_agn = agn_scale[-1]
+        columns = list(grid.galaxy_shape.itercols())
+        of_shape = [(c.info.name, unit_of(c), _text(c, "")) for c in columns]
+        fraction = OtherFraction.of_grid(grid)
+        found += [mixed, *of_shape]
+        if fraction is not None:
+            text = FRACTIONS[fraction.name][0]
+            found.append((fraction.name, u.dimensionless_unscaled, text))
+        values = np.array([plain(c) for c in columns], float).reshape(len(columns), grid.n_galaxies)
+        return cls(
+            *zip(*found, strict=True),
+            np.array(galaxy_scale),
+            np.array(agn_scale, float).reshape(len(agn_scale), n_agn),
+            np.array(mixed_galaxy, float),
+            np.array(mixed_agn, float),
+            ShapeQuantities(tuple(name for name, *_ in of_shape), values),
+            fraction,
+        )
+
+    @property
+    def intensive(self):
+        """Names of those that do not scale with mass."""
+        return self.names[len(self.galaxy_scale) + len(self.agn_scale) + 1 :]
+
+    def summarize(self, out):
+        """Moments and quantiles of all quantities, from what the grid engine found for n objects."""
+        moments, quantiles = self.shape.summarize(out.galaxy, DERIVED_LEVELS)
+        parts = [(out.moments, out.quantiles), (moments, quantiles)]
+        if self.fraction is not None:
+            share = np.column_stack([out.share, np.full(len(out.share), np.nan)])
+            parts.append((share[:, None], out.share_quantiles[:, None]))
+        return tuple(np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
+
+    def evaluate(self, name, grid, g, k, frac, scale):
+        """
+        Values of a quantity for single models: galaxies, AGN templates, fractions and scales.
+
+        Indices and numbers have one shape, and the values have it too; a scale of NaN gives NaN.
+        """
+        i, n, of = self.names.index(name), len(self.galaxy_scale), self.fraction
+        if i < n:
+            return scale * self.galaxy_scale[i][g]
+        # no value where there is no model
+        if name in self.shape.names:
+            values = self.shape.values[self.shape.names.index(name)][g]
+            return np.where(np.isfinite(scale), values, np.nan)
+        if of is not None and name == of.name:
+            y = frac / (1.0 - frac) * of.galaxy[g] * of.agn[k]
+            return np.where(np.isfinite(scale), y / (1.0 + y), np.nan)
+        power = scale * frac / (1.0 - frac) * grid.dust_luminosity[g]
+        if i < n + len(self.agn_scale):
+            return power * self.agn_scale[i - n][k]
+        mixed = scale * self.mixed_galaxy[g]
+        return mixed + power * self.mixed_agn[k] if self.mixed_agn.size else mixed
+
+
+def _text(column, ending):
+    text = getattr(column.info, "description", None) or column.info.name
+    return text.removesuffix(ending)
+
+
+def _in_watt(column):
+    """Values of a column for each solar mass, and the unit of the whole: W of luminosities."""
+    unit = unit_of(column) * MASS
+    if not unit.is_equivalent(LUMINOSITY):
+        return plain(column), unit
+    return plain(column) * unit.to(LUMINOSITY), LUMINOSITY

@@ -1,0 +1,522 @@
+"""What a fit returns: posteriors of the objects of a catalog."""
+
+import html
+import re
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.fitting.data.likelihood import FitFlags, filter_names
+from miricigale.fitting.posterior.posterior import (
+    FitRows,
+    cell_edges,
+    cell_percentiles,
+    cell_shares,
+    check_levels,
+    moments,
+)
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, kept_percentiles
+from miricigale.fitting.results import drawing, histories
+from miricigale.fitting.results.sample_flags import worst_bands
+from miricigale.fitting.results.table_columns import FIELDS, LEVELS, ODDS, OUTLIER, TEXTS
+from miricigale.utils.file_formats import read_write
+from miricigale.utils.object_rows import PerObject, PerObjectDict
+from miricigale.utils.options import check_names
+from miricigale.utils.tables import described_table, error_column
+from miricigale.utils.units import FNU
+
+#: Part of the mean below which CIGALE gives no standard deviation.
+CIGALE_LEAST_STD = 0.05
+#: Objects that a notebook shows.
+_SHOWN = 20
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FitResults(FitRows):
+    """
+    Posteriors of the objects of a catalog, in its order.
+
+    Made by `BayesFitter.fit`; every array is read-only, and NaN for objects that could not be
+    fitted. ``results[0]``, ``results[rows]`` and ``results.loc[id]`` are of this class too: of a single object
+    the arrays have no axis of objects (shapes below without ``n``), and only a single object has spectra and
+    plots.
+
+    Parameters
+    ----------
+    ids : `~numpy.ndarray`, shape (n,)
+        Ids of the objects.
+    flags : `~numpy.ndarray` of int, shape (n,)
+        `FitFlags`.
+    n_bands : `~numpy.ndarray` of int, shape (n,)
+        Number of bands used, upper limits among them.
+    chi2 : `~numpy.ndarray`, shape (n,)
+        Chi2 of the best model, model error and the terms of upper limits included; with the stated errors of
+        all bands, wrong ones too.
+    log_evidence : `~numpy.ndarray`, shape (n,)
+        Of the grid ln of the sum of prior * likelihood (fluxes in uJy), each model at its best scale;
+        otherwise the sampler's ln(evidence).
+    filters : tuple of str
+        Bands of the models, nb of them.
+    flux, flux_err, sigma : `~numpy.ndarray`, shape (n, nb)
+        Measured fluxes or upper limits, their errors, and the errors used (of fluxes with model
+        error; infinite in bands that were not used), in uJy.
+    axes : dict of str to `~miricigale.fitting.posterior.priors.GridAxis`
+        Parameters that have several values; of a sampler, cells of their priors.
+    pdf : dict of str to `~numpy.ndarray`, shape (n, n_values)
+        Posterior weights of their values.
+    pdf_2d : `~numpy.ndarray`, shape (n, nz, nf)
+        Joint posterior of redshift and AGN fraction.
+    best_index : `~numpy.ndarray` of int, shape (n, 4)
+        Redshift, galaxy, AGN template and fraction of the best model in the grid; -1 of a sampler.
+    best_scale : `~numpy.ndarray`, shape (n,)
+        Its scale, in solar masses formed.
+    best : dict of str to array_like, shape (n,)
+        Parameters and derived quantities of the best model; attribute: `~astropy.units.Quantity`.
+    quantities, units, descriptions : tuple
+        Names, units and meanings of the n_q derived quantities.
+    moments : `~numpy.ndarray`, shape (n, n_q, 3)
+        Mean, standard deviation and mean of log10 (over models where it is not zero).
+    quantiles : `~numpy.ndarray`, shape (n, n_q, n_levels)
+        Quantiles at `miricigale.fitting.posterior.quantities.DERIVED_LEVELS`.
+    model_flux, model_flux_std, best_flux : `~numpy.ndarray`, shape (n, nb)
+        Mean and standard deviation of the model fluxes over the posterior, and the fluxes of
+        the best model, in uJy, in all bands of the models.
+    limit : `~numpy.ndarray` of bool, shape (n, nb), optional
+        Which of the bands used are upper limits; none by default.
+    pairs : dict of tuple of str to `~numpy.ndarray`, shape (n, nx, ny), optional
+        Joint posteriors of other pairs of parameters, those that the fit was asked for; see
+        `joint_pdf`.
+    log_evidence_err, n_calls, n_effective, converged : `~numpy.ndarray`, shape (n,), optional
+        Of a sampler: error of ``log_evidence``, models evaluated, effective size of the sample, and
+        whether it finished before ``max_calls``.
+    axis_moments, axis_quantiles : `~numpy.ndarray`, shapes (n, n_axes, 2) and (n, n_axes, n_levels), optional
+        Of a sampler: moments and quantiles of the parameters of ``axes``, from the sample itself.
+    draws : `~numpy.ndarray`, shape (n, n_draws, n_parameters), optional
+        Of a sampler: draws of equal weight of all `parameters`; see `samples`.
+    intensive : tuple of str, optional
+        Those of ``quantities`` that do not scale with mass: attenuation, ages, colors, the AGN
+        fraction in its other definition. They have no mean of log10.
+    fitted_filters : tuple of str, optional
+        The bands that were fitted; all of ``filters`` by default.
+    redshift_fixed : bool, optional
+        Whether the fit was at given redshifts.
+    constants : dict of str to float, optional
+        Parameters with one value, which have no posterior.
+    distance : `~numpy.ndarray`, shape (n,), optional
+        Distances in Mpc that masses and luminosities are for, where they are not those of the redshifts; NaN
+        where they are.
+    outlier : `~numpy.ndarray`, shape (n, nb), optional
+        How likely each band is wrong, of a fit with ``outliers``; NaN in bands not used.
+    least_std : float, optional
+        Part of the mean below which no standard deviation is given (CIGALE: 0.05).
+    model : `~miricigale.sed.SEDModel`, optional
+        The model that was fitted; not written to files.
+    curves : tuple of `~miricigale.filters.Filter`, optional
+        Curves of the bands that are not of the library; not written to files.
+    meta : dict, optional
+        Provenance and the settings of the fit, for people.
+
+    Examples
+    --------
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes, model_error=0.02)
+    >>> results = fitter.fit(photometry)
+    >>> results
+    <FitResults of 2 objects, 2 fitted, 4 bands>
+    >>> results["b"].mean("redshift").round(2)
+    <Quantity 1.03>
+    >>> edges, weights = results["b"].distribution("redshift")
+    """
+
+    ids: PerObject
+    flags: PerObject
+    n_bands: PerObject
+    chi2: PerObject
+    log_evidence: PerObject
+    filters: tuple
+    flux: PerObject
+    flux_err: PerObject
+    sigma: PerObject
+    axes: dict
+    pdf: PerObjectDict
+    pdf_2d: PerObject
+    best_index: PerObject
+    best_scale: PerObject
+    best: PerObjectDict
+    quantities: tuple
+    units: tuple
+    descriptions: tuple
+    moments: PerObject
+    quantiles: PerObject
+    model_flux: PerObject
+    model_flux_std: PerObject
+    best_flux: PerObject
+    limit: PerObject = None
+    pairs: PerObjectDict = field(default_factory=dict)
+    log_evidence_err: PerObject = None
+    n_calls: PerObject = None
+    n_effective: PerObject = None
+    converged: PerObject = None
+    axis_moments: PerObject = None
+    axis_quantiles: PerObject = None
+    draws: PerObject = None
+    intensive: tuple = ()
+    fitted_filters: tuple | None = None
+    redshift_fixed: bool = False
+    distance: PerObject = None
+    outlier: PerObject = None
+    constants: dict = field(default_factory=dict)
+    least_std: float = 0.0
+    model: object = None
+    curves: tuple = ()
+    meta: dict = field(default_factory=dict)
+
+    read, write = read_write("results (FITS: all but the model; ECSV: their table, not read back)")
+
+    def __post_init__(self):
+        if self.limit is None:
+            object.__setattr__(self, "limit", np.zeros(np.shape(self.sigma), dtype=bool))
+        if self.fitted_filters is None:
+            object.__setattr__(self, "fitted_filters", tuple(self.filters))
+        best = self.best.items()
+        self.__dict__["best"] = {name: u.Quantity(v, self.unit(name)) for name, v in best}
+        super().__post_init__()
+
+    def __repr__(self):
+        bands = f"{len(self.filters)} bands"
+        if self.isscalar:
+            key = np.asarray(self.ids).item()
+            return f"<FitResults of {key!r}, chi2 {self.chi2:.4g} in {self.n_bands} of {bands}>"
+        good = int(np.count_nonzero(self.fitted))
+        return f"<FitResults of {len(self)} objects, {good} fitted, {bands}>"
+
+    def _repr_html_(self):
+        table = self._several()[:_SHOWN].to_table()._repr_html_()
+        more = "" if self.isscalar or len(self) <= _SHOWN else f", the first {_SHOWN}"
+        return f"<p>{html.escape(repr(self))}{more}</p>{table}"
+
+    @property
+    def fitted(self):
+        """Which objects have a result."""
+        return np.isfinite(self.chi2)
+
+    @property
+    def n_limits(self):
+        """How many of the bands used are upper limits: array of int, shape (n,)."""
+        return np.count_nonzero(self.limit, axis=-1)
+
+    @property
+    def reduced_chi2(self):
+        """Chi2 over the number of bands (limits among them) less one; NaN with a single band."""
+        free = np.asarray(np.maximum(self.n_bands - 1, 0))
+        return np.divide(self.chi2, free, out=np.full(free.shape, np.nan), where=free > 0)[()]
+
+    @property
+    def band_off(self):
+        """The band that is off (`FitFlags` ``BAND_OFF``), empty without: array of str, shape (n,)."""
+        names = np.array([*self.filters, ""])
+        found = names[worst_bands(self._several())]
+        return found[0] if self.isscalar else found
+
+    @property
+    def parameters(self):
+        """Names of all that has a posterior: parameters, then derived quantities."""
+        return (*self.axes, *self.quantities)
+
+    def unit(self, name):
+        """Unit of a parameter or derived quantity."""
+        name = self._named(name)
+        if name in self.axes:
+            return u.Unit(self.axes[name].unit)
+        if name == "redshift":
+            # a fixed one has no axis
+            return u.dimensionless_unscaled
+        return self.units[self._quantity(name)]
+
+    def extensive(self, name):
+        """Whether it is a derived quantity that scales with mass."""
+        return name in self.quantities and name not in self.intensive
+
+    def _quantity(self, name):
+        check_names([name], "parameter", self.parameters)
+        return self.quantities.index(name)
+
+    def _meaning(self, name):
+        return self.descriptions[self._quantity(name)] if name in self.quantities else name
+
+    # ------------------------------------------------------------------ posteriors
+
+    def mean(self, name):
+        """Posterior means of a parameter or derived quantity: Quantity, shape (n,)."""
+        return self._moments(name)[0] * self.unit(name)
+
+    def std(self, name):
+        """Posterior standard deviations: Quantity, shape (n,)."""
+        return self._moments(name)[1] * self.unit(name)
+
+    def _moments(self, name):
+        name = self._named(name)
+        kept = self._kept(name, "moments")
+        if kept is None:
+            mean, std = moments(self.axes[name].values, self.pdf[name])
+        else:
+            mean, std = kept[..., 0], kept[..., 1]
+        return mean, np.maximum(std, self.least_std * np.abs(mean))
+
+    def _kept(self, name, what):
+        """Moments or quantiles that are kept; None of a parameter of which the cells are."""
+        if name not in self.axes:
+            return getattr(self, what)[..., self._quantity(name), :]
+        kept = getattr(self, f"axis_{what}")
+        return None if kept is None else kept[..., list(self.axes).index(name), :]
+
+    def median(self, name):
+        """Posterior medians of a parameter: `~astropy.units.Quantity`, shape (n,)."""
+        return self.percentile(name, [0.5])[..., 0]
+
+    def summary(self):
+        """Id, names of flags, chi2, and the 16th, 50th and 84th percentiles, as a table."""
+        table = self.to_table()
+        kept = [name for name in table.colnames if re.search(r"^(id|chi2_best)$|_p\d\d$", name)]
+        table = table[kept]
+        table.add_column([", ".join(names) for names in self.flag_names()], 1, "flags")
+        return table
+
+    def _column(self, name):
+        """Posterior medians of a parameter, or a column of the table."""
+        if self._named(name) in self.parameters:
+            return self.median(name)
+        return super()._column(name)
+
+    def _value(self, name):
+        # half-made copies have no axes yet
+        if "axes" in self.__dict__ and name in self.parameters:
+            return self.median(name)
+        return None
+
+    def _value_names(self):
+        return self.parameters
+
+    def plot(self, ax=None, **kwargs):
+        """Draw a single object (`plot_sed`), or the masses of several over 1 + z; returns the axes."""
+        if self.isscalar:
+            return self.plot_sed(ax, **kwargs)
+        from miricigale.plotting.comparison import plot_relation
+
+        mass = self.median("mass")
+        labels = "1 + z", f"stellar mass ({mass.unit}), posterior medians"
+        return plot_relation(1 + self.median("redshift").value, mass.value, ax=ax, labels=labels)
+
+    def percentile(self, name, levels):
+        """
+        Posterior percentiles.
+
+        Parameters
+        ----------
+        name : str
+            A parameter or derived quantity, by our name or CIGALE's (``"stellar.m_star"``).
+        levels : array_like
+            Levels in (0, 1), or all in percent (16, 50, 84); of derived quantities, and of all of a sampler, from
+            0.001 to 0.999.
+
+        Returns
+        -------
+        percentiles : `~astropy.units.Quantity`, shape (n, n_levels); (n,) for a single level
+            For parameters of the grid from the distribution that is linear within each cell.
+
+        Raises
+        ------
+        KeyError
+            If there is no such parameter.
+        ValueError
+            If a level is outside.
+        """
+        single, levels = np.ndim(levels) == 0, check_levels(levels)
+        name = self._named(name)
+        some = self._several()
+        kept = some._kept(name, "quantiles")
+        if kept is None:
+            axis = self.axes[name]
+            out = cell_percentiles(axis.values, some.pdf[name], levels, axis.bounds)
+        else:
+            out = kept_percentiles(name, levels, kept)
+        out = out[:, 0] if single else out
+        return (out[0] if self.isscalar else out) * self.unit(name)
+
+    def distribution(self, name):
+        """
+        Posterior of a parameter or derived quantity.
+
+        Returns
+        -------
+        edges : `~astropy.units.Quantity`, shape (n_cells + 1,) or (n, n_cells + 1)
+            Edges of the cells: those around the values of a parameter, or, for each object, the
+            quantiles of a derived quantity. Between nodes a component that may be absent has a first cell of
+            no width at 0, whose weight is the probability that it is.
+        weights : `~numpy.ndarray`, shape (n, n_cells) or (n_cells,)
+            Weight of each cell; of the cells between quantiles the same for all.
+        """
+        name = self._named(name)
+        if name in self.axes:
+            axis = self.axes[name]
+            edges = cell_edges(axis.values, axis.bounds)
+            if self.axis_quantiles is not None and axis.absent_at_zero:
+                # what is absent has a cell of no width, and what is present begins at 0
+                edges[:2] = 0.0
+            return edges * self.unit(name), self.pdf[name]
+        return self._kept(name, "quantiles") * self.unit(name), np.diff(DERIVED_LEVELS)
+
+    def cdf(self, name):
+        """
+        Cumulative distribution of a parameter or derived quantity, linear between its points.
+
+        Returns
+        -------
+        values : `~astropy.units.Quantity`
+            Edges of the cells of a parameter, or quantiles; see `distribution`.
+        levels : `~numpy.ndarray`
+            Part of the posterior below each; from 0.001 to 0.999 for a derived quantity.
+        """
+        name = self._named(name)
+        edges, weights = self.distribution(name)
+        first = np.full((*weights.shape[:-1], 1), 0.0 if name in self.axes else DERIVED_LEVELS[0])
+        # rounding may lift a sum above 1
+        levels = np.minimum(first + np.cumsum(weights, axis=-1), 1.0)
+        return edges, np.concatenate([first, levels], axis=-1)
+
+    @property
+    def redshift_odds(self):
+        r"""
+        How likely the median redshift is no outlier: array, shape (n,).
+
+        The odds of Benitez 2000 (ApJ 536, 571, section 4.2), the posterior in a window about the redshift given,
+        with the window of outliers: the probability that :math:`|z_{50} - z| / (1 + z) < 0.15` for the redshift
+        z, from the distribution that is linear within each cell of the redshifts. NaN at known redshifts.
+        """
+        some = self._several()
+        out = np.full(len(some), np.nan)
+        if "redshift" in self.axes and not self.redshift_fixed:
+            z, axis = some.median("redshift").value, self.axes["redshift"]
+            low, high = (z - OUTLIER) / (1.0 + OUTLIER), (z + OUTLIER) / (1.0 - OUTLIER)
+            out = cell_shares(axis.values, some.pdf["redshift"], low, high, axis.bounds)
+        return out[0] if self.isscalar else out
+
+    def joint_pdf(self, x, y):
+        """
+        Joint posteriors of two parameters, summed over all models.
+
+        Parameters
+        ----------
+        x, y : str
+            Redshift and AGN fraction, or a pair of ``pairs`` in `BayesFitter.fit`, in any order.
+            `Samples.pdf_2d` has those of any two, from draws.
+
+        Returns
+        -------
+        weights : `~numpy.ndarray`, shape (n, nx, ny)
+            Weights of the values ``axes[x].values`` and ``axes[y].values``; they sum to 1.
+
+        Raises
+        ------
+        KeyError
+            If the results do not have it.
+        """
+        x = self._named(x)
+        y = self._named(y)
+        known = dict(self.pairs)
+        if "frac_agn" in self.axes:
+            known["redshift", "frac_agn"] = self.pdf_2d
+        if (x, y) in known:
+            return known[x, y]
+        if (y, x) in known:
+            return np.swapaxes(known[y, x], -1, -2)
+        check_names((x, y), "parameter", self.parameters)
+        have = ", ".join(f"{a} and {b}" for a, b in known) or "none"
+        msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit)"
+        raise KeyError(msg)
+
+    # -------------------------------------------------------------- tables and drawings
+
+    def to_table(self):
+        """
+        Results as a table.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            One row for each object: ``id``, ``flags``, ``n_bands``, ``n_limits``,
+            ``chi2_best``, ``reduced_chi2``, ``band_off``, ``log_evidence`` (of a sampler also
+            ``log_evidence_err``, ``n_calls``, ``n_effective``, ``converged``), and for each
+            parameter and derived quantity ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84``
+            and ``_best``; derived quantities that scale with mass also have ``_logmean``, the mean
+            of log10 (dex, in their unit). Of a fit with ``outliers``, for each band
+            ``<band>_outlier``, how likely it is wrong. With free redshifts `redshift_odds`.
+        """
+        some = self._several()
+        texts = TEXTS["object"] | {"flags": FitFlags.describe()}
+        columns = {n: (getattr(some, FIELDS.get(n, n)), text) for n, text in texts.items()}
+        columns = {n: value for n, value in columns.items() if value[0] is not None}
+        for name in some.parameters:
+            unit, meaning = some.unit(name), some._meaning(name)
+            percentiles = some.percentile(name, LEVELS)
+            parts = [some.mean(name), some.std(name), *percentiles.T, some.best[name]]
+            for (suffix, text), value in zip(TEXTS["parameter"].items(), parts, strict=True):
+                columns[f"{name}_{suffix}"] = (value, f"{text} of {meaning}")
+            if some.extensive(name):
+                log_mean = some.moments[:, some._quantity(name), 2] * u.dex
+                text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
+                columns[f"{name}_logmean"] = (log_mean, text)
+            if name == "redshift" and not some.redshift_fixed:
+                columns["redshift_odds"] = (some.redshift_odds, ODDS)
+        if some.outlier is not None:
+            for name in some.fitted_filters:
+                value = some.outlier[:, some.filters.index(name)]
+                columns[f"{name}_outlier"] = (value, f"how likely {name} is wrong")
+        return described_table(columns, dict(self.meta))
+
+    def predict(self, filters=None):
+        """
+        Fluxes of the models over the posterior; `Samples.predict` has those in other bands.
+
+        Parameters
+        ----------
+        filters : list of str or `~miricigale.filters.FilterSet`, optional
+            Bands of the models, fitted or not; all by default.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``id`` and, for each filter, mean (by its name), standard deviation (``<name>_err``)
+            and flux of the best model (``<name>_best``) in uJy.
+        """
+        some = self._several()
+        columns = {"id": (some.ids, "identifier")}
+        names = filter_names("filters", self.filters if filters is None else filters)
+        check_names(names, "filter of the models", self.filters)
+        for name in names:
+            for column, array, text in (
+                (name, some.model_flux, "posterior mean of the model flux"),
+                (error_column(name), some.model_flux_std, "its posterior standard deviation"),
+                (f"{name}_best", some.best_flux, "flux of the best model"),
+            ):
+                columns[column] = (array[:, self.filters.index(name)] * FNU, text)
+        return described_table(columns, dict(self.meta))
+
+    def _one(self, what):
+        """Refuse several objects where one is needed."""
+        if not self.isscalar:
+            msg = f"{what} is of a single object: results[0].{what}() or results.loc[id].{what}()"
+            raise TypeError(msg)
+        return self
+
+    samples, best_sed, plot_sed = drawing.samples, drawing.best_sed, drawing.plot_sed
+    plot_pdf, plot_pdf2d = drawing.plot_pdf, drawing.plot_pdf2d
+    plot_corner, plot_redshift = drawing.plot_corner, drawing.plot_redshift
+    plot_sfh = histories.plot_best_sfh

@@ -1,0 +1,538 @@
+"""Models drawn from posteriors: joint distributions, fluxes in any band, spectra."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.fitting.data.likelihood import FitFlags
+from miricigale.fitting.posterior.posterior import FitRows, bin_edges, cell_edges, check_levels
+from miricigale.fitting.posterior.priors import grid_priors
+from miricigale.fitting.posterior.quantities import FRACTIONS, Quantities
+from miricigale.fitting.results import histories
+from miricigale.fitting.results.drawing import CORNER, labeled
+from miricigale.fitting.results.percentile_columns import LEVELS, suffix
+from miricigale.sed import grid_spectra
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.file_formats import read_write
+from miricigale.utils.object_rows import PerObject
+from miricigale.utils.options import check_names, check_that
+from miricigale.utils.random import stream
+from miricigale.utils.tables import described_table, error_column
+from miricigale.utils.units import FNU, WAVE
+
+#: Cells of a derived quantity in a corner plot, and the part of the draws that are beyond them.
+N_BINS = 20
+CUT = 0.01
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Samples(FitRows):
+    """
+    Models drawn from the posteriors of the objects of a catalog.
+
+    All draws of an object have the same weight. What a model is comes from the grid, so that
+    only four indices and a scale are kept for each. ``samples[id]`` and ``samples[rows]`` are of
+    this class too; of a single object the arrays have no axis of objects.
+
+    Parameters
+    ----------
+    grid : `~miricigale.sed.ModelGrid`
+        The grid that was fitted.
+    ids : array_like, shape (n,)
+        Ids of the objects.
+    flags : array_like of int, shape (n,)
+        `FitFlags`.
+    index : array_like of int, shape (n, n_draws, 4)
+        Redshift, galaxy, AGN model and AGN fraction of every draw, as indices of the grid; -1 for
+        objects that could not be fitted. Where the fraction is 0 the AGN model may be -1: none.
+    scale : array_like, shape (n, n_draws)
+        Solar masses formed.
+    model : `~miricigale.sed.SEDModel`, optional
+        The model the grid was made from, for other bands and for spectra.
+    meta : dict, optional
+        Provenance, for people.
+    axes : dict of str to `~miricigale.fitting.posterior.priors.GridAxis`, optional
+        Parameters that have several values, with the prior of the fit (``fitter.priors.axes``);
+        flat in the nodes by default. It matters only for parameters without effect: their
+        posterior is their prior.
+    seed : int, optional
+        Chooses values of parameters without effect.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not agree or an index is not one of the grid.
+
+    Examples
+    --------
+    >>> from miricigale import BayesFitter, ErrorModel, SEDModel
+    >>> bands = ["acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
+    >>> model = SEDModel.yang2021(agn=False)
+    >>> truth = {"id": ["a", "b"], "redshift": [0.5, 1.0], "age": [1.0, 3.0], "mass": [1e10, 1e10]}
+    >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
+    >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
+    >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
+    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> samples = fitter.sample(photometry, 100, seed=1)
+    >>> samples
+    <Samples of 2 objects, 100 draws each>
+    >>> samples["b"].mean("redshift").round(1)
+    <Quantity 1.>
+    """
+
+    grid: object
+    ids: PerObject
+    flags: PerObject
+    index: PerObject
+    scale: PerObject
+    model: object = None
+    meta: dict = field(default_factory=dict)
+    axes: dict | None = None
+    seed: int = 0
+
+    read, write = read_write(
+        "draws (FITS: all but grid and model; ECSV: their table, not read back)",
+        """grid : `~miricigale.sed.ModelGrid`
+    The grid that was fitted (``fitter.grid``), for draws are indices of it; others are refused.
+model : `~miricigale.sed.SEDModel`, optional
+    The model that it was made from, for other bands and for spectra.
+""",
+    )
+
+    def __post_init__(self):
+        ids = np.asarray(self.ids)
+        self._check(ids.size)
+        dtypes = {"ids": ids.dtype, "flags": np.int64, "index": np.int32, "scale": float}
+        for name, dtype in dtypes.items():
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype))
+        if self.axes is None:
+            object.__setattr__(self, "axes", grid_priors(self.grid).axes)
+        super().__post_init__()
+
+    def _check(self, n):
+        """Refuse draws whose shapes do not agree, or that are no models of the grid."""
+        grid, index, shape = self.grid, np.asarray(self.index), np.shape(self.scale)
+        if len(shape) != 2 or shape[0] != n or shape[1] < 1:
+            raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
+        for name, wanted in (("index", (*shape, 4)), ("flags", (n,))):
+            got = np.shape(getattr(self, name))
+            check_that(got == wanted, name, f"of shape {wanted}", got)
+        sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
+        drawn = index[(index[:, :, 0] >= 0).all(axis=1)].reshape(-1, 4)
+        if np.any(drawn < [0, 0, -1, 0]) or np.any(drawn >= sizes):
+            raise argument_error("index", f"within the grid's {sizes}", "others")
+        if np.any((drawn[:, 2] < 0) & (grid.frac_agn[drawn[:, 3]] > 0)):
+            wanted = "with an AGN model where the AGN fraction is above 0"
+            raise argument_error("index", wanted, "none")
+
+    def __repr__(self):
+        what = repr(np.asarray(self.ids).item()) if self.isscalar else f"{len(self)} objects"
+        return f"<Samples of {what}, {self.n_draws} draws{'' if self.isscalar else ' each'}>"
+
+    @property
+    def n_draws(self):
+        """Number of draws of each object."""
+        return self.scale.shape[-1]
+
+    @property
+    def fitted(self):
+        """Which objects have draws."""
+        return (self.index[..., 0] >= 0).all(axis=-1)
+
+    # ------------------------------------------------------------------- values
+
+    @cached_property
+    def _quantities(self):
+        return Quantities.of_grid(self.grid)
+
+    @property
+    def _fractions(self):
+        have = set(self._quantities.names)
+        return [name for name, parts in FRACTIONS.items() if have.issuperset(parts[1:])]
+
+    @property
+    def parameters(self):
+        """
+        Names of all that can be asked for.
+
+        Parameters with several values in the grid, derived quantities and, where the grid has
+        AGN, the AGN fraction in both definitions.
+        """
+        fractions = self._fractions
+        derived = (name for name in self._quantities.names if name not in fractions)
+        return (*self.axes, *derived, *fractions)
+
+    def unit(self, name):
+        """Unit of a parameter or derived quantity."""
+        name = self._named(name)
+        if name in self.axes:
+            return u.Unit(self.axes[name].unit)
+        check_names([name], "parameter", self.parameters)
+        known = self._quantities
+        if name in FRACTIONS:
+            return u.dimensionless_unscaled
+        return known.units[known.names.index(name)]
+
+    def description(self, name):
+        """One line on a parameter or derived quantity."""
+        known = self._quantities
+        texts = dict(zip(known.names, known.descriptions, strict=True))
+        texts |= {name: parts[0] for name, parts in FRACTIONS.items()}
+        for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
+            texts |= {one: table[one].info.description for one in table.colnames}
+        return texts.get(name) or name
+
+    def values(self, name):
+        """
+        Values of a parameter or derived quantity in every draw.
+
+        Returns
+        -------
+        values : `~astropy.units.Quantity`, shape (n, n_draws)
+            NaN for objects that could not be fitted, and for parameters of the AGN where a
+            draw has none.
+        """
+        name = self._named(name)
+        some, unit = self._several(), self.unit(name)
+        out = np.where(some.fitted[:, None], some._values(name), np.nan)
+        return out.reshape(self.scale.shape) * unit
+
+    def _values(self, name):
+        """Values without their unit, shape (n, n_draws); of any model for objects without draws."""
+        z, g, k, f = np.moveaxis(self.index, -1, 0)
+        grid, axis = self.grid, self.axes.get(name)
+        if name in self._fractions:
+            agn, galaxy = (self._values(part) for part in FRACTIONS[name][1:])
+            whole = agn + galaxy
+            return np.divide(agn, whole, out=np.zeros_like(whole), where=whole != 0)
+        if axis is None:
+            frac = grid.frac_agn[f]
+            return self._quantities.evaluate(name, grid, g, np.maximum(k, 0), frac, self.scale)
+        values = {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f]}
+        if axis.kind in values:
+            return values[axis.kind]
+        return self._of_axis(axis, g if axis.kind == "galaxy" else k)
+
+    def _of_axis(self, axis, model):
+        """Values of a parameter; where a model stands for several, drawn as its prior has it."""
+        share = axis.share
+        out = axis.values[np.argmax(share, axis=0)][model]
+        several = np.count_nonzero(share > 0, axis=0) > 1
+        many = several[model] & (model >= 0)
+        total = np.cumsum(share, axis=0)
+        for i in np.flatnonzero(many.any(axis=1)):
+            rng = stream(int(self.seed), "samples", axis.name, str(self.ids[i]))
+            draw = rng.random(model.shape[1])[many[i]]
+            cdf = total[:, model[i][many[i]]]
+            out[i, many[i]] = axis.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
+        return np.where(model >= 0, out, np.nan)
+
+    def to_table(self, names=None):
+        """
+        All draws as a long table.
+
+        Parameters
+        ----------
+        names : list of str, optional
+            Parameters and derived quantities; all by default.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``id``, ``draw`` (from 0), ``flags``, and a column for each parameter and derived
+            quantity; the draws of an object follow one another. Objects that could not be
+            fitted stay in place with NaN.
+        """
+        some = self._several()
+        n, draws = some.scale.shape
+        columns = {
+            "id": (np.repeat(some.ids, draws), "identifier"),
+            "draw": (np.tile(np.arange(draws), n), "number of the draw"),
+            "flags": (np.repeat(some.flags, draws), FitFlags.describe()),
+        }
+        for name in self.parameters if names is None else names:
+            columns[name] = (some.values(name).ravel(), self.description(name))
+        return described_table(columns, dict(self.meta))
+
+    def mean(self, name):
+        """Means of the draws: Quantity, shape (n,)."""
+        return self.values(name).mean(axis=-1)
+
+    def std(self, name):
+        """Standard deviations of the draws: Quantity, shape (n,)."""
+        return self.values(name).std(axis=-1)
+
+    def percentile(self, name, levels):
+        """
+        Percentiles of the draws.
+
+        Parameters
+        ----------
+        name : str
+            A parameter or derived quantity.
+        levels : array_like, shape (n_levels,)
+            Levels in (0, 1), or all in percent, of percentiles of shape (n, n_levels); (n,) for a single level.
+        """
+        values = self.values(name)
+        single, levels = np.ndim(levels) == 0, check_levels(levels)
+        out = np.moveaxis(np.quantile(values.value, levels, axis=-1), 0, -1) * values.unit
+        return out[..., 0] if single else out
+
+    # -------------------------------------------------------------- distributions
+
+    def pdf(self, name, key):
+        """
+        Distribution of a parameter or derived quantity of one object.
+
+        Parameters
+        ----------
+        name, key : str and object
+            A parameter or derived quantity, and the id of the object.
+
+        Returns
+        -------
+        edges : `~astropy.units.Quantity`, shape (n_bins + 1,)
+            Of parameters of the grid the cells around its nodes; of derived quantities 30 bins of equal
+            width, in the logarithm where they scale with mass.
+        weights : `~numpy.ndarray`, shape (n_bins,)
+            Part of the draws in each.
+        """
+        values, edges = self._binned(name, key)
+        return edges * self.unit(name), np.histogram(values, edges)[0] / self.n_draws
+
+    def pdf_2d(self, a, b, key):
+        """
+        Joint distribution of two parameters or derived quantities of one object.
+
+        Parameters
+        ----------
+        a, b : str
+            Parameters or derived quantities.
+        key : object
+            Id of the object.
+
+        Returns
+        -------
+        a_edges, b_edges : `~astropy.units.Quantity`, shapes (n_a + 1,) and (n_b + 1,)
+            Edges of the cells; see `pdf`.
+        weights : `~numpy.ndarray`, shape (n_a, n_b)
+            Part of the draws in each; the draws without a value (parameters of an AGN that is
+            not there) are in none.
+        """
+        (x, x_edges), (y, y_edges) = (self._binned(name, key) for name in (a, b))
+        part = np.full(self.n_draws, 1.0 / self.n_draws)
+        weights = np.histogram2d(x, y, (x_edges, y_edges), weights=part)[0]
+        return x_edges * self.unit(a), y_edges * self.unit(b), weights
+
+    def _binned(self, name, key):
+        """Values in the draws of an object, and edges of the cells."""
+        name = self._named(name)
+        values, known = self.loc[key]._fitted_one().values(name).value, self._quantities
+        if name in self.axes:
+            return values, cell_edges(self.axes[name].values, self.axes[name].bounds)
+        check_that(np.isfinite(values).any(), "name", "one with values in the draws", repr(name))
+        extensive = name in known.names and name not in known.intensive
+        return values, bin_edges(values, log=extensive)
+
+    # ---------------------------------------------------------- fluxes and spectra
+
+    def fluxes(self, filters=None):
+        """
+        Model fluxes of every draw.
+
+        Parameters
+        ----------
+        filters : list of str or `~miricigale.filters.FilterSet`, optional
+            Any bands. Those of the grid (all of them by default) are read from it; for others
+            the model is evaluated, every different model of the draws once.
+
+        Returns
+        -------
+        fluxes : `~astropy.units.Quantity`, shape (n, n_draws, n_filters)
+            In uJy; NaN for objects that could not be fitted.
+
+        Raises
+        ------
+        ValueError
+            If a band is not one of the grid and no model is known, or the model is another.
+        """
+        names, extra = grid_spectra.band_names(self.grid, filters)
+        model, some = self._model() if extra else None, self._several()
+        out = np.full((*some.scale.shape, len(names)), np.nan)
+        fitted = some.fitted
+        out[fitted] = grid_spectra.draw_fluxes(
+            self.grid, some.index[fitted], some.scale[fitted], names, extra, model
+        )
+        return out.reshape(*self.scale.shape, len(names)) * FNU
+
+    def _model(self):
+        check_that(self.model is not None, "model", "an SEDModel (these samples know none)", "None")
+        grid_spectra.check_model(self.model, self.grid)
+        return self.model
+
+    def predict(self, filters=None, *, levels=LEVELS):
+        """
+        Posterior of the fluxes in any bands.
+
+        Parameters
+        ----------
+        filters : list of str or `~miricigale.filters.FilterSet`, optional
+            See `fluxes`.
+        levels : tuple of float, optional
+            Levels of percentiles.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``id``, ``flags`` and, for each filter, mean (by its name), standard deviation
+            (``<name>_err``) and percentiles (``<name>_p16``, ...) in uJy.
+        """
+        levels = check_levels(levels)
+        names, _ = grid_spectra.band_names(self.grid, filters)
+        some = self._several()
+        columns = {
+            "id": (np.array(some.ids), "identifier"),
+            "flags": (np.array(some.flags), FitFlags.describe()),
+        }
+        for name, flux in zip(names, np.moveaxis(some.fluxes(filters), -1, 0), strict=True):
+            columns[name] = (flux.mean(axis=1), "posterior mean of the model flux")
+            columns[error_column(name)] = (flux.std(axis=1), "its standard deviation")
+            for level, values in zip(levels, np.quantile(flux, levels, axis=1), strict=True):
+                text = f"quantile {level:g} of the model flux"
+                columns[f"{name}_{suffix(level)}"] = (values, text)
+        return described_table(columns, dict(self.meta))
+
+    def spectra(self, key, *, rest=True):
+        """
+        Spectra of the draws of one object; different galaxies and AGN models are evaluated once.
+
+        Parameters
+        ----------
+        key : object
+            Id of the object.
+        rest : bool, optional
+            Whether in the rest frame (L_nu as it leaves the galaxy, without absorption between
+            the galaxies and in the Milky Way) or as observed (F_nu, with both).
+
+        Returns
+        -------
+        wave : `~astropy.units.Quantity`, shape (n_wave,)
+            Wavelengths in um; of the observed spectra those that all draws cover, in the steps
+            of the median redshift.
+        spectra : `~astropy.units.Quantity`, shape (n_draws, n_wave)
+            In W / Hz or uJy.
+        """
+        one = self.loc[key]._fitted_one()
+        function = grid_spectra.rest_spectra if rest else grid_spectra.observed_spectra
+        wave, values = function(self._model(), self.grid, one.index, one.scale)
+        return wave * WAVE, values * (u.W / u.Hz if rest else FNU)
+
+    def sed_band(self, key, levels=LEVELS, *, rest=True):
+        """
+        Percentiles of the spectrum of one object.
+
+        Parameters
+        ----------
+        key, rest : optional
+            See `spectra`.
+        levels : tuple of float, optional
+            Levels of the percentiles, in (0, 1).
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``wave`` and a column for each level (``p16``, ``p50``, ``p84``), taken at every
+            wavelength by itself: L_nu in W / Hz, or F_nu in uJy as observed.
+        """
+        levels = check_levels(levels)
+        wave, values = self.spectra(key, rest=rest)
+        columns = {"wave": (wave, f"{'rest' if rest else 'observed'} wavelength")}
+        for level, row in zip(levels, np.quantile(values.value, levels, axis=0), strict=True):
+            text = f"quantile {level:g} of {'L_nu' if rest else 'F_nu'}"
+            columns[suffix(level)] = (row * values.unit, text)
+        return described_table(columns, dict(self.meta) | {"id": str(key), "rest": bool(rest)})
+
+    def plot_sed_band(self, key, ax=None, *, levels=LEVELS, rest=True, **kwargs):
+        """Draw `sed_band`; returns the axes."""
+        from miricigale.plotting.posteriors import plot_sed_band
+
+        table = self.sed_band(key, levels, rest=rest)
+        bands = [table[name] for name in table.colnames[1:]]
+        return plot_sed_band(table["wave"], bands, ax=ax, rest=rest, **kwargs)
+
+    sfh_band, plot_sfh = histories.sfh_band, histories.plot_sfh_band
+
+    def plot_pdf2d(self, key, a="redshift", b="frac_agn", ax=None, **kwargs):
+        """Draw the joint distribution of two parameters of an object; returns the axes."""
+        from miricigale.plotting.posteriors import plot_pdf_2d
+
+        a_edges, b_edges, weights = self.pdf_2d(a, b, key)
+        kwargs.setdefault("labels", tuple(labeled(name, self.unit(name)) for name in (a, b)))
+        return plot_pdf_2d(a_edges.value, b_edges.value, weights, ax=ax, **kwargs)
+
+    def plot_corner(self, key, names=None, *, truths=None, figure=None):
+        """
+        Draw the posteriors of several parameters of an object, each and in pairs.
+
+        Parameters
+        ----------
+        key : object
+            Id of the object.
+        names : list of str, optional
+            Parameters and derived quantities; by default those of redshift, stellar mass, star-formation rate,
+            attenuation and AGN fraction that there are. Quantities that scale with mass are drawn as log10.
+        truths : dict of str to float, optional
+            Values to mark, by name.
+        figure : `~matplotlib.figure.Figure`, optional
+            Where to draw; a new one by default.
+
+        Returns
+        -------
+        axes : `~numpy.ndarray` of `~matplotlib.axes.Axes`, shape (n, n)
+            Of derived quantities the outermost 1 % of the draws are beyond the panels.
+        """
+        from miricigale.plotting.corner import plot_corner
+
+        if names is None:
+            names = [name for name in CORNER if name in self.parameters]
+        names = [self._named(name) for name in names]
+        check_names(names, "parameter", self.parameters)
+        some = self.loc[key]._fitted_one()
+        panels = [some._panel(name) for name in names]
+        marginals = [(edges, np.histogram(x, edges)[0] / self.n_draws) for x, edges, _ in panels]
+        joints = {}
+        for row, (y, y_edges, _) in enumerate(panels):
+            for column, (x, x_edges, _) in enumerate(panels[:row]):
+                weights = np.histogram2d(x, y, (x_edges, y_edges))[0] / self.n_draws
+                joints[row, column] = x_edges, y_edges, weights
+        labels = []
+        for name, (_, _, log) in zip(names, panels, strict=True):
+            label = labeled(name, self.unit(name))
+            labels.append(f"log {label}" if log else label)
+        marked = {self._named(name): value for name, value in (truths or {}).items()}
+        check_names(marked, "parameter for 'truths'", names)
+        values = [marked.get(name) for name in names]
+        for i, (_, _, log) in enumerate(panels):
+            if log and values[i] is not None:
+                values[i] = np.log10(values[i])
+        return plot_corner(labels, marginals, joints, truths=values, figure=figure)
+
+    def _panel(self, name):
+        """Values of a single object, edges of their cells, and whether both are logarithms, for a corner plot."""
+        values = self.values(name).value
+        if name in self.axes:
+            axis = self.axes[name]
+            return values, cell_edges(axis.values, axis.bounds), False
+        good = values[np.isfinite(values)]
+        check_that(good.size, "names", "of parameters with values in the draws", repr(name))
+        extensive = name in self._quantities.names and name not in self._quantities.intensive
+        log = bool(extensive and np.all(good > 0))
+        if log:
+            values = np.log10(values)
+            good = np.log10(good)
+        low, high = np.quantile(good, [0.5 * CUT, 1.0 - 0.5 * CUT])
+        # equal values get a narrow bin
+        high = max(high, low + 1e-6 * max(abs(low), 1e-30))
+        return values, np.linspace(low, high, N_BINS + 1), log

@@ -1,0 +1,1 @@
+"""Calibration on survey data: zero points, errors of bands, templates and priors."""

@@ -1,0 +1,453 @@
+"""Calibration of a survey: priors, errors of models and bands, and zero points, from sources of known redshift."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.evaluation import photoz_metrics
+from miricigale.fitting.data.template_error import TemplateError
+from miricigale.fitting.posterior.populations import MassFunction, agn_fraction_prior
+from miricigale.fitting.posterior.priors import known_redshifts
+from miricigale.fitting.results.pulls import without_warnings
+from miricigale.fitting.survey.band_errors import (
+    long_instruments,
+    measure_bands,
+    prior_errors,
+    prior_of_band,
+    relative_zero_points,
+)
+from miricigale.fitting.survey.calibration import measure_priors, measure_template_error
+from miricigale.refdata import locate
+from miricigale.utils.caching import cached
+from miricigale.utils.exceptions import DataError, FitWarning, warn
+from miricigale.utils.files import replacing
+from miricigale.utils.options import check_names, check_that
+from miricigale.utils.package_tables import declared
+from miricigale.utils.table_files import read_table
+from miricigale.utils.tables import described_rows, described_table, require_columns
+
+#: Turns of the calibration, each a step of expectation maximization, and the power by which steps of priors are
+#: lengthened (Salakhutdinov & Roweis 2003).
+_TURNS, _LONGER = 6, 2.0
+#: Errors of models before any were measured.
+_FIRST = 0.1
+#: Least number of sources of a half.
+_LEAST = 50
+_NAME = "miricigale survey calibration"
+_COLUMNS, _SCORES = (declared("miricigale.fitting", "columns.toml")[k] for k in ("bands", "scores"))
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyCalibration:
+    """
+    What sources of known redshift say of a survey and of models: for ``calibration`` of `BayesFitter`.
+
+    Parameters
+    ----------
+    name : str
+        What results call it.
+    bands : `~astropy.table.QTable`
+        A row for each band: ``band``, ``zero_point``, ``error_factor``, ``error_part``, ``outlier``, the share of
+        wrong fluxes that fits allow for, and, where it was measured, ``wrong``, the share that was found. Other
+        bands are taken as they are.
+    template_error : `TemplateError`
+        Errors of the models by rest wavelength.
+    priors : dict of str to tuple
+        Values of parameters of the grid, and their weights.
+    mass_function : `MassFunction`, optional
+        Prior of mass and redshift.
+    scores : `~astropy.table.QTable`, optional
+        Redshifts of each half of the sources with what was measured on the other: see `calibrate`.
+    errors : dict of str to `~numpy.ndarray`, optional
+        Errors of ``template_error`` and of the weights of ``priors``: half of the difference of two halves.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import SurveyCalibration
+    >>> ceers = SurveyCalibration.survey()
+    >>> ceers.name
+    'CEERS'
+    """
+
+    name: str
+    bands: QTable
+    template_error: TemplateError
+    priors: dict
+    mass_function: MassFunction | None = None
+    scores: QTable | None = None
+    errors: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        wanted = ("band", "zero_point", "error_factor", "error_part", "outlier")
+        require_columns(self.bands, wanted, "bands")
+
+    def __repr__(self):
+        numbers = f"{len(self.bands)} bands, {len(self.priors)} priors"
+        return f"<SurveyCalibration {self.name}: {numbers}>"
+
+    def of_bands(self, column, filters, default):
+        """Values of a column for bands: dict by name; ``default`` for those that are not in it."""
+        known = dict(zip(map(str, self.bands["band"]), map(float, self.bands[column]), strict=True))
+        return {name: known.get(name, default) for name in filters}
+
+    def grid_priors(self, axes):
+        """Weights for the axes of a grid: dict by name of those whose values are the same."""
+        out = {}
+        for name, (values, weights) in self.priors.items():
+            axis = axes.get(name)
+            if axis is None or np.size(axis) < 2:
+                continue
+            if np.shape(axis) != np.shape(values) or not np.allclose(axis, values, rtol=1e-6):
+                text = f"the calibration {self.name!r} has no prior for the values of {name!r}"
+                warn(f"{text}: flat", FitWarning)
+                continue
+            out[name] = np.array(weights)
+        return out
+
+    def without_priors(self):
+        """Calibration of the same bands and errors for other models: without priors."""
+        return dataclasses.replace(self, priors={}, mass_function=None, errors={})
+
+    @classmethod
+    def without_bands(cls, name, template_error):
+        """Calibration that has errors of models only."""
+        return cls(name, described_rows([], _COLUMNS), template_error, {})
+
+    def with_band_errors(self, errors):
+        """
+        Calibration with other errors of bands; fluxes of MIRI may be wrong.
+
+        Parameters
+        ----------
+        errors : dict of str to `~miricigale.fitting.survey.band_errors.BandErrors`
+            By band.
+
+        Returns
+        -------
+        calibration : `SurveyCalibration`
+            With these bands alone.
+        """
+        rows = [_band_row(band, found) for band, found in errors.items()]
+        return dataclasses.replace(self, bands=described_rows(rows, _COLUMNS))
+
+    def with_prior_errors(self, bands):
+        """
+        Calibration of a catalog of which nothing was measured.
+
+        Parameters
+        ----------
+        bands : list of str
+            Bands of the catalog.
+
+        Returns
+        -------
+        calibration : `SurveyCalibration`
+            Its bands have the errors of `~miricigale.fitting.survey.band_errors.prior_errors`: in MIRI 3.3 times
+            those
+            of the catalog, 15 % of the flux, and 5 % of wrong fluxes.
+        """
+        return self.with_band_errors({band: prior_errors(band) for band in bands})
+
+    def summary(self):
+        """
+        Table of what is done to the fluxes and errors of each band, as text.
+
+        Returns
+        -------
+        text : str
+            A line for each band: fluxes that were compared with what others predict, zero point, factor of the
+            errors, part of the flux that is added, and share of wrong fluxes that was found. ``prior`` stands
+            where no flux said anything.
+        """
+        lines = [f"{'band':20s} {'fluxes':>6s}  zero point      errors x  + flux, %  wrong, %"]
+        for row in self.bands:
+            measured = row["n"] > 0
+            n_fluxes = str(int(row["n"])) if measured else "prior"
+            zero_point = f"{row['zero_point']:.3f}"
+            if measured and row["zero_point_err"] > 0:
+                zero_point += f" +- {row['zero_point_err']:.3f}"
+            numbers = f"{row['error_factor']:8.2f}  {100 * row['error_part']:9.1f}"
+            has_wrong = measured and np.isfinite(row["wrong"])
+            wrong = f"{100 * row['wrong']:8.1f}" if has_wrong else ""
+            line = f"{row['band']:20s} {n_fluxes:>6s}  {zero_point:14s} {numbers}  {wrong}"
+            lines.append(line.rstrip())
+        return "\n".join(lines)
+
+    @classmethod
+    @cached(copies=True)
+    def survey(cls):
+        """
+        Calibration of `~miricigale.sed.SEDModel.survey`, measured on CEERS by ``tools/make_calibration.py``.
+
+        On sources of CEERS (Finkelstein et al. 2023, ApJL 946, L13) in HST, NIRCam and MIRI bands as published by
+        Lisiecki et al. 2025, with S/N above 5 in seven bands, at published redshifts most of which are
+        photometric. What is of that catalog alone (zero points, errors of its bands, wrong fluxes) is left out.
+        """
+        return cls.read(locate("survey.ceers"))
+
+    def write(self, path, *, overwrite=False):
+        """Write an ECSV table of the bands, with the rest in its header."""
+        error = self.template_error
+        meta = {"kind": _NAME, "name": self.name}
+        meta["template_error"] = {"um": error.wave.value.tolist(), "error": error.error.tolist()}
+        meta["priors"] = {
+            name: {"values": np.asarray(v).tolist(), "weights": np.asarray(w).tolist()}
+            for name, (v, w) in self.priors.items()
+        }
+        if self.mass_function is not None:
+            meta["mass_function"] = dataclasses.asdict(self.mass_function)
+        meta["errors"] = {name: np.asarray(e).tolist() for name, e in self.errors.items()}
+        if self.scores is not None:
+            meta["scores"] = {n: self.scores[n].tolist() for n in self.scores.colnames}
+        table = described_table({n: (self.bands[n], t) for n, t in _COLUMNS.items()}, meta)
+        with replacing(path, overwrite=overwrite) as partial:
+            table.write(partial, format="ascii.ecsv")
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read what `write` wrote.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If it is another file.
+        """
+        table = read_table(path, wanted="a calibration of a survey", form="ascii.ecsv")
+        meta = table.meta
+        msg = f"{path} is no calibration of a survey (SurveyCalibration.write)"
+        if meta.get("kind") != _NAME:
+            raise DataError(msg)
+        try:
+            error, mass, scores = (
+                meta.get(name) for name in ("template_error", "mass_function", "scores")
+            )
+            return cls(
+                name=meta["name"],
+                bands=_read_bands(table),
+                template_error=TemplateError.from_meta(error),
+                priors={
+                    n: (np.array(p["values"]), np.array(p["weights"]))
+                    for n, p in meta["priors"].items()
+                },
+                mass_function=None if mass is None else MassFunction(**mass),
+                scores=None if scores is None else QTable(scores),
+                errors={name: np.array(e) for name, e in meta.get("errors", {}).items()},
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            msg = f"{msg}, or a damaged one: {error!r}"
+            raise DataError(msg) from error
+
+
+def _read_bands(table):
+    """Bands of a file; those of earlier versions do not have the share of wrong fluxes that was found."""
+    columns = {}
+    for name, text in _COLUMNS.items():
+        values = table[name] if name in table.colnames else np.full(len(table), np.nan)
+        columns[name] = (values, text)
+    return described_table(columns)
+
+
+def _band_row(band, errors):
+    """Row of the table of bands from `BandErrors`: dict by column."""
+    return {
+        "band": band,
+        "n": errors.n,
+        "zero_point": errors.zero_point,
+        "zero_point_err": errors.zero_point_err,
+        "error_factor": errors.factor,
+        "error_part": errors.part,
+        "outlier": errors.wrong if prior_of_band(band).allows_wrong else 0.0,
+        "wrong": errors.wrong,
+    }
+
+
+def calibrate(
+    fitter,
+    photometry,
+    *,
+    redshift="redshift",
+    name="calibration",
+    reference=None,
+    priors=None,
+    executor=None,
+):
+    """
+    Measure what sources of known redshift say of a survey and of the models.
+
+    In turns, each a step of expectation maximization: priors of all parameters (`measure_priors`), errors of
+    models by rest wavelength (`measure_template_error`), and zero points, errors and shares of wrong fluxes of
+    bands as `calibrate_bands` measures them, from what the other bands predict. Each of two halves of the sources,
+    every other one, is measured by itself, and fitted with free redshifts with what was found on the other: the
+    scores. What is returned is the mean of both, with half of their difference as error. These are six fits of the
+    sources at their redshifts, on nodes, five more if instruments without a band below 5 um, such as MIRI, are
+    left out to be predicted by the others, and two with free redshifts.
+
+    Where nothing is measured of a band, the prior of `calibrate_bands` counts, and ``n`` of the band is 0.
+
+    Parameters
+    ----------
+    fitter : `BayesFitter`
+        On a grid. Its priors, errors of models and outlier fractions are those of the first of the scores; what
+        is measured comes in their place.
+    photometry : `~astropy.table.QTable`
+        As for `BayesFitter.fit`. Sources without redshift are left out.
+    redshift : str or array_like, optional
+        Column of known redshifts, or values.
+    name : str, optional
+        What results call it.
+    reference : str, optional
+        Band whose zero point is 1: by default their median is 1.
+    priors : dict, optional
+        Weights of the values of parameters that are not measured: by default those of `agn_fraction_prior`, for
+        templates that do not fit make AGN where there are none. ``{}`` measures all.
+    executor : `concurrent.futures.Executor`, optional
+        As for `BayesFitter.fit`.
+
+    Returns
+    -------
+    calibration : `SurveyCalibration`
+        For ``BayesFitter(..., calibration=calibration)``.
+
+    Raises
+    ------
+    ValueError
+        If a half has fewer than 50 sources of known redshift.
+
+    References
+    ----------
+    Dempster, Laird & Rubin 1977, JRSS B 39, 1. Brammer, van Dokkum & Coppi 2008, ApJ 686, 1503.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import calibrate
+    >>> calibration = calibrate(fitter, photometry, redshift="z_spec")  # doctest: +SKIP
+    >>> calibration.scores  # doctest: +SKIP
+    >>> calibration.write("calibration.ecsv")  # doctest: +SKIP
+    """
+    check_that(fitter.grid is not None, "fitter", "one with a grid", fitter.engine)
+    table = fitter._table_of(photometry)
+    z = known_redshifts(table, redshift)
+    # none of NaN
+    rows = np.flatnonzero((z >= fitter.grid.redshift[0]) & (z <= fitter.grid.redshift[-1]))
+    wanted = f"with {2 * _LEAST} known redshifts or more"
+    check_that(rows.size >= 2 * _LEAST, "photometry", wanted, rows.size)
+    if priors is None:
+        axis = fitter.priors.axes.get("frac_agn")
+        some = axis is not None and axis.values.size > 1 and axis.values[0] == 0
+        priors = {"frac_agn": agn_fraction_prior(axis.values)} if some else {}
+    if reference is not None:
+        check_names([reference], "band that is fitted", _fitted(fitter, table))
+    options = {"executor": executor}
+    halves = [(table[rows[h::2]], z[rows[h::2]]) for h in (0, 1)]
+    before, after = [], []
+    # what there is to say of the catalog was said of all of it
+    with without_warnings():
+        found = [_measure(fitter, *half, name, reference, priors, options) for half in halves]
+        for (some, _), other in zip(halves, found[::-1], strict=True):
+            before.append(fitter.fit(some, **options))
+            after.append(with_calibration(fitter, other).fit(some, **options))
+    true = np.concatenate([half[1] for half in halves])
+    scores = [
+        {"fit": "before"} | _score(before, true),
+        {"fit": "after"} | _score(after, true),
+    ]
+    return dataclasses.replace(_mean(found), scores=described_rows(scores, _SCORES))
+
+
+def _fitted(fitter, table):
+    """Bands of a catalog that are fitted: list of str."""
+    return [b for b in fitter.filters or fitter.bands if b in table.colnames]
+
+
+def _score(fits, true):
+    """Sources, bias, sigma_MAD, outliers, and part within the 68 % interval: dict by column."""
+    low, z, high = np.concatenate(
+        [one.percentile("redshift", (0.16, 0.5, 0.84)).value for one in fits]
+    ).T
+    good = np.isfinite(z)
+    metrics = photoz_metrics(true[good], z[good])
+    inside = np.mean((low <= true)[good] & (true <= high)[good])
+    return {
+        "n": int(good.sum()),
+        "bias": metrics.bias,
+        "sigma_mad": metrics.sigma_mad,
+        "outliers": metrics.outlier_fraction,
+        "inside": inside,
+    }
+
+
+def on_nodes(fitter):
+    """Return a fitter of the nodes of the grid alone: errors and priors are of what these leave."""
+    settings = dataclasses.replace(fitter.backend.given, interpolate=0, finer=None, agn_error=0.0)
+    return fitter.replace(settings=settings)
+
+
+def _measure(fitter, table, z, name, reference, priors, options):
+    """`SurveyCalibration` of some sources at their redshifts."""
+    options = {"redshift": z, **options}
+    fitter = on_nodes(fitter)
+    bands = _fitted(fitter, table)
+    long = [band for group in long_instruments(bands) for band in group]
+    predicting = [band for band in bands if band not in long]
+    data = fitter.replace(calibration=None)._read_bands(table, bands)
+    errors = {band: prior_errors(band) for band in bands}
+    weights = {}
+
+    def current(template_error):
+        known = {n: (fitter.priors.axes[n].values, w) for n, w in weights.items()}
+        rows = [_band_row(band, found) for band, found in errors.items()]
+        table = described_rows(rows, _COLUMNS)
+        return SurveyCalibration(name, table, template_error, known, MassFunction())
+
+    now = fitter.replace(model_error=_FIRST, template_error=None, calibration=None)
+    for turn in range(_TURNS):
+        fit = now.fit(table, **options)
+        part = {band: 0.0 if turn == 0 else errors[band].part for band in bands}
+        error = measure_template_error(fit, model_error=part)
+        weights = _longer(weights, measure_priors(fit), 1.0 if turn == 0 else _LONGER) | priors
+        if turn > 0:
+            if long:
+                fit = now.replace(filters=predicting).fit(table, **options)
+            errors = measure_bands(fit, data, bands, error)
+            if reference is not None:
+                errors = relative_zero_points(errors, reference)
+        now = with_calibration(fitter, current(error))
+    return now.calibration
+
+
+def with_calibration(fitter, calibration):
+    """Return a fitter with a calibration in place of its own priors and errors."""
+    none = dict.fromkeys(("priors", "template_error", "model_error"))
+    return fitter.replace(calibration=calibration, **none)
+
+
+def _longer(before, now, power):
+    """Weights with a longer step from those before."""
+    out = {}
+    for name, weights in now.items():
+        old = before.get(name, np.full(weights.size, 1.0 / weights.size))
+        step = np.divide(weights, old, out=np.zeros(weights.size), where=old > 0) ** power * old
+        out[name] = step / step.sum()
+    return out
+
+
+def _mean(found):
+    """Mean of two calibrations, of errors that of their squares, with half of the difference as error."""
+    a, b = found
+    bands, wave = a.bands.copy(), a.template_error.wave
+    for name in ("zero_point", "outlier", "wrong"):
+        bands[name] = 0.5 * (a.bands[name] + b.bands[name])
+    # what is scatter in parts of the flux in one half may be in parts of its error in the other
+    for name in ("error_factor", "error_part"):
+        bands[name] = np.sqrt(0.5 * (a.bands[name] ** 2 + b.bands[name] ** 2))
+    bands["zero_point_err"] = 0.5 * np.abs(a.bands["zero_point"] - b.bands["zero_point"])
+    bands["n"] = a.bands["n"] + b.bands["n"]
+    error = a.template_error.error, b.template_error(wave)
+    priors = {n: (v, 0.5 * (w + b.priors[n][1])) for n, (v, w) in a.priors.items()}
+    errors = {n: 0.5 * np.abs(w - b.priors[n][1]) for n, (_, w) in a.priors.items()}
+    errors["template_error"] = 0.5 * np.abs(error[0] - error[1])
+    mean = TemplateError(wave, np.sqrt(0.5 * (error[0] ** 2 + error[1] ** 2)))
+    return SurveyCalibration(a.name, bands, mean, priors, a.mass_function, errors=errors)

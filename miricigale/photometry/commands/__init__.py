@@ -1,0 +1,1 @@
+"""Photometry from files to files: inputs, patches, kernels, injection, pages."""

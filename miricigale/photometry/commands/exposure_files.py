@@ -1,0 +1,177 @@
+"""Forced photometry of files of exposures: several of one filter are fitted together."""
+
+import collections
+import dataclasses
+import warnings
+from pathlib import Path
+
+from miricigale.photometry.commands.file_inputs import (
+    Inputs,
+    Measurement,
+    Pixels,
+    file_kernel,
+    short_band,
+)
+from miricigale.photometry.commands.kernel_files import image_psf
+from miricigale.utils.exceptions import PhotometryWarning, argument_error
+
+
+def with_exposures(inputs):
+    """
+    The inputs as they are, or as `ExposureInputs` if several are exposures of one filter.
+
+    Parameters
+    ----------
+    inputs : `~miricigale.photometry.commands.file_inputs.Inputs`
+        The files.
+
+    Returns
+    -------
+    inputs : `~miricigale.photometry.commands.file_inputs.Inputs`
+    """
+    if len(inputs.images) == 1:
+        return inputs
+    counts = collections.Counter(inputs.bands)
+    repeated_bands = {band for band, n in counts.items() if n > 1}
+    repeated_files = [file for file in inputs.images if file.header.filter in repeated_bands]
+    if not repeated_files or not all(file.header.exposure for file in repeated_files):
+        return inputs
+    values = {field.name: getattr(inputs, field.name) for field in dataclasses.fields(inputs)}
+    return ExposureInputs(**values)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExposureInputs(Inputs):
+    """Files of a measurement, some of which are exposures of one filter, that are fitted together."""
+
+    @property
+    def groups(self):
+        """Numbers of the images of each filter: dict of str to list of int."""
+        groups = {}
+        for k, band in enumerate(self.bands):
+            groups.setdefault(band, []).append(k)
+        return groups
+
+    @property
+    def labels(self):
+        """As of `Inputs`, with the names of the exposures, without that of their kind of product."""
+        labels = []
+        for band, rows in self.groups.items():
+            many_bands = len(self.groups) > 1
+            for k in rows:
+                name = Path(str(self.images[k].path)).name.partition(".")[0]
+                # models and residuals are no products of JWST
+                name = name.removesuffix("_cal").removesuffix("_crf")
+                parts = [short_band(band)] if many_bands else []
+                if len(rows) > 1:
+                    parts.append(name)
+                labels.append("_".join(parts))
+        return labels
+
+    def check(self):
+        """As of `Inputs`; options that exposures do not have are refused too."""
+        super().check()
+        for name, offered in (("components", 1), ("offset_order", None)):
+            value = self.options.get(name, offered)
+            if value != offered:
+                raise argument_error(name, f"{offered} for exposures of one filter", value)
+        if self.options.get("background_order", 0) is None:
+            wanted = "0 to 4 for exposures of one filter, each of which has a sky of its own"
+            raise argument_error("background_order", wanted, None)
+        if self.psf_stars:
+            raise argument_error("psf_stars", "left out for exposures of one filter", True)
+
+    def _check_bands(self):
+        """Several images of a filter are exposures: see `with_exposures`."""
+
+    def read(self, prior=None, images=None):
+        """Read the images, those of one filter as a list."""
+        if prior is not None or images is not None:
+            raise argument_error(
+                "prior, images", "None for exposures, which are read whole", "parts"
+            )
+        images_of_band = {}
+        for band, rows in self.groups.items():
+            read = [self.images[k].read() for k in rows]
+            images_of_band[band] = read if len(read) > 1 else read[0]
+        return Pixels(self.highres.read(), [file.read() for file in self.detection], images_of_band)
+
+    def photometers(self, n_threads=None):
+        """As of `Inputs`; the kernels of exposures are those of their places and rolls."""
+        single = [rows[0] for rows in self.groups.values() if len(rows) == 1]
+        photometers = {}
+        if single:
+            mosaics = dataclasses.replace(
+                self,
+                images=tuple(self.images[k] for k in single),
+                kernels=tuple(self.kernels[k] for k in single),
+            )
+            photometers = Inputs.photometers(mosaics, n_threads)
+        from miricigale.photometry.fit.forced import ForcedPhotometer
+
+        options = self.fit_options(n_threads)
+        for band, rows in self.groups.items():
+            if len(rows) > 1:
+                photometers[band] = ForcedPhotometer(
+                    self._kernels(rows), psf_stars=False, **options
+                )
+        return {band: photometers[band] for band in self.groups}
+
+    def _kernels(self, rows):
+        """Kernels of some exposures: of files, or models by place and roll."""
+        # PSFs are heavy, and files are checked before
+        from miricigale.photometry.fit.exposure_kernels import ExposureKernels
+
+        files = [self.images[k] for k in rows]
+        has_own = [self.kernels[k] is not None or self.images[k].psf is not None for k in rows]
+        modeled = files[0].header.filter.startswith("miri.") and not any(has_own)
+        if modeled:
+            sharp = image_psf(self.highres, "highres_psf")
+            headers = [file.header for file in files]
+            return ExposureKernels.from_images(headers, self.highres.header, sharp)
+        kernels = []
+        for k, file in zip(rows, files, strict=True):
+            kernels.append(file_kernel(file, self.highres, self.kernels[k]))
+        return ExposureKernels(kernels)
+
+    def measure(self, pixels, photometers, segments, sources):
+        """Measure the sources: an `ExposureMeasurement`."""
+        from miricigale.photometry.fit.bands import measure_prior
+
+        results = measure_prior(pixels.images, photometers, pixels.prior, segments, sources)
+        return ExposureMeasurement(self, pixels, photometers, segments, results)
+
+
+class ExposureMeasurement(Measurement):
+    """What was measured, some of it on exposures."""
+
+    def products(self, name):
+        """Models or residuals, one for each image in the order of the labels."""
+        products = []
+        for result in self.results.values():
+            if result.exposures is None:
+                products.append(getattr(result, f"{name}_image"))
+            else:
+                products += getattr(result.exposures, f"{name}_images")
+        return products
+
+    def _shown(self, band):
+        """The first exposure with a name for all, and pulls of points fitted to all residuals."""
+        from miricigale.photometry.commands.page import empty_positions
+        from miricigale.photometry.fit.forced import ForcedPhotometer
+
+        images, result = self.pixels.images[band], self.results[band]
+        if result.exposures is None:
+            return images, None
+        image = images[0].copy()
+        name = Path(image.meta["source"]).name
+        image.meta["source"] = f"{name} and {len(images) - 1} more"
+        empty = empty_positions(result, self.inputs.seed)
+        if not len(empty):
+            return image, None
+        blank = ForcedPhotometer(self.photometers[band].kernel, template="psf")
+        residuals = list(result.exposures.residual_images)
+        with warnings.catch_warnings():
+            # of the noise there was a warning already
+            warnings.simplefilter("ignore", PhotometryWarning)
+            return image, blank.measure(residuals, catalog=empty).snr

@@ -1,0 +1,365 @@
+"""What is measured: images, a prior and what belongs to them; checked and read, whole or in part."""
+
+import collections
+import dataclasses
+import functools
+import os
+
+import astropy.units as u
+import numpy as np
+from astropy.io import fits
+from astropy.nddata import StdDevUncertainty
+
+from miricigale.filters import Filter
+from miricigale.instrument import epoch_of, north_up_wcs
+from miricigale.instrument.image import Image
+from miricigale.instrument.image_planes import plane_data
+from miricigale.instrument.sky_axes import grid_angle
+from miricigale.photometry.commands.kernel_files import can_be_modeled, matching_kernel
+from miricigale.photometry.images.fits_images import open_map
+from miricigale.photometry.images.mosaics import MosaicFile
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import file_place
+from miricigale.utils.units import SURFACE_BRIGHTNESS
+
+#: What the file of a `~miricigale.psf.KernelField` states as its format.
+FIELD = "kernel-field-1"
+
+#: Bytes of a process without images, for each pixel of the prior (or of an image of the detection) and of an
+#: image that is measured, and of some thousand sources where they are dense: largest memory, as it was measured.
+_BYTES = {"process": 450_000_000, "prior": 90, "image": 60, "sources": 750_000_000}
+
+#: Images of a measurement: the prior, others of the detection, and those that are measured by name of the filter.
+Pixels = collections.namedtuple("Pixels", "prior detection images")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """Files and options of a measurement; each attribute as for `~miricigale.photometry.measure_files`."""
+
+    images: tuple
+    highres: MosaicFile
+    detection: tuple = ()
+    segmentation: object = None
+    catalog: object = None
+    kernels: tuple = (None,)
+    confidence: float = 0.95
+    psf_stars: bool | None = False
+    seed: int = 1
+    options: dict = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, image, highres, *, detection=(), kernel=None, **given):
+        """Of the arguments of `~miricigale.photometry.measure_files`."""
+        images, kernels = (v if isinstance(v, (list, tuple)) else [v] for v in (image, kernel))
+        kernels = [None] * len(images) if kernel is None else kernels
+        if len(kernels) != len(images):
+            raise argument_error("kernel", f"one for each of {len(images)} images", len(kernels))
+        files = [
+            one if isinstance(one, MosaicFile) else MosaicFile(one)
+            for one in (highres, *images, *detection)
+        ]
+        n = 1 + len(images)
+        parts = {"highres": files[0], "images": tuple(files[1:n]), "detection": tuple(files[n:])}
+        names = {one.name for one in dataclasses.fields(cls)}
+        options = {name: given.pop(name) for name in sorted(given.keys() - names)}
+        return cls(**parts, kernels=tuple(kernels), options=options, **given)
+
+    @property
+    def bands(self):
+        """Names of the filters."""
+        return [one.header.filter for one in self.images]
+
+    @property
+    def _named(self):
+        named = [("segmentation", self.segmentation), ("catalog", self.catalog)]
+        named += [("highres_psf", self.highres.psf), *(("psf", one.psf) for one in self.images)]
+        named += [("kernel", one) for one in self.kernels]
+        return [(what, path) for what, path in named if path is not None]
+
+    @property
+    def paths(self):
+        """Files that are read, maps of the noise left out."""
+        files = [*self.images, self.highres, *self.detection]
+        return [one.path for one in files] + [path for _, path in self._named]
+
+    def check(self):
+        """Refuse, before any image is read, what is missing, or not what it should be."""
+        for one in self.images:
+            _check_images(one, self.highres)
+        for what, path in self._named:
+            if not os.path.isfile(file_place(path)[0]):
+                msg = f"no file {path} ('{what}')"
+                raise DataError(msg)
+        for one, own in zip(self.images, self.kernels, strict=True):
+            if self.catalog is not None:
+                _check_catalog(self.catalog, one, self.highres)
+            _check_psfs(one, self.highres, own)
+        self._check_bands()
+
+    def _check_bands(self):
+        """Refuse several images of one filter."""
+        if len(set(self.bands)) < len(self.bands):
+            wanted = "of different filters (or exposures, _cal, of one, measured whole)"
+            raise argument_error("image", wanted, self.bands)
+
+    @property
+    def labels(self):
+        """What the images of models and residuals are called, one for each image; empty for a single one."""
+        return [""] if len(self.images) == 1 else [short_band(band) for band in self.bands]
+
+    def n_bytes(self, prior=None, images=None):
+        """About how many bytes parts of these shapes take, with sources; without, the whole images alone."""
+        dense = 0 if prior is None else _BYTES["sources"]
+        prior = self.highres.header.shape if prior is None else prior
+        images = [one.header.shape for one in self.images] if images is None else images
+        fine = np.prod(prior, dtype=float) * (1 + len(self.detection))
+        coarse = sum(np.prod(one, dtype=float) for one in images)
+        return int(_BYTES["process"] + _BYTES["prior"] * fine + _BYTES["image"] * coarse + dense)
+
+    def read(self, prior=None, images=None):
+        """
+        Read the images, or a part of them.
+
+        Parameters
+        ----------
+        prior : tuple of slice, optional
+            The part of the prior; None with ``images`` where it has none.
+        images : list of (tuple of slice or None), optional
+            The same of each image.
+
+        Returns
+        -------
+        pixels : `Pixels`
+            Of the parts without data there are images that hold no source.
+        """
+        if images is None:
+            found = {k: one.read() for k, one in zip(self.bands, self.images, strict=True)}
+            return Pixels(self.highres.read(), [one.read() for one in self.detection], found)
+        away = self.highres.header.wcs.pixel_to_world(0, 0).icrs
+        away = away.directional_offset_by(0 * u.deg, 90 * u.deg)
+        found = {}
+        for band, one, part in zip(self.bands, self.images, images, strict=True):
+            image = part and one.replace(section=part).read()
+            found[band] = image or _blank((3, 3), north_up_wcs(away, 1 * u.arcsec, (3, 3)))
+        whole = self.highres.header
+        if prior is None:
+            return Pixels(_blank((3, 3), whole.wcs), [], found)
+        files = [one.replace(section=prior) for one in (self.highres, *self.detection)]
+        sharp, *others = (one.read() for one in files)
+        if sharp is None:
+            # its pixels are those of the segments
+            sharp = _blank(files[0].header.shape, files[0].header.wcs)
+        return Pixels(sharp, [one for one in others if one is not None], found)
+
+    def fit_options(self, n_threads=None):
+        """Options of a `~miricigale.photometry.ForcedPhotometer`, with the defaults of files."""
+        defaults = {"background_order": 0, "second_pass": None, "n_threads": n_threads}
+        return defaults | self.options
+
+    def photometers(self, n_threads=None):
+        """What measures each band: dict of `~miricigale.photometry.ForcedPhotometer`."""
+        from miricigale.photometry import ForcedPhotometer
+
+        options = self.fit_options(n_threads)
+        found = {}
+        for band, one, own in zip(self.bands, self.images, self.kernels, strict=True):
+            kernel = file_kernel(one, self.highres, own)
+            stars = self.psf_stars if own is None else False
+            found[band] = ForcedPhotometer(kernel, psf_stars=stars, **options)
+        return found
+
+    def find_sources(self, pixels, catalog=None, part=None):
+        """Segments and sources (as of `~miricigale.photometry.read_prior`); ``part`` is () without a prior."""
+        from miricigale.photometry import chi_image, read_prior
+        from miricigale.photometry.detection.prior_catalog import (
+            SEGMENTS,
+            detected_prior,
+            sources_of,
+        )
+
+        prior, others = pixels.prior, pixels.detection
+        if self.segmentation is None or part == ():
+            return detected_prior(chi_image([prior, *others]) if others else prior, catalog)
+        if part is None:
+            return read_prior(prior, segmentation=self.segmentation, catalog=catalog)
+        whole, what = self.highres.header, ("a segmentation map", "the segmentation", SEGMENTS)
+        grid = whole.shape, whole.wcs, self.highres.path
+        with open_map(self.segmentation, *what, grid) as hdu:
+            return sources_of(prior, np.array(plane_data(hdu, part)), catalog)
+
+    def measure(self, pixels, photometers, segments, sources):
+        """Measure the sources: a `Measurement`."""
+        from miricigale.photometry.fit.bands import measure_prior
+
+        results = measure_prior(pixels.images, photometers, pixels.prior, segments, sources)
+        return Measurement(self, pixels, photometers, segments, results)
+
+
+def short_band(band):
+    """Name of a filter without its instrument."""
+    return str(band).rpartition(".")[2]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Measurement:
+    """What was measured, and of what."""
+
+    inputs: Inputs
+    pixels: Pixels
+    photometers: dict  # By name of the filter, as the results.
+    segments: np.ndarray  # Of the prior.
+    results: dict  # `~miricigale.photometry.ForcedPhotometryResult`.
+
+    @functools.cached_property
+    def table(self):
+        """The table of all bands."""
+        from miricigale.photometry.fit.bands import join_bands
+
+        inputs, found = self.inputs, self.results
+        if len(found) == 1:
+            ((band, one),) = found.items()
+            table = one.to_table(band, confidence=inputs.confidence)
+        else:
+            each = {k: one.to_table(confidence=inputs.confidence) for k, one in found.items()}
+            table = join_bands(each)
+        paths = [str(one.path) for one in inputs.images]
+        paths = paths[0] if len(paths) == 1 else paths
+        table.meta.update(image=paths, highres=str(inputs.highres.path))
+        return table
+
+    def products(self, name):
+        """Models (``"model"``) or residuals (``"residual"``), one for each image that was read."""
+        return [getattr(one, f"{name}_image") for one in self.results.values()]
+
+    def write_page(self, path):
+        """Write the page, of those bands that have data."""
+        from miricigale.photometry.commands.page import Measured, write_page
+        from miricigale.psf import KernelField
+
+        measured = []
+        for name, result in self.results.items():
+            image, pulls = self._shown(name)
+            if "source" not in image.meta:
+                continue
+            kernel = self.photometers[name].kernel
+            if result.psf_stars is not None:
+                kernel = result.psf_stars.kernel
+            if result.exposures is not None or isinstance(kernel, KernelField):
+                kernel = kernel.mean
+            measured.append(Measured(name, result, image, kernel, pulls))
+        confidence, seed = self.inputs.confidence, self.inputs.seed
+        write_page(path, measured, self.pixels.prior, self.segments, confidence, seed)
+
+    def _shown(self, band):
+        """The image of a band for the page, and pulls at empty positions, None where the page makes them."""
+        return self.pixels.images[band], None
+
+
+def _blank(shape, wcs):
+    """An image without a source, of which a row alone has data."""
+    mask = np.arange(shape[0])[:, None] + np.zeros(shape) > 0
+    noise = StdDevUncertainty(np.ones(shape, np.float32))
+    data = np.zeros(shape, np.float32)
+    return Image(data, unit=SURFACE_BRIGHTNESS, wcs=wcs, mask=mask, uncertainty=noise)
+
+
+def file_kernel(image, highres, path):
+    """The kernel between two images; that of a file may be of several places."""
+    from miricigale.psf import KernelField
+
+    if path is not None and fits.getheader(file_place(path)[0]).get("FORMAT") == FIELD:
+        return KernelField.read(path)
+    return matching_kernel(image, highres, path)
+
+
+def _check_images(image, highres):
+    """Refuse images that are not what they should be, or do not overlap."""
+    wanted, stated = image.filter, [MosaicFile(one.path).header.filter for one in (image, highres)]
+    if wanted is not None and stated[0] not in (None, wanted) and stated[1] == wanted:
+        msg = (
+            f"'image' and 'highres' seem to be swapped: {highres.path} is the image in {wanted}, "
+            f"{image.path} is in {stated[0]}"
+        )
+        raise ValueError(msg)
+    found, _ = (one.header.filter for one in (image, highres))
+    if found is None:
+        wanted = f"given, for the header of {image.path} does not name it"
+        raise argument_error("filter", wanted, None)
+    if found not in Filter.names() and not found.startswith("sedpy."):
+        wanted = f"a filter that 'miricigale filters' lists, for {image.path}"
+        raise argument_error("filter", wanted, repr(found))
+    for one in (image, highres):
+        try:
+            grid_angle(one.header.wcs, one.header.shape)
+        except ValueError as err:
+            msg = f"{one.path}: {err}"
+            raise ValueError(msg) from err
+    if not (_overlap(image.header, highres.header) or _overlap(highres.header, image.header)):
+        where = [_middle(one.header).to_string("decimal", precision=4) for one in (image, highres)]
+        msg = (
+            f"'image' and 'highres' show different fields: the middle of {image.path} is at "
+            f"{where[0]}, that of {highres.path} at {where[1]} deg"
+        )
+        raise ValueError(msg)
+
+
+def _middle(header):
+    ny, nx = header.shape
+    return header.wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2).icrs
+
+
+def _inside(sky, header):
+    """Whether some positions are on an image."""
+    from miricigale.photometry.images.arrays import sky_pixels
+
+    return np.isfinite(sky_pixels(sky, header.wcs, header.shape, 0.0)).any()
+
+
+def _overlap(one, other):
+    """Whether some of a coarse grid of pixels of one image are on the other."""
+    axes = [np.linspace(0, n - 1, 15) for n in one.shape]
+    y, x = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
+    return _inside(one.wcs.pixel_to_world(x, y), other)
+
+
+def _check_psfs(image, highres, kernel):
+    """Refuse images whose PSF is neither given nor known."""
+    from miricigale.psf import MODEL_FILTERS
+
+    if kernel is not None:
+        if image.psf is not None:
+            raise argument_error("psf", "left out where a kernel is given", image.psf)
+        return
+    for file, prefix in ((image, ""), (highres, "highres_")):
+        name = file.header.filter
+        if file.psf is not None or can_be_modeled(file.header):
+            continue
+        if name in MODEL_FILTERS:
+            wanted = f"given, for the header of {file.path} has no PA_APER (or '{prefix}psf')"
+            raise argument_error(prefix + "pa_aper", wanted, None)
+        name = name or "an image whose filter is unknown ('highres_filter')"
+        wanted = f"given (or 'kernel'), for there is no model PSF for {name}"
+        raise argument_error(prefix + "psf", wanted, None)
+
+
+def _check_catalog(path, image, highres):
+    """Refuse a catalog of another field."""
+    from astropy.coordinates import SkyCoord
+
+    from miricigale.photometry.detection.prior_catalog import read_catalog
+
+    sky = read_catalog(path, epoch=epoch_of(highres.header))["sky"]
+    for what, file in (("image", image), ("highres", highres)):
+        if _inside(sky, file.header):
+            continue
+        msg = f"none of the {len(sky)} sources of {path} is on {file.path} ('{what}')"
+        known = np.isfinite(sky.ra.deg)
+        hours = SkyCoord(15 * sky.ra[known], sky.dec[known])
+        if _inside(hours, file.header):
+            msg += ": is ra in hours? Wanted are degrees, or a column with a unit"
+        elif known.any():
+            first = sky[known][0].to_string("decimal", precision=4)
+            where = _middle(file.header).to_string("decimal", precision=4)
+            msg += f": the first is at {first}, the middle of the image at {where} deg"
+        raise ValueError(msg)

@@ -1,0 +1,300 @@
+"""Patches of a fixed grid on the prior: their pixels, the sources that are theirs, and their tables as one."""
+
+import dataclasses
+import itertools
+import warnings
+
+import numpy as np
+import scipy.sparse
+from astropy.table import QTable, vstack
+from astropy.wcs.utils import pixel_to_pixel
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from miricigale.photometry.detection.catalogs import joined_sky
+from miricigale.photometry.fit.bands import spread_rows
+from miricigale.photometry.fit.result_table import new_ids
+from miricigale.photometry.images.arrays import sky_pixels
+from miricigale.photometry.images.flags import ForcedFlags
+from miricigale.utils.exceptions import PhotometryWarning, warn
+
+#: Pixels of the prior beyond its core in which a patch lists detections too: one that two patches see on
+#: either side of the line between them would be in both tables or in none.
+RIM = 5.0
+
+
+@dataclasses.dataclass(frozen=True)
+class PatchGrid:
+    """
+    Squares of the prior's pixels, as the patches of a tract of LSST.
+
+    Lines between cores are at multiples of ``size``, whatever the images are. A patch is a core and its overlap; a
+    position belongs to the patch whose core holds it (its lower edges included).
+
+    Parameters
+    ----------
+    size, overlap : int
+        Side of the cores, and width of the rim around them, in pixels of the prior.
+    first, shape : tuple of int
+        Number of the first core along y and x (0 begins with the prior's first pixel), and how many there are.
+
+    Examples
+    --------
+    >>> from miricigale.photometry.commands.patches import PatchGrid
+    >>> grid = PatchGrid(1000, 200, (0, 0), (2, 3))
+    >>> grid.names[4], grid.box(4)
+    ('y01x01', (slice(800, 2200, None), slice(800, 2200, None)))
+    >>> grid.holder([[999.4, 999.5], [5000.0, -3.0]])
+    array([3, 2])
+    """
+
+    size: int
+    overlap: int
+    first: tuple
+    shape: tuple
+
+    @classmethod
+    def over(cls, prior, images, size, overlap):
+        """The grid over a prior and images (each with ``wcs`` and ``shape``), as far as these reach."""
+        low, high = np.array([[0, 0], prior.shape])
+        for one in images:
+            edge = _raster([(0, one.shape[0]), (0, one.shape[1])])
+            xy = pixel_to_pixel(one.wcs, prior.wcs, *edge)
+            # the patches at the edge have an overlap beyond it too
+            low = np.fmin(low, np.nanmin(xy, axis=1)[::-1] + overlap)
+            high = np.fmax(high, np.nanmax(xy, axis=1)[::-1] - overlap)
+        first, last = np.floor(low / size).astype(int), np.ceil(high / size).astype(int)
+        return cls(size, overlap, tuple(first.tolist()), tuple((last - first).tolist()))
+
+    @property
+    def names(self):
+        """Names of the patches, row by row."""
+        places = itertools.product(*(range(n) for n in self.shape))
+        return [f"y{y:02d}x{x:02d}" for y, x in places]
+
+    def box(self, k):
+        """Rows and columns of a patch with its overlap, which may be beyond the prior."""
+        place = np.array(np.unravel_index(k, self.shape))
+        low = (place + self.first) * self.size - self.overlap
+        return tuple(slice(int(n), int(n) + self.size + 2 * self.overlap) for n in low)
+
+    def holder(self, xy):
+        """Number of the patch whose core holds each pixel (x, y), (n,); the nearest beyond them, -1 for NaN."""
+        xy = np.asarray(xy, float).reshape(-1, 2)
+        known = np.isfinite(xy).all(axis=1)
+        place = np.floor((np.where(known[:, None], xy, 0)[:, ::-1] + 0.5) / self.size) - self.first
+        place = np.clip(place, 0, np.array(self.shape) - 1).astype(int)
+        return np.where(known, np.ravel_multi_index(tuple(place.T), self.shape), -1)
+
+    def near(self, k, xy, margin):
+        """Whether pixels (x, y) are in the core of a patch or within a margin of it."""
+        steps = itertools.product((-margin, 0.0, margin), repeat=2)
+        return np.any([self.holder(np.asarray(xy) + step) == k for step in steps], axis=0)
+
+
+def patch_parts(inputs, grid, k):
+    """The parts (slices, or None) of the prior and of each image that a patch has with its overlap."""
+    box, whole = grid.box(k), inputs.highres.header
+    headers = (one.header for one in inputs.images)
+    seen = [seen_part(box, whole.wcs, one.wcs, one.shape) for one in headers]
+    return [_within(box, whole.shape), *seen]
+
+
+def seen_part(box, wcs, other, shape):
+    """The part (slices, or None) of an image with a WCS that has what a box of pixels of another has."""
+    xy = np.array(pixel_to_pixel(wcs, other, *_raster([(one.start, one.stop) for one in box])))
+    ends = np.floor(np.nanmin(xy, axis=1)), np.ceil(np.nanmax(xy, axis=1)) + 1
+    found = [slice(int(a), int(b)) for a, b in zip(*ends, strict=True)]
+    return _within(found[::-1], shape)
+
+
+def _within(box, shape):
+    found = tuple(slice(max(b.start, 0), min(b.stop, n)) for b, n in zip(box, shape, strict=True))
+    return found if all(one.start < one.stop for one in found) else None
+
+
+def _raster(spans):
+    """Pixels x, y all over a box of rows and columns, given as pairs of start and stop."""
+    y, x = np.meshgrid(*(np.linspace(a, b - 1, 33) for a, b in spans), indexing="ij")
+    return x.ravel(), y.ravel()
+
+
+def own_rows(patch, grid, xy):
+    """
+    Which rows of the tables of patches are kept, so that each source is there once.
+
+    A row is that of its patch's core. Sources that two patches list within `RIM` of each other, and no nearer one,
+    are the same: of these the one in its core stays, or else that of the first patch.
+
+    Parameters
+    ----------
+    patch : int `~numpy.ndarray`, shape (n,)
+        Number of the patch of each row.
+    grid : `PatchGrid`
+        The patches.
+    xy : `~numpy.ndarray`, shape (n, 2)
+        Pixels of the prior.
+
+    Returns
+    -------
+    kept : bool `~numpy.ndarray`, shape (n,)
+    """
+    core = grid.holder(xy) == patch
+    kept, links, taken = core.copy(), [], set()
+    pairs = cKDTree(xy).query_pairs(RIM, output_type="ndarray")
+    pairs = pairs[patch[pairs[:, 0]] != patch[pairs[:, 1]]]
+    far = np.hypot(*(xy[pairs[:, 0]] - xy[pairs[:, 1]]).T)
+    for i, j in pairs[np.argsort(far, kind="stable")].tolist():
+        # the nearest that each patch has for a source of the other
+        keys = {(i, patch[j]), (j, patch[i])}
+        if not keys & taken:
+            links.append((i, j))
+            taken |= keys
+    if links:
+        graph = scipy.sparse.coo_array(
+            (np.ones(len(links)), np.transpose(links)), shape=(len(patch),) * 2
+        )
+        same, rows = connected_components(graph, directed=False)[1], np.unique(links)
+        # the core first, then the first patch
+        rows = rows[np.lexsort((patch[rows], ~core[rows], same[rows]))]
+        kept[rows] = False
+        kept[rows[np.unique(same[rows], return_index=True)[1]]] = True
+    return kept
+
+
+def join_patches(tables, grid, prior, catalog=None, ids=False):
+    """
+    Join the tables of patches.
+
+    Parameters
+    ----------
+    tables : dict of int to `~astropy.table.QTable`
+        By number of the patch: its rows in its core, and within `RIM` of that; ``new`` says which the prior lacks.
+    grid : `PatchGrid`
+        The patches.
+    prior : `~miricigale.photometry.images.mosaics.MosaicHeader`
+        That of the prior.
+    catalog : `~astropy.table.QTable`, optional
+        ``id`` and ``sky`` of all sources: then the table has these rows.
+    ids : bool, optional
+        Whether ids are those of segments; otherwise sources are counted, patch by patch.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        With ``patch``, the name of the patch, in place of ``new``; new sources are the last rows.
+    """
+    patch = np.repeat(list(tables), [len(one) for one in tables.values()])
+    table = vstack(list(tables.values()), metadata_conflicts="silent")
+    xy = _pixels(table["sky"], prior)
+    known, new = ~np.asarray(table["new"]), np.asarray(table["new"])
+    kept = np.zeros(len(table), bool)
+    for some in (known, new) if catalog is None and not ids else (new,):
+        kept[some] = own_rows(patch[some], grid, xy[some])
+    table["patch"] = np.array(grid.names)[patch]
+    table["patch"].info.description = "Patch whose core holds the source"
+    flags = [table[name] for name in table.colnames if name.endswith("flags")]
+    cut = np.any([one & ForcedFlags.CUT for one in flags], axis=0)
+    if catalog is None:
+        rows = np.flatnonzero(known if ids else known & kept)
+        if ids:
+            core = grid.holder(xy[rows]) == patch[rows]
+            rows = rows[np.lexsort((~core, cut[rows]))]
+            rows = rows[np.unique(np.asarray(table["id"])[rows], return_index=True)[1]]
+        found, key, sky = rows, np.asarray(table["id"])[rows], table["sky"][rows]
+        key = key if ids else np.arange(1, len(rows) + 1)
+    else:
+        place = {one: k for k, one in enumerate(np.asarray(table["id"]).tolist()) if known[k]}
+        key, sky = np.asarray(catalog["id"]), catalog["sky"].icrs
+        found = np.array([place.get(one, -1) for one in key.tolist()], int)
+    extra = np.flatnonzero(new & kept)
+    found = np.concatenate([found, extra])
+    if n_cut := np.count_nonzero(cut[found[found >= 0]]):
+        text = f"{n_cut} sources have segments that reach beyond their patches (flag CUT): a larger overlap"
+        warn(f"{text} than {grid.overlap} pixels has them whole", PhotometryWarning)
+    joined = QTable()
+    joined["id"] = np.concatenate([key, new_ids(key, len(extra))])
+    joined["sky"] = joined_sky([sky, table["sky"][extra]])
+    for name in table.colnames:
+        if name not in ("id", "sky", "new"):
+            kind = "flags" if name.endswith("flags") else name
+            joined[name] = spread_rows(table[name], found, kind)
+            joined[name].info.description = table[name].info.description
+    return joined
+
+
+def measure_patch(inputs, grid, k, catalog=None, n_threads=None):
+    """
+    Measure the sources of a patch.
+
+    Parameters
+    ----------
+    inputs : `~miricigale.photometry.commands.file_inputs.Inputs`
+        The files.
+    grid : `PatchGrid`
+        The patches.
+    k : int
+        Which.
+    catalog : `~astropy.table.QTable`, optional
+        ``id`` and ``sky`` of all sources, where there is one.
+    n_threads : int, optional
+        Number of threads.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        For `join_patches`; without rows where the files have nothing.
+    measured : `~miricigale.photometry.commands.file_inputs.Measurement` or None
+        None without a source and an image.
+    """
+    whole = inputs.highres.header
+    part, *parts = patch_parts(inputs, grid, k)
+    pixels = inputs.read(part, parts)
+    own = None
+    if catalog is not None:
+        xy = _pixels(catalog["sky"], whole)
+        rows = np.flatnonzero(grid.near(k, xy, grid.overlap))
+        catalog, own = catalog[rows], grid.holder(xy[rows]) == k
+    segments, sources = inputs.find_sources(pixels, catalog, part or ())
+    if not len(sources) and not any("source" in one.meta for one in pixels.images.values()):
+        return QTable({"id": [], "new": []}), None
+    with warnings.catch_warnings():
+        # of images without data here
+        warnings.filterwarnings("ignore", "none of the .* sources is on or near", PhotometryWarning)
+        measured = inputs.measure(pixels, inputs.photometers(n_threads), segments, sources)
+    table = measured.table
+    for band, section in zip(inputs.bands, parts, strict=True):
+        # pixels are those of the whole image
+        for name, pixels in zip(("y", "x"), section or (), strict=False):
+            table[f"{band}_{name}"] += pixels.start
+    columns = [table[name] for name in table.colnames if name.endswith("flags")]
+    table["new"] = np.any([one & ForcedFlags.NOT_IN_CATALOG for one in columns], axis=0)
+    xy = _pixels(table["sky"], whole)
+    kept = grid.near(k, xy, RIM)
+    if part:
+        cut = _is_cut(segments, part, whole.shape, xy)
+        for one in columns:
+            one[cut] |= int(ForcedFlags.CUT)
+        if inputs.segmentation is not None:
+            # its position may be in another core than that of the whole, and in none
+            kept |= cut
+    if own is not None:
+        kept[: len(own)] = own
+    return table[kept], measured
+
+
+def _is_cut(segments, part, shape, xy):
+    """Whether the segment at each pixel x, y of the prior reaches an edge of a part which is none of the prior."""
+    edges = [np.zeros(0, int)]
+    for labels, one, n in zip((segments, segments.T), part, shape, strict=True):
+        edges += [labels[0]] * (one.start > 0) + [labels[-1]] * (one.stop < n)
+    place = np.nan_to_num(xy[:, ::-1] - [one.start for one in part], nan=-1.0)
+    place = np.rint(place).astype(int)
+    inside = np.all((place >= 0) & (place < segments.shape), axis=1)
+    label = np.where(inside, segments[tuple(np.where(inside[:, None], place, 0).T)], 0)
+    return (label > 0) & np.isin(label, np.concatenate(edges))
+
+
+def _pixels(sky, header):
+    """Pixels (x, y), (n, 2), of the prior's grid; NaN for positions that are missing or a degree off."""
+    return sky_pixels(sky, header.wcs, header.shape, 1e5)

@@ -1,0 +1,75 @@
+"""The columns of a catalog that photometry uses."""
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import Table
+
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.ids import counted_ids, id_column
+from miricigale.utils.missing_values import floats, mask_of
+from miricigale.utils.options import check_that
+from miricigale.utils.positions import at_epoch
+from miricigale.utils.tables import require_columns, unique_ids
+from miricigale.utils.units import to_array
+
+#: Columns of a catalog that need not be there, and that templates keep.
+OPTIONAL = ("flux", "components")
+
+
+def catalog_sources(catalog, epoch=None):
+    """
+    Return ``id``, ``sky`` (ICRS), ``flux`` and ``components`` of a catalog, by name; None without such a column.
+
+    Proper motions bring positions to an epoch (`~miricigale.utils.positions.at_epoch`).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is no table, has no ``sky``, an id twice, or a number of components other than 1 and 2.
+    """
+    if not isinstance(catalog, Table):
+        raise argument_error("catalog", "a table with the column 'sky'", type(catalog).__name__)
+    require_columns(catalog, ["sky"], "catalog")
+    sky = catalog["sky"]
+    if not isinstance(sky, SkyCoord):
+        raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
+    name = id_column(catalog.colnames, "catalog", labels=False)
+    ids = counted_ids(catalog, "catalog") if name is None else unique_ids(catalog[name], "catalog")
+    flux = components = None
+    if "flux" in catalog.colnames:
+        flux = floats(catalog["flux"])
+    if "components" in catalog.colnames:
+        components = catalog["components"]
+        wanted = "a column 'components' without masked values"
+        check_that(not np.any(mask_of(components)), "catalog", wanted, "some")
+        components = np.asarray(components)
+        if components.dtype.kind not in "iu" or not np.isin(components, (1, 2)).all():
+            found = np.unique(components)[:5].tolist()
+            raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")
+    sky = at_epoch(sky, epoch, "catalog")
+    sky = SkyCoord(sky.ra.deg, sky.dec.deg, unit="deg")
+    return {"id": ids, "sky": sky, "flux": flux, "components": components}
+
+
+def sersic_rows(catalog):
+    """Half-light radius (arcsec), index, axis ratio and angle (rad) of a catalog, (n, 4); NaN for points."""
+    units = {"half_light_radius": u.arcsec, "position_angle": u.deg}
+    names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
+    require_columns(catalog, names, "catalog", units=units)
+    radius, index, ratio, angle = (catalog[name] for name in names)
+    sizes = (
+        to_array(radius, u.arcsec, "half_light_radius"),
+        to_array(angle, u.rad, "position_angle"),
+    )
+    rows = np.stack([sizes[0], floats(index), floats(ratio), sizes[1]], axis=1)
+    if "profile" in catalog.colnames:
+        rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan
+    return rows
+
+
+def joined_sky(skies):
+    """Positions (ICRS) one after the other."""
+    skies = [sky.icrs for sky in skies]
+    angles = (np.concatenate([getattr(sky, one).deg for sky in skies]) for one in ("ra", "dec"))
+    return SkyCoord(*angles, unit="deg")

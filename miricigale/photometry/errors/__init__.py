@@ -1,0 +1,1 @@
+"""Errors of fluxes: models, curves, calibration, noise of images."""

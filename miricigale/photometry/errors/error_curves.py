@@ -1,0 +1,223 @@
+"""Curves of one band: the error as a function of flux, from bins or from a formula."""
+
+import dataclasses
+import itertools
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.filters import as_photometry
+from miricigale.filters.band_names import known_filter
+from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
+from miricigale.utils.tables import described_columns, error_column, require_columns
+from miricigale.utils.units import FNU, to_array
+
+#: What turns the median of absolute values into a standard deviation.
+STATISTICS = {"mad": 1.482602218505602, "median_abs": 1.0}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Binned:
+    """Errors at nodes in flux, joined by straight lines in asinh(flux)."""
+
+    flux: np.ndarray
+    error: np.ndarray
+    low: float
+    high: float
+    kind = "binned"
+
+    def sigma(self, flux):
+        scale = self.error[0] if self.error[0] > 0 else 1.0
+        return np.interp(np.arcsinh(flux / scale), np.arcsinh(self.flux / scale), self.error)
+
+    def outside(self, flux):
+        return (flux < self.low) | (flux > self.high)
+
+    def rows(self):
+        nan = np.full(len(self.flux), np.nan)
+        ends = [np.full(len(self.flux), v) for v in (self.low, self.high)]
+        return [self.flux, self.error, *ends, nan, nan]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Analytic:
+    """sigma^2 = sky^2 + fraction^2 flux^2 + photon max(flux, 0)."""
+
+    sky: float
+    fraction: float = 0.0
+    photon: float = 0.0
+    kind = "analytic"
+    high = np.inf
+
+    def sigma(self, flux):
+        return np.sqrt(
+            self.sky**2 + (self.fraction * flux) ** 2 + self.photon * np.maximum(flux, 0)
+        )
+
+    def outside(self, flux):
+        return np.zeros(np.shape(flux), bool)
+
+    def rows(self):
+        return [
+            np.array([v]) for v in (np.nan, self.sky, np.nan, np.nan, self.fraction, self.photon)
+        ]
+
+
+def measured_curve(name, true, seen, size, statistic):
+    """Errors of one band in bins of true flux, from arrays in uJy."""
+    wanted = f"at least three measured sources in {name!r}"
+    check_that(len(true) >= 3, "measured", wanted, f"{len(true)}")
+    order = np.argsort(-true, kind="stable")
+    edges = np.arange(0, max(len(true) // size, 1) * size + 1, size)
+    edges[-1] = len(true)
+    parts = [order[a:b] for a, b in itertools.pairwise(edges)][::-1]
+    flux, error = np.transpose([_scatter(true[part], seen[part]) for part in parts])
+    if statistic != "median_abs":
+        error = _pooled(flux, error)
+    return Binned(flux, error * STATISTICS[statistic], float(true.min()), float(true.max()))
+
+
+def _pooled(flux, error):
+    """
+    Errors that rise with the flux, as does the signal-to-noise.
+
+    The scatter of thirty sources is known to a fifth at best. Bins that contradict either order
+    are joined (isotonic regression in the logarithm); otherwise the limit, where the
+    signal-to-noise crosses a value, would be that of one unlucky bin.
+    """
+    from scipy.optimize import isotonic_regression
+
+    order = np.argsort(flux, kind="stable")
+    flux, error = flux[order], error[order]
+    if np.all(error > 0):
+        error = np.exp(isotonic_regression(np.log(error)).x)
+        bright = flux > 0
+        ratio = np.log(flux[bright] / error[bright])
+        error[bright] = flux[bright] / np.exp(isotonic_regression(ratio).x)
+    back = np.empty_like(error)
+    back[order] = error
+    return back
+
+
+def _scatter(true, seen):
+    """
+    Median true flux of a bin and median absolute deviation there.
+
+    Bright sources scatter in proportion to their flux (templates, blends), faint ones by the
+    noise of the sky. Where the signal-to-noise is above 5 the deviations are taken relative to
+    each flux, or the brightest of a wide bin would set the error of the faintest.
+    """
+    flux = np.median(true)
+    absolute = np.median(np.abs(seen - true))
+    if flux > 5 * absolute and np.all(true > 0):
+        return flux, flux * np.median(np.abs(seen / true - 1.0))
+    return flux, absolute
+
+
+def limiting_flux(curve, n_sigma):
+    """Flux (uJy) above which the signal-to-noise exceeds ``n_sigma``; NaN if none reaches it."""
+    from scipy.optimize import brentq
+
+    def excess(flux):
+        return flux - n_sigma * float(curve.sigma(flux))
+
+    grid = np.geomspace(1e-9, 1e9, 3601)
+    below = np.flatnonzero(grid < n_sigma * curve.sigma(grid))
+    if len(below) == 0:
+        return grid[0]
+    last = below[-1]
+    if last == len(grid) - 1:
+        return np.nan
+    limit = brentq(excess, grid[last], grid[last + 1], rtol=1e-12)
+    return np.nan if limit > curve.high else limit
+
+
+def common_bands(truth, measured):
+    """Names of the flux columns that two tables both have; an error if there is none."""
+    require_columns(truth, [], "truth")
+    require_columns(measured, [], "measured")
+    errors = {error_column(name) for name in truth.colnames}
+    shared = [name for name in truth.colnames if name in measured.colnames and name not in errors]
+    bands = [
+        name
+        for name in shared
+        if getattr(truth[name], "unit", None) is not None
+        and u.Unit(truth[name].unit).is_equivalent(FNU)
+    ]
+    wanted = "tables that share a column of fluxes with a unit (or 'filters' given)"
+    check_that(bands, "truth, measured", wanted, f"the common columns {shared}")
+    return bands
+
+
+def same_rows(truth, measured):
+    """Rows of two tables that belong to the same source, by ``id`` or by place."""
+    if "id" in truth.colnames and "id" in measured.colnames:
+        _, rows, others = np.intersect1d(
+            np.asarray(truth["id"]), np.asarray(measured["id"]), return_indices=True
+        )
+        return rows, others
+    wanted = f"a table of {len(truth)} rows as 'truth', or ids in both"
+    check_that(len(truth) == len(measured), "measured", wanted, len(measured))
+    rows = np.arange(len(truth))
+    return rows, rows
+
+
+def flux_table(photometry, filters, known):
+    """A copy of a table with fluxes in uJy, and the bands: those of ``known`` that it has by default."""
+    if filters is not None:
+        filters = [known_filter(name, known, "band of this error model") for name in filters]
+    names = known if filters is None else filters
+    if names and not set(names) & set(getattr(photometry, "colnames", ())):
+        photometry = as_photometry(photometry, names)
+    require_columns(photometry, [], "photometry")
+    if filters is None:
+        filters = [name for name in known if name in photometry.colnames]
+    wanted = f"a table with at least one of the columns {list(known)}"
+    check_that(filters, "photometry", wanted, f"columns {photometry.colnames}")
+    require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
+    table = QTable(photometry, copy=True)
+    for name in filters:
+        table[name] = to_array(table[name], FNU, name) * FNU
+    return table, filters
+
+
+def curves_to_table(curves, meta):
+    """Make the table of curves by filter name."""
+    rows = [np.stack(curve.rows()) for curve in curves.values()]
+    counts = [values.shape[1] for values in rows]
+    values = np.concatenate([np.empty((6, 0)), *rows], axis=1)
+    flux, sigma, low, high, fraction, photon = values
+    kinds = np.array([curve.kind for curve in curves.values()], str)
+    columns = {
+        "filter": np.repeat(np.array(list(curves), str), counts),
+        "kind": np.repeat(kinds, counts),
+        "flux": flux * FNU,
+        "sigma": sigma * FNU,
+        "low": low * FNU,
+        "high": high * FNU,
+        "fraction": fraction * u.dimensionless_unscaled,
+        "photon": photon * FNU,
+    }
+    texts = declared("miricigale.photometry", "columns.toml")["curves"]
+    return described_columns(columns, texts, dict(meta))
+
+
+def curves_from_table(table):
+    """Make the curves by filter name of what `curves_to_table` made."""
+    wanted = ["filter", "kind", "flux", "sigma", "low", "high", "fraction", "photon"]
+    require_columns(table, wanted, "table")
+    curves = {}
+    filters = np.asarray(table["filter"]).astype(str)
+    for name in dict.fromkeys(filters):
+        part = table[filters == name]
+        flux, sigma, low, high, photon = (
+            u.Quantity(part[c]).to_value(FNU) for c in ("flux", "sigma", "low", "high", "photon")
+        )
+        if part["kind"][0] == "binned":
+            curves[name] = Binned(flux, sigma, float(low[0]), float(high[0]))
+        else:
+            fraction = float(u.Quantity(part["fraction"][0]).value)
+            curves[name] = Analytic(float(sigma[0]), fraction, float(photon[0]))
+    return curves

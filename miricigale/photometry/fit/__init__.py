@@ -1,0 +1,1 @@
+"""Forced photometry: the fit of templates to an image, its results, apertures."""

@@ -1,0 +1,218 @@
+"""Aperture photometry in the manner of Source Extractor, to compare forced photometry with."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.nddata import CCDData, StdDevUncertainty
+from photutils.aperture import ApertureStats, CircularAperture, PixelAperture, SkyAperture
+from photutils.background import LocalBackground, SExtractorBackground
+from photutils.segmentation import SourceCatalog
+
+from miricigale.photometry.detection.detection import detect_sources
+from miricigale.photometry.images.arrays import image_arrays, pixel_scale
+from miricigale.photometry.images.mosaics import as_mosaic
+from miricigale.utils.options import check_that
+from miricigale.utils.sep_tools import background as sep_background
+from miricigale.utils.tables import described_table
+from miricigale.utils.units import ANGLE, FNU, positive, to_array
+
+#: The paper's settings on its pixels: PHOT_AUTOPARAMS, BACK_SIZE and BACK_FILTERSIZE, width of the ring for
+#: the local background, diameter of the circle (arcsec); light of a point source in the AUTO ellipse and in the
+#: circle.
+_KRON, _BACKGROUND, _RING, _DIAMETER = (2.5, 3.5), (64, 6), 40, 1.86
+_AUTO_FRACTION, _APERTURE_FRACTION = 0.94, 0.8
+
+
+def aperture_photometry(image, sky, diameter=None):
+    """
+    Sum light in circles, or in other apertures.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`, path-like or other (see `as_mosaic`)
+        In units of surface brightness, with WCS.
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,), or `~photutils.aperture.Aperture`
+        Positions of circles; or an aperture of photutils, on the sky or in pixels of the image.
+    diameter : `~astropy.units.Quantity`, optional
+        Of the circles.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        ``flux`` and ``flux_err`` (uJy; for noise that is not correlated: on a mosaic of the package's own to be
+        multiplied by its ``meta["noise_correction"]``) and ``coverage``, the fraction of the aperture on usable
+        pixels. NaN where that is zero.
+
+    Raises
+    ------
+    ValueError
+        If the diameter is not positive, positions are without one, or an aperture has one.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import aperture_photometry
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> table = aperture_photometry(image, sky, 0.6 * u.arcsec)
+    >>> print(f"{table['flux'][0]:.2f} +- {table['flux_err'][0]:.2f}")
+    1.58 uJy +- 0.05 uJy
+    """
+    arrays = image_arrays(as_mosaic(image), "image")
+    if isinstance(sky, (PixelAperture, SkyAperture)):
+        check_that(diameter is None, "diameter", "left out with an aperture", diameter)
+        aperture = sky.to_pixel(arrays.wcs) if isinstance(sky, SkyAperture) else sky
+        flux, flux_err, coverage = aperture_sums(arrays, aperture)
+        shape = type(sky).__name__
+    else:
+        check_that(diameter is not None, "diameter", "given with positions", "None")
+        size = positive(diameter, ANGLE, "diameter")
+        xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
+        flux, flux_err, coverage = circle_sums(arrays, xy, size / 2 / pixel_scale(arrays.wcs))
+        shape = f"a circle of {size:.4g} arcsec diameter"
+    columns = {
+        "flux": (flux * FNU, f"Light in {shape}"),
+        "flux_err": (flux_err * FNU, "1-sigma error, if the noise is not correlated"),
+        "coverage": (coverage, "Fraction of the aperture on usable pixels"),
+    }
+    return described_table(columns)
+
+
+def circle_sums(arrays, xy, radius):
+    """Flux, error and usable fraction in circles, exact in the pixels that they cut."""
+    n = len(xy)
+    if n == 0:
+        return np.empty(0), np.empty(0), np.empty(0)
+    return aperture_sums(arrays, CircularAperture(np.nan_to_num(xy, nan=-1e6), radius))
+
+
+def aperture_sums(arrays, aperture):
+    """Flux, error and usable fraction in apertures of photutils in pixels, exact in the pixels that they cut."""
+    variance = np.where(arrays.usable, arrays.sigma, 0.0) ** 2
+    sums = [
+        np.atleast_1d(ApertureStats(image, aperture).sum)
+        for image in (arrays.flux, variance, arrays.usable.astype(float))
+    ]
+    coverage = np.nan_to_num(sums[2]) / aperture.area
+    empty = coverage <= 0
+    flux, noise = (np.where(empty, np.nan, values) for values in sums[:2])
+    return flux, np.sqrt(noise), coverage
+
+
+def source_extractor_photometry(
+    image, *, preset="yang2021_miri", stated_on=0.06 * u.arcsec, weighted=True
+):
+    """
+    Detect and measure on one image, blind, as Source Extractor does.
+
+    Settings in pixels are those of the paper's images of 0.06 arcsec. On other pixels they are brought to the
+    same sizes on the sky, and the threshold to the same surface brightness, so that a source has the same
+    flux on any.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        In units of surface brightness, with WCS.
+    preset : str or `DetectionPreset`, optional
+        See `~miricigale.photometry.detect_sources`.
+    stated_on : `~astropy.units.Quantity` or None, optional
+        Pixel scale for which settings in pixels are meant; None for the image's own.
+    weighted : bool, optional
+        Whether the image's mask and errors count. Otherwise it is taken as by default in the program: pixels
+        without data are 0, and the noise is one for all, the median rms of the background's boxes.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        The detections, with ``flux_auto``, ``flux_auto_err``, ``flux_aper``, ``flux_aper_err`` as
+        measured (Kron ellipses of PHOT_AUTOPARAMS 2.5, 3.5; circles of 1.86 arcsec), and ``flux_best``,
+        ``flux_best_err``: the brighter of the two after each is divided by its part of a point source's light
+        (0.94 and 0.8).
+
+    References
+    ----------
+    Yang et al. 2021, ApJ 908, 144, appendix (the settings); Bertin & Arnouts 1996.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import source_extractor_photometry
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> table = source_extractor_photometry(image)
+    >>> print(f"{len(table)} source, {table['flux_aper'][0]:.2f} in the circle")
+    1 source, 2.28 uJy in the circle
+    """
+    arrays = image_arrays(image, "image")
+    ratio = 1.0
+    if stated_on is not None:
+        ratio = float(to_array(stated_on, ANGLE, "stated_on")) / pixel_scale(image.wcs)
+    box = max(1, round(_BACKGROUND[0] * ratio))
+    empty = ~arrays.usable if weighted else None
+    level, rms = sep_background(arrays.flux, empty, box, _BACKGROUND[1])
+    flux = arrays.flux - np.where(arrays.usable, level, 0.0)
+    if not weighted:
+        flux = arrays.flux - level
+        sigma = np.full(flux.shape, np.median(rms[rms > 0]))
+        arrays = dataclasses.replace(arrays, sigma=sigma, usable=sigma > 0)
+    data = np.where(arrays.usable, flux, np.nan)
+    own = CCDData(data, unit=FNU, uncertainty=StdDevUncertainty(arrays.sigma), wcs=image.wcs)
+    segmentation, catalog = detect_sources(own, preset=preset, stated_on=stated_on)
+    values = [np.empty(0)] * 4
+    if len(catalog):
+        values = _measure(arrays, flux, segmentation, catalog, ratio)
+    auto, auto_err, aper, aper_err = values
+    best, others = np.stack(values[:2]) / _AUTO_FRACTION, np.stack(values[2:]) / _APERTURE_FRACTION
+    best = np.where(np.nan_to_num(best[0], nan=-np.inf) > others[0], best, others)
+    for name, flux, error, text in (
+        ("flux_auto", auto, auto_err, "Light in the Kron ellipse"),
+        ("flux_aper", aper, aper_err, "Light in the circle"),
+        ("flux_best", *best, "Brighter of the two after correction to total"),
+    ):
+        catalog[name], catalog[f"{name}_err"] = flux * FNU, error * FNU
+        catalog[name].info.description = text
+        catalog[f"{name}_err"].info.description = "1-sigma error, if the noise is not correlated"
+    return catalog
+
+
+def _measure(arrays, flux, segmentation, catalog, ratio):
+    """Light and errors in Kron ellipses and circles, less the level of rings around them."""
+    arrays = dataclasses.replace(
+        arrays, flux=flux, sigma=np.where(arrays.usable, arrays.sigma, 0.0)
+    )
+    factor, least = _KRON
+    sources = SourceCatalog(
+        flux,
+        segmentation,
+        error=arrays.sigma,
+        mask=~arrays.usable,
+        local_bkg_width=round(_RING * ratio),
+        kron_params=(factor, least / factor, 0.0),
+    )
+    auto, auto_err = (np.atleast_1d(v) for v in (sources.kron_flux, sources.kron_flux_err))
+    radius = _DIAMETER / 2 / pixel_scale(arrays.wcs)
+    xy = np.stack([catalog["x_centroid"], catalog["y_centroid"]], axis=-1)
+    aper, aper_err, coverage = circle_sums(arrays, xy, radius)
+    # the mode, for faint sources within the rings raise the median
+    mode = LocalBackground(radius, radius + _RING * ratio, bkg_estimator=SExtractorBackground())
+    ring = np.nan_to_num(np.atleast_1d(mode(arrays.flux, *xy.T, mask=~arrays.usable)))
+    return auto, auto_err, aper - ring * np.pi * radius**2 * coverage, aper_err

@@ -1,0 +1,248 @@
+"""Several bands with the same sources: measured with the same templates, joined in one table."""
+
+import dataclasses
+
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable, Table
+
+from miricigale.photometry.detection.catalogs import joined_sky
+from miricigale.photometry.fit.forced import ForcedPhotometer
+from miricigale.photometry.fit.result_table import new_ids
+from miricigale.photometry.fit.results import band_column
+from miricigale.photometry.fit.stars import with_stars
+from miricigale.photometry.images.arrays import sky_pixels
+from miricigale.photometry.images.flags import ForcedFlags
+from miricigale.photometry.images.mosaics import as_mosaic
+from miricigale.photometry.images.repeated_pixels import own_pixels
+from miricigale.photometry.templates.sources import SourceTemplates
+from miricigale.utils.meta import provenance
+from miricigale.utils.options import check_that
+
+
+def measure_bands(images, kernels, templates, **options):
+    """
+    Measure the same sources on images of several bands.
+
+    Parameters
+    ----------
+    images : dict of str to `~astropy.nddata.CCDData`
+        The images by name of the filter; lists of exposures are fitted together.
+    kernels : dict of str to `~miricigale.psf.MatchingKernel` or `ForcedPhotometer`
+        From the high-resolution image to each of them, or what measures it.
+    templates : `SourceTemplates`
+        The sources.
+    **options
+        Options of the `ForcedPhotometer` for those bands whose kernel is given.
+
+    Returns
+    -------
+    results : dict of str to `ForcedPhotometryResult`
+        By name of the filter, in the order of the images; `join_bands` makes one table of them.
+
+    Raises
+    ------
+    ValueError, TypeError, `~astropy.units.UnitsError`
+        If a band has no kernel or an input does not fit; a note names the band.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from astropy.table import QTable
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import ForcedPhotometer, SourceTemplates, measure_bands
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> templates = SourceTemplates.from_catalog(QTable({"sky": sky}))
+    >>> images = {"miri.f770w": image, "miri.f1000w": image.multiply(2)}
+    >>> kernels = dict.fromkeys(images, ForcedPhotometer(psf=psf))
+    >>> for name, result in measure_bands(images, kernels, templates).items():
+    ...     print(f"{name} {result.flux[0]:.2f}")
+    miri.f770w 2.02 uJy
+    miri.f1000w 4.05 uJy
+    """
+    missing = sorted(set(images) ^ set(kernels))
+    check_that(not missing, "kernels", "one for each image", f"not in both: {missing}")
+    results = {}
+    for name, image in images.items():
+        one = kernels[name]
+        try:
+            if not isinstance(one, ForcedPhotometer):
+                one = ForcedPhotometer(one, **options)
+            results[name] = one.measure(image, templates=templates)
+        except (ValueError, TypeError) as err:
+            err.add_note(f"in the band {name!r}")
+            raise
+    return results
+
+
+def measure_prior(images, photometers, highres, segmentation, catalog):
+    """
+    Measure the sources of a prior on images of several bands, and with them what any of these shows beyond it.
+
+    Parameters
+    ----------
+    images, photometers : dict of str to `~astropy.nddata.CCDData` and to `ForcedPhotometer`
+        By name of the filter, with the same templates.
+    highres, segmentation, catalog
+        As for `ForcedPhotometer.measure`.
+
+    Returns
+    -------
+    results : dict of str to `ForcedPhotometryResult`
+        Of the same sources in all bands: those of the catalog, and after them new ones, flagged
+        ``NOT_IN_CATALOG``, where a photometer found some. Of those within half the width of the PSF of one that
+        another band has shown there is one.
+    """
+    opened = {}
+    for name, image in images.items():
+        if isinstance(image, (list, tuple)):
+            opened[name] = [as_mosaic(one) for one in image]
+        else:
+            opened[name] = own_pixels(as_mosaic(image))
+    images = opened
+    starred = {
+        name: with_stars(one, images[name], catalog, highres)
+        for name, one in photometers.items()
+        if one.psf_stars is not False and not one.bare
+    }
+    photometers = photometers | {name: one for name, (one, _) in starred.items()}
+    results = _measure_prior(images, photometers, highres, segmentation, catalog)
+    return results | {name: stars.noted(results[name]) for name, (_, stars) in starred.items()}
+
+
+def _measure_prior(images, photometers, highres, segmentation, catalog):
+    """As `measure_prior`, without stars."""
+    # without PSFs there are no wings
+    first = min(photometers.values(), key=lambda one: one.bare)
+    near = np.zeros(len(catalog), bool)
+    for name, image in images.items():
+        reach = len(photometers[name].mean_kernel.target)
+        for one in image if isinstance(image, list) else [image]:
+            xy = sky_pixels(catalog["sky"], one.wcs, one.shape, reach)
+            near |= np.isfinite(xy[:, 0])
+    templates = first._templates(highres, segmentation, catalog[near])
+    if not near.all():
+        parts = [templates, SourceTemplates.from_catalog(catalog[~near])]
+        order = np.argsort(np.concatenate([np.flatnonzero(near), np.flatnonzero(~near)]))
+        joined = SourceTemplates.concatenate(parts)[order]
+        templates = dataclasses.replace(joined, meta=templates.meta)
+    if first.bare:
+        # kernels are not alike
+        templates = dataclasses.replace(templates, psf=None)
+    results = measure_bands(images, photometers, templates)
+    sky = SkyCoord([], [], unit="deg")
+    for result in results.values():
+        new = [] if result.new_sources is None else result.new_sources["sky"].icrs
+        if len(new) and len(sky):
+            new = new[new.match_to_catalog_sky(sky)[1] > result.psf_fwhm / 2]
+        sky = joined_sky([sky, new]) if len(new) else sky
+    if not len(sky):
+        return results
+    points = SourceTemplates.from_catalog(
+        QTable({"id": new_ids(templates.id, len(sky)), "sky": sky})
+    )
+    known = {"flags": int(ForcedFlags.NOT_IN_CATALOG)}
+    known |= {
+        k: v for k, v in (("flux", 0.0), ("components", 1)) if getattr(templates, k) is not None
+    }
+    points = dataclasses.replace(points, **{k: np.full(len(sky), v) for k, v in known.items()})
+    every = dataclasses.replace(
+        SourceTemplates.concatenate([templates, points]), meta=templates.meta
+    )
+    again = {name: one.replace(second_pass=False) for name, one in photometers.items()}
+    found = measure_bands(images, again, every)
+    for name, result in found.items():
+        result.meta["second_pass"] = results[name].meta["second_pass"]
+    return found
+
+
+def join_bands(results):
+    """
+    Put the photometry of several bands in one table, by id.
+
+    Parameters
+    ----------
+    results : dict of str to `ForcedPhotometryResult` or `~astropy.table.QTable`
+        By name of the filter; tables as `ForcedPhotometryResult.to_table` makes them without
+        a name, or some of their columns.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        ``id`` and ``sky`` (of the first band that has it), and for each band ``<name>``,
+        ``<name>_err``, ``<name>_flags`` and so on. A row for each id that any band has, in the order
+        in which they come; where a band lacks it its flux is NaN and flagged ``NO_DATA``.
+
+    Raises
+    ------
+    ValueError
+        If there is no band.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.table import QTable
+    >>> from miricigale.photometry import join_bands
+    >>> sky = SkyCoord([53.10, 53.11], [-27.8, -27.8], unit="deg")
+    >>> blue = QTable({"id": [1, 2], "sky": sky, "flux": [1.0, 2.0] * u.uJy})
+    >>> red = QTable({"id": [2], "sky": sky[1:], "flux": [3.0] * u.uJy})
+    >>> print(join_bands({"miri.f770w": blue, "miri.f1500w": red})["id", "miri.f770w", "miri.f1500w"])
+     id miri.f770w miri.f1500w
+           uJy         uJy
+    --- ---------- -----------
+      1        1.0         nan
+      2        2.0         3.0
+    """
+    check_that(results, "results", "at least one band", "none")
+    tables = {
+        name: one if isinstance(one, Table) else one.to_table() for name, one in results.items()
+    }
+    rows = {}
+    for one in tables.values():
+        for k, key in enumerate(np.asarray(one["id"]).tolist()):
+            rows.setdefault(key, (one, k))
+    ids = list(rows)
+    sky = [one["sky"][k].icrs for one, k in rows.values()] if len(tables) > 1 else []
+    bands = {name: dict(one.meta) for name, one in tables.items() if one.meta}
+    joined = QTable(meta=provenance(stage="photometry") | ({"bands": bands} if bands else {}))
+    first = next(iter(tables.values()))
+    joined["id"] = np.array(ids, dtype=np.asarray(first["id"]).dtype if not ids else None)
+    same = all(np.array_equal(one["id"], first["id"]) for one in tables.values())
+    joined["sky"] = first["sky"] if same else SkyCoord(sky)
+    for name, one in tables.items():
+        at = {key: k for k, key in enumerate(np.asarray(one["id"]).tolist())}
+        index = np.array([at.get(key, -1) for key in ids], int)
+        for column in one.colnames:
+            label = band_column(column, name)
+            if label == column:
+                continue
+            joined[label] = spread_rows(one[column], index, column)
+            joined[label].info.description = one[column].info.description
+    return joined
+
+
+def spread_rows(values, index, column):
+    """
+    Rows of a column by number, filled for those that are missing (-1).
+
+    Missing numbers are NaN or 0, texts "none", and ``flags``, if that is the name of the column, ``NO_DATA``.
+    """
+    if np.all(index >= 0):
+        return values[index].copy()
+    kind = np.asarray(values).dtype.kind
+    empty = {"f": np.nan, "b": False}.get(kind, "none" if kind == "U" else 0)
+    if column == "flags":
+        empty = int(ForcedFlags.NO_DATA)
+    found = np.where(index >= 0, np.asarray(values)[index], empty)
+    unit = getattr(values, "unit", None)
+    return found if unit is None else found * unit

@@ -1,0 +1,212 @@
+"""Diagnostics of a fit from its residual: noise, goodness of fit and flags."""
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from miricigale.photometry._core.stamps import residual_statistics
+from miricigale.photometry.detection.residual_sources import ResidualPeaks, residual_peaks
+from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
+from miricigale.photometry.templates.normal_equations import noise_correlation, stated_correlation
+from miricigale.utils.parallel import chunks
+
+#: Part of a template's light on pixels at the rim of the data from which its flux may be off by some per cent.
+_RIM_LIGHT = 0.1
+#: Errors by which a flux is above twice the image's light, or negative, where templates cancel.
+_ABOVE_LIGHT, _NEGATIVE = 3.0, 5.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Diagnostics:
+    """A fit compared with its image."""
+
+    #: (ny, nx): uJy per pixel; the residual is zero where the image is not usable.
+    model: np.ndarray
+    residual: np.ndarray
+    correlation: np.ndarray | None  # Of the noise; None where it is taken as white.
+    #: (n,): Of each row of the bank; NaN where not fitted, and for second components.
+    chi2: np.ndarray
+    residual_fraction: np.ndarray
+    rim: np.ndarray  # (n,): Fraction of each row's light on pixels at the rim of the image's data.
+    # (n,): The flux with which each row would have all of the image's light below its core, uJy; NaN where not
+    # fitted, and for second components.
+    seen: np.ndarray
+    poor: np.ndarray  # (n,): Whether chi2 is too large for noise.
+    peaks: ResidualPeaks  # Light that no template explains.
+
+
+def diagnose(fit, xy):
+    """Compare a `TemplateFit` with its image; ``xy``, (n, 2), are all known sources, NaN far outside."""
+    model = fit.model()
+    residual = fit.residual(model)
+    correlation = None
+    if fit.settings.errors.correlated_noise and len(fit.rows):
+        correlation = _correlation(fit, residual, model)
+    chi2, left, core, rim = _statistics(fit, residual).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left = left / (fit.total * core)
+        # the image is its model and the residual
+        seen = _statistics(fit, residual + fit.arrays.usable * model)[:, 1] / core
+    out = np.ones(len(chi2), bool)
+    out[fit.rows] = False
+    out |= ~fit.main
+    seen = np.where(out, np.nan, seen)
+    chi2, left = np.where(out, np.nan, chi2), np.where(out, np.nan, left)
+    # where the measured noise is above that of the uncertainty, it is the measure
+    lag = 0 if correlation is None else correlation.shape[0] // 2
+    variance = 1.0 if correlation is None else max(1.0, correlation[lag, lag])
+    peaks = residual_peaks(fit, residual, model, xy + fit.displacement(xy))
+    poor = chi2 > POOR_CHI2 * variance
+    if fit.free is not None:
+        # what the high-resolution image shows is not what is fitted here
+        poor[fit.rows] |= fit.free.strain > POOR_STRAIN
+    return Diagnostics(model, residual, correlation, chi2, left, rim, seen, poor, peaks)
+
+
+def _correlation(fit, residual, model):
+    """Measured correlation of the noise, or as the image states it where there is too little sky; or None."""
+    usable = fit.arrays.usable
+    free = usable.copy()
+    for part in chunks(len(model), 256):
+        free[part] &= np.abs(model[part]) * fit.inverse_sigma[part] < 0.3
+    if np.count_nonzero(free) < max(400, 0.02 * np.count_nonzero(usable)):
+        free = usable
+    if np.count_nonzero(free) < 400:
+        stated = fit.arrays.noise_correction
+        return stated_correlation(stated) if stated > 1 else None
+    correlation = noise_correlation(residual, free, fit.inverse_sigma, executor=fit.bank.executor)
+    return correlation if correlation.any() else None
+
+
+def _statistics(fit, residual):
+    """Chi2, light left and light of each template's core (see the kernel), its part on the rim, shape (n, 4)."""
+    out = np.full((len(fit.bank.order), 3), np.nan)
+    rim_light = np.zeros(len(out))
+    if not len(fit.rows):
+        return np.column_stack([out, rim_light])
+    rim = rim_pixels(fit.arrays.usable)
+    for block in fit.bank.blocks():
+
+        def measure(part, block=block):
+            rows = slice(block.first + part.start, block.first + part.stop)
+            values, boxes, starts = block.some(part)
+            residual_statistics(values, boxes, starts, residual, fit.inverse_sigma, out[rows])
+            rim_light[rows] = _light_on(rim, values, boxes, starts)
+
+        fit.bank.map(measure, block.parts())
+    return np.column_stack([out, rim_light / fit.bank.full_light()])
+
+
+def rim_pixels(usable):
+    """
+    Pixels at the rim of the data: usable ones beside what is beyond the first and last usable pixels.
+
+    Those of a drizzled mosaic are covered in part, and show the brightness of that part as if it were that of the
+    whole pixel: the light of a star that falls there is too large.
+
+    Parameters
+    ----------
+    usable : `~numpy.ndarray` of bool, shape (ny, nx)
+        Pixels with data. The edge of the array is no rim.
+
+    Returns
+    -------
+    rim : `~numpy.ndarray` of bool, shape (ny, nx)
+    """
+    (left, right), (low, high) = _ends(usable)
+    rows, columns = np.ogrid[: usable.shape[0], : usable.shape[1]]
+    beyond = (columns < left[rows]) | (columns > right[rows])
+    beyond |= (rows < low[columns]) | (rows > high[columns])
+    return usable & binary_dilation(beyond)
+
+
+def _light_on(mask, values, boxes, starts):
+    """Sum of each flat stamp over the pixels of a mask."""
+    light = np.zeros(len(boxes))
+    for k, (y, x, ny, nx) in enumerate(boxes):
+        part = mask[y : y + ny, x : x + nx]
+        if part.any():
+            stamp = values[starts[k] : starts[k] + ny * nx].reshape(ny, nx)
+            light[k] = stamp[part].sum()
+    return light
+
+
+def _ends(usable):
+    """First and last usable pixel of each row, and of each column; none of a row without any."""
+    ends = []
+    for image in (usable, usable.T):
+        some = image.any(axis=1)
+        n = image.shape[1]
+        first = image.argmax(axis=1)
+        last = n - 1 - image[:, ::-1].argmax(axis=1)
+        ends.append((np.where(some, first, n), np.where(some, last, -1)))
+    return ends
+
+
+def _cut_by_rim(usable, boxes):
+    """
+    Boxes (row, column, height, width; inside the image) whose unusable pixels are mostly beyond the image's data.
+
+    That is before the first or after the last usable pixel of a row or column: of a mosaic whose footprint is
+    turned against its pixels, what is not exposed.
+    """
+    found = np.zeros(len(boxes), bool)
+    if not len(boxes):
+        return found
+    (left, right), (low, high) = _ends(usable)
+    for k, (y, x, ny, nx) in enumerate(boxes):
+        rows, columns = np.ogrid[y : y + ny, x : x + nx]
+        beyond = (columns < left[rows]) | (columns > right[rows])
+        beyond |= (rows < low[columns]) | (rows > high[columns])
+        found[k] = np.sum(beyond) > 0.5 * np.sum(~usable[y : y + ny, x : x + nx])
+    return found
+
+
+def canceling(flux, error, seen):
+    """
+    Whether fluxes are more than the image can hold, by which those of neighbors must be negative, or are negative.
+
+    Parameters
+    ----------
+    flux, error : `~numpy.ndarray`, shape (n,)
+        Fluxes and their errors, uJy; NaN where not measured.
+    seen : `~numpy.ndarray`, shape (n,)
+        As of `Diagnostics`.
+
+    Returns
+    -------
+    canceling : bool `~numpy.ndarray`, shape (n,)
+        Those above twice the image's light by three errors, or negative by five.
+    """
+    with np.errstate(invalid="ignore"):
+        above = flux - 2.0 * np.maximum(seen, 0.0) > _ABOVE_LIGHT * error
+        return above | (flux < -_NEGATIVE * error)
+
+
+def source_flags(fit, diagnostics, place, flux, blending):
+    """
+    Flags, (n,), that follow from a fit, and the fraction of each template on usable pixels.
+
+    ``place`` is the source of each row of the bank, ``flux`` those of all sources (NaN where not
+    measured), ``blending`` each row's formal error over that of the source alone (NaN where not fitted).
+    """
+    flags, inside, coverage = np.zeros(len(flux), int), np.zeros(len(flux)), np.zeros(len(flux))
+    inside[place[fit.main]] = fit.light[fit.main, 0]
+    coverage[place[fit.main]] = np.clip(fit.light[fit.main, 1], 0.0, 1.0)
+    for rows, flag in (
+        (inside < 0.9, ForcedFlags.EDGE),
+        (coverage < 0.9 * np.minimum(inside, 1.0), ForcedFlags.MASKED),
+        (place[fit.degenerate], ForcedFlags.DEGENERATE),
+        (place[fit.inseparable], ForcedFlags.ONE_COMPONENT),
+        (place[fit.noisy], ForcedFlags.NOISY_SEGMENT),
+        (place[blending > 2], ForcedFlags.BLENDED),
+        (place[diagnostics.poor], ForcedFlags.POOR_FIT),
+    ):
+        flags[rows] |= int(flag)
+    cut = np.flatnonzero(fit.main & (flags[place] & int(ForcedFlags.MASKED) > 0))
+    cut = cut[_cut_by_rim(fit.arrays.usable, fit.bank.box[cut])]
+    flags[place[cut]] |= int(ForcedFlags.EDGE)
+    flags[place[fit.main & (diagnostics.rim > _RIM_LIGHT)]] |= int(ForcedFlags.EDGE)
+    flags[np.isnan(flux) & (flags & int(ForcedFlags.DEGENERATE) == 0)] |= int(ForcedFlags.NO_DATA)
+    return flags, coverage

@@ -1,0 +1,496 @@
+"""Forced photometry on exposures: all of them fitted together, none of them resampled."""
+
+import dataclasses
+
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import Table
+from astropy.wcs.utils import pixel_to_pixel
+from scipy.special import ndtr
+
+from miricigale.instrument import mosaic_wcs
+from miricigale.photometry.detection.residual_sources import LEFT_SNR, new_sources
+from miricigale.photometry.fit.exposure_fit import ExposureFit, ExposurePart, gaussian_width
+from miricigale.photometry.fit.exposure_kernels import ExposureKernels
+from miricigale.photometry.fit.exposure_result import joint_result, plane_peaks
+from miricigale.photometry.fit.offsets import source_offsets
+from miricigale.photometry.fit.result_table import CatalogRows
+from miricigale.photometry.images.arrays import fit_arrays, local_maps, pixel_scale, sky_pixels
+from miricigale.photometry.images.coadd import Plane
+from miricigale.photometry.images.mosaics import as_mosaic
+from miricigale.photometry.templates.placement import Placement
+from miricigale.photometry.templates.sources import SourceTemplates
+from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
+from miricigale.utils.options import check_that
+from miricigale.utils.parallel import single_threaded, threads
+from miricigale.utils.units import ANGLE
+
+#: Change of an exposure's shift (pixels) at which it is done, and how often it is looked for.
+_SHIFT_DONE = 1e-3
+_MAX_SHIFT_STEPS = 8
+
+#: Bright sources go by their own offsets: least signal-to-noise, most light of others below the template,
+#: error (pixels) that is added to all, and largest offset in rms widths of the PSF.
+_BRIGHT_SNR = 20.0
+_ISOLATED = 0.2
+_OFFSET_FLOOR = 0.01
+_LARGEST_OFFSET = 0.3
+
+#: Fewest sources from which offsets are taken, how often, and offset that all have in common
+#: (in full widths at half maximum) from which it is ``max_shift`` that is wanted.
+_FEWEST_SOURCES = 4
+_OFFSET_PASSES = 3
+_COMMON_OFFSET = 0.05
+
+#: How often positions of new sources are refined.
+_REFINED = 2
+
+#: Largest share of false new sources where the evidence decides.
+_FALSE_RATE = 0.1
+
+
+def measure_exposures(
+    photometer, images, highres=None, segmentation=None, catalog=None, *, templates=None
+):
+    """
+    Measure the sources of a catalog on exposures that are fitted together.
+
+    Parameters
+    ----------
+    photometer : `~miricigale.photometry.ForcedPhotometer`
+        The settings; its kernel is one for all exposures, or `ExposureKernels`.
+    images : sequence
+        The exposures, each as the image of `~miricigale.photometry.ForcedPhotometer.measure`.
+    highres, segmentation, catalog, templates
+        As for `~miricigale.photometry.ForcedPhotometer.measure`.
+
+    Returns
+    -------
+    result : `~miricigale.photometry.ForcedPhotometryResult`
+        With ``exposures``.
+
+    Raises
+    ------
+    ValueError, TypeError, `~astropy.units.UnitsError`
+        If an input does not fit, or an option is not offered for exposures.
+    """
+    if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
+        catalog = highres
+        highres = None
+    images = _opened(images)
+    settings = _settings_of_each(photometer, len(images))
+    _check_offered(photometer)
+    prior_given = any(value is not None for value in (highres, segmentation, catalog))
+    if templates is None:
+        highres, segmentation, catalog = photometer._prior(
+            images[0], highres, segmentation, catalog
+        )
+        sources = SourceTemplates.from_catalog(catalog)
+        sources = dataclasses.replace(sources, sky=catalog["sky"])
+    elif prior_given:
+        raise argument_error("templates", "given alone with the exposures", "a catalog too")
+    else:
+        sources = templates
+    if sources.components is not None and np.any(sources.components == 2):
+        raise argument_error("components", "1 for exposures", "2 for some of the sources")
+    arrays = [fit_arrays(image, f"image[{k}]") for k, image in enumerate(images)]
+    placed = [
+        Placement.of(own_settings, exposure, sources.sky)
+        for own_settings, exposure in zip(settings, arrays, strict=True)
+    ]
+    near_rows = np.unique(np.concatenate([place.near for place in placed]))
+    if len(sources.id) and not len(near_rows):
+        msg = f"none of the {len(sources.id)} sources is on or near the exposures: nothing is measured"
+        warn(msg, PhotometryWarning)
+    if templates is None:
+        templates = photometer._templates(highres, segmentation, catalog[near_rows])
+    else:
+        templates = templates[near_rows]
+    photometer._check_grid(templates)
+    plane = _plane(arrays)
+    margin = max(place.margin for place in placed)
+    xy = sky_pixels(sources.sky, plane.wcs, plane.shape, margin)
+    rows = _catalog_rows(sources, templates, near_rows, xy)
+    meta = {"template": templates.meta.get("template", photometer.template)}
+    name = images[0].meta.get("filter", images[0].meta.get("FILTER"))
+    if name is not None:
+        meta["filter"] = str(name)
+    with threads(photometer.n_threads) as executor, single_threaded():
+        joint = _Joint(photometer, plane, rows)
+        joint.place(placed, templates, executor)
+        fit, new_xy, evidence, offsets = joint.fit_all()
+        return joint_result(fit, plane, images, rows, new_xy, evidence, offsets, meta)
+
+
+def _opened(images):
+    """The exposures as images, checked to be of one filter."""
+    if not len(images):
+        raise argument_error("image", "at least one exposure", "none")
+    opened = [as_mosaic(image, f"image[{k}]") for k, image in enumerate(images)]
+    names = {str(image.meta["filter"]) for image in opened if image.meta.get("filter") is not None}
+    check_that(len(names) <= 1, "image", "exposures of one filter", sorted(names))
+    return opened
+
+
+def _settings_of_each(photometer, n):
+    """The photometer with the kernel of each of n exposures."""
+    kernel = photometer.kernel
+    if not isinstance(kernel, ExposureKernels):
+        if photometer.bare:
+            raise argument_error("kernel", "one with its PSFs for exposures", "one without")
+        return [photometer] * n
+    wanted = f"one for each of {n} exposures"
+    check_that(len(kernel) == n, "kernel", wanted, f"{len(kernel)} kernels")
+    # kernels of one roll are often the same object
+    by_kernel = {}
+    for kernel_of_one in kernel.kernels:
+        if id(kernel_of_one) not in by_kernel:
+            by_kernel[id(kernel_of_one)] = photometer.replace(kernel=kernel_of_one)
+    return [by_kernel[id(kernel_of_one)] for kernel_of_one in kernel.kernels]
+
+
+def _check_offered(photometer):
+    """Refuse options that are not offered for exposures."""
+    for name, value, offered in (
+        ("components", photometer.components, 1),
+        ("offset_order", photometer.offset_order, None),
+    ):
+        if value != offered:
+            raise argument_error(name, f"{offered} for exposures", value)
+    if photometer.psf_stars is True:
+        wanted = "False or None for exposures (correct the PSFs beforehand)"
+        raise argument_error("psf_stars", wanted, True)
+
+
+def _plane(arrays):
+    """The grid that exposures have in common: north up, with pixels of their mean size."""
+    shapes = [exposure.flux.shape for exposure in arrays]
+    scale = np.mean([pixel_scale(exposure.wcs) for exposure in arrays])
+    sized = []
+    for exposure, shape in zip(arrays, shapes, strict=True):
+        wcs = exposure.wcs
+        if wcs.pixel_shape is None:
+            wcs = wcs.deepcopy()
+            wcs.pixel_shape = shape[::-1]
+        sized.append(wcs)
+    wcs = mosaic_wcs(sized, scale * ANGLE)
+    return Plane.over(
+        wcs, [(exposure.wcs, shape) for exposure, shape in zip(arrays, shapes, strict=True)]
+    )
+
+
+def _catalog_rows(sources, templates, near, xy):
+    """The catalog as the fit and its result take it."""
+    n = len(sources.id)
+    flags = np.zeros(n, int)
+    snr = np.full(n, np.nan)
+    kinds = np.full(n, "none", "U6")
+    flags[near] = templates.flags
+    snr[near] = templates.snr
+    kinds[near] = templates.kind
+    return CatalogRows(
+        id=np.asarray(sources.id),
+        sky=sources.sky,
+        xy=xy,
+        near=near,
+        flags=flags,
+        template=kinds,
+        template_snr=snr,
+        fitted=templates.fitted,
+        reference=sources.flux,
+    )
+
+
+@dataclasses.dataclass(eq=False)
+class _Offsets:
+    """What `source_offsets` needs of an exposure."""
+
+    part: ExposurePart
+    flux: np.ndarray  # Of the rows of its bank.
+
+    @property
+    def bank(self):
+        return self.part.bank
+
+    @property
+    def psf_width(self):
+        return self.part.psf_width
+
+    @property
+    def inverse_sigma(self):
+        return self.part.inverse_sigma
+
+
+class _Joint:
+    """The fits of the sources of a catalog: shifts of exposures, bright sources, sources that it lacks."""
+
+    def __init__(self, photometer, plane, catalog):
+        self._settings = photometer
+        self._plane = plane
+        self._catalog = catalog
+        self._scale = pixel_scale(plane.wcs)
+        order = photometer.background_order
+        # an exposure always has a sky of its own
+        self._order = 0 if order is None else order
+        self._n = len(catalog.near)
+
+    def place(self, placed, templates, executor):
+        """Make the templates of each exposure."""
+        self._placed = placed
+        self._grids = [place.grid(templates) for place in placed]
+        number = np.full(len(self._catalog.id), -1)
+        number[self._catalog.near] = np.arange(self._n)
+        # memory that is kept is that of all exposures
+        memory = self._settings.memory
+        memory = dataclasses.replace(memory, max_bytes=memory.max_bytes / len(placed))
+        self._parts = []
+        for place in placed:
+            rows = number[place.near]
+            placement = dataclasses.replace(place, settings=place.settings.replace(memory=memory))
+            bank = placement.bank(place.near, templates[rows], executor)
+            self._parts.append(ExposurePart(place.arrays, place.settings, bank, rows))
+        #: Pixels by which each exposure's templates are moved.
+        self._shifts = np.zeros((len(placed), 2))
+        # what they are found to be, with errors, whether they are fitted or not
+        self._measured = np.full((len(placed), 2), np.nan)
+        self._errors = np.full((len(placed), 2), np.nan)
+
+    def fit_all(self):
+        """
+        The last fit, positions of new sources in the plane, the evidence for them, and offsets of exposures.
+
+        The offsets are east and north in arcsec, (n_exposures, 2), with their errors, (n_exposures,).
+        """
+        fit = self._fit(self._parts)
+        if not len(fit.rows):
+            pass
+        elif self._settings.max_shift is not None:
+            fit = self._with_shifts(fit)
+        else:
+            self._measured, self._errors = self._steps(fit)
+        new_xy = np.empty((0, 2))
+        evidence = None
+        if self._settings.second_pass is not False:
+            new_xy, evidence = self._new_positions(fit)
+        if len(new_xy):
+            new_xy, fit = self._with_points(new_xy)
+        elif not self._settings.second_pass:
+            fit = self._settled(fit)
+        fit.free_templates(self._catalog.fitted)
+        offsets = self._on_sky(self._measured), self._errors.mean(axis=1) * self._scale
+        return fit, new_xy, evidence, offsets
+
+    def _fit(self, parts, new_xy=None, gradients=None):
+        xy = self._catalog.xy[self._catalog.near]
+        if new_xy is not None:
+            xy = np.concatenate([xy, new_xy])
+        return ExposureFit(parts, self._settings, xy, self._scale, self._order, gradients)
+
+    def _with_shifts(self, fit):
+        """The fit with templates moved by a shift of each exposure."""
+        limit = self._settings.max_shift.value
+        fixed = np.zeros(len(self._parts), bool)
+        first_parts = self._parts
+        for _ in range(_MAX_SHIFT_STEPS):
+            steps, self._errors = self._steps(fit)
+            self._measured = self._shifts + steps
+            fixed |= np.isnan(steps[:, 0])
+            shifts = self._shifts + np.where(fixed[:, None], 0.0, steps)
+            scales = np.array([part.scale for part in fit.parts])
+            far = np.hypot(*shifts.T) * scales > limit
+            for k in np.flatnonzero(far & ~fixed):
+                value = np.round(shifts[k] * scales[k], 3)
+                msg = (
+                    f"a shift of exposure {k} by {value} arcsec is beyond 'max_shift' "
+                    f"{self._settings.max_shift}: it is measured without a shift"
+                )
+                warn(msg, PhotometryWarning)
+            fixed |= far
+            shifts[fixed] = 0.0
+            step = np.abs(shifts - self._shifts).max()
+            self._shifts = self._shifts + np.clip(shifts - self._shifts, -1.0, 1.0)
+            moved = []
+            for part, shift, like in zip(first_parts, self._shifts, fit.parts, strict=True):
+                moved.append(part.moved(shift, like))
+            fit = self._fit(moved)
+            if step < _SHIFT_DONE:
+                break
+        self._parts = fit.parts
+        return fit
+
+    def _steps(self, fit):
+        """Shifts of exposures beyond those of their templates, to first order, and errors: pixels, (k, 2)."""
+        gradients = []
+        for k, part in enumerate(fit.parts):
+            dy, dx = np.gradient(fit.model(k))
+            derivatives = [-dx, -dy]
+            power = [
+                np.sum((image * part.inverse_sigma) ** 2, dtype=float) for image in derivatives
+            ]
+            # too little light to find a shift of less than a pixel
+            gradients.append(derivatives if min(power) > 1 else [])
+        trial = self._fit(fit.parts, fit.xy[self._n :], gradients)
+        variance = np.diag(trial.fit.common_covariance)
+        steps = np.full((len(fit.parts), 2), np.nan)
+        errors = steps.copy()
+        for k, places in enumerate(trial.places):
+            if "shift" in places:
+                steps[k] = trial.common[places["shift"]]
+                errors[k] = np.sqrt(variance[places["shift"]])
+        return steps, errors
+
+    def _on_sky(self, shifts):
+        """Shifts of exposures (pixels) as arcsec to the east and north."""
+        offsets = []
+        for part, shift in zip(self._parts, shifts, strict=True):
+            ny, nx = part.arrays.flux.shape
+            middle = np.array([[(nx - 1) / 2, (ny - 1) / 2]])
+            turn = self._turns(part, middle)[0]
+            offsets.append((turn @ shift) * self._scale * [-1.0, 1.0])
+        return np.array(offsets)
+
+    def _new_positions(self, fit):
+        """
+        Where the residuals show sources that the catalog lacks, in the plane, and the evidence for them.
+
+        As for one image, the negative of the residual and Gaussian noise say how many are false.
+        """
+        decide = self._settings.second_pass is None
+        flux = np.full(len(self._catalog.id), np.nan)
+        flux[self._catalog.near] = fit.flux
+        xy = self._catalog.xy
+        peaks, usable = plane_peaks(fit, self._plane, xy)
+        negative, _ = plane_peaks(fit, self._plane, xy, sign=-1.0)
+        form = {"usable": usable} if decide else {}
+        new = new_sources(peaks, xy, flux, **form)
+        false = new_sources(negative, xy, flux, **form)
+        width = gaussian_width(self._settings.mean_kernel) / self._scale
+        n_beams = np.count_nonzero(usable) / (4 * np.pi * width**2)
+        n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
+        rate = float(n_false / max(np.count_nonzero(new), 1))
+        fitted = bool(self._settings.second_pass or rate <= _FALSE_RATE)
+        positions = peaks.refined[new & fitted]
+        evidence = {
+            "peaks": int(new.sum()),
+            "threshold": LEFT_SNR,
+            "false_rate": float(f"{rate:.2g}"),
+            "fitted": bool(fitted and len(positions)),
+        }
+        return positions, evidence
+
+    def _with_points(self, new_xy):
+        """Positions of new sources, refined, and the fit with them."""
+        fit = self._fit(self._added(new_xy, self._parts), new_xy)
+        for _ in range(_REFINED):
+            step, error, _ = self._offsets(fit)
+            rows = np.arange(self._n, self._n + len(new_xy))
+            width = gaussian_width(self._settings.mean_kernel) / self._scale
+            good = error[rows] < 0.25 * width
+            new_xy = new_xy.copy()
+            new_xy[good] += np.clip(step[rows][good], -width, width)
+            fit = self._fit(self._added(new_xy, fit.parts), new_xy)
+        return new_xy, fit
+
+    def _added(self, new_xy, like):
+        """The exposures with points at positions of the plane; templates that are those of ``like`` are kept."""
+        sky = self._plane.wcs.pixel_to_world(*new_xy.T).icrs
+        added = []
+        for k, (part, place, grid) in enumerate(
+            zip(self._parts, self._placed, self._grids, strict=True)
+        ):
+            wcs = part.arrays.wcs
+            xy = sky_pixels(sky, wcs, part.arrays.flux.shape, place.margin)
+            rows = np.flatnonzero(np.isfinite(xy[:, 0]))
+            xy = xy[rows]
+            poly = local_maps(xy, np.full(len(xy), place.margin / 2), wcs, grid)
+            bank = part.bank.with_points(xy + self._shifts[k], poly)
+            bank.reuse(like[k].bank)
+            source = np.concatenate([part.source, self._n + rows])
+            added.append(ExposurePart(part.arrays, part.settings, bank, source))
+        return added
+
+    def _offsets(self, fit):
+        """
+        Offsets of sources from their templates, of all exposures together.
+
+        In pixels of the plane: the steps, (n, 2), their errors and the light of others over a source's own, (n,);
+        errors are infinite where no exposure shows enough.
+        """
+        n = len(fit.xy)
+        total = np.zeros((n, 2))
+        weight = np.zeros(n)
+        neighbors = np.zeros(n)
+        for k, part in enumerate(fit.parts):
+            if not len(part.source):
+                continue
+            model = fit.model(k)
+            residual = fit.residual(k, model)
+            view = _Offsets(part, fit.flux[part.row_source])
+            rows = np.arange(len(part.source))
+            step, error, neighbor_light = source_offsets(view, residual, model, rows)
+            good = np.isfinite(error) & np.isfinite(step).all(axis=1) & (error > 0)
+            source = part.row_source[good]
+            plane_step = np.einsum("kij,kj->ki", self._turns(part, part.bank.xy)[good], step[good])
+            step_weight = error[good] ** -2.0
+            total[source] += step_weight[:, None] * plane_step
+            weight[source] += step_weight
+            neighbors[source] += step_weight * neighbor_light[good]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return total / weight[:, None], weight**-0.5, neighbors / weight
+
+    def _turns(self, part, xy):
+        """Linear maps from pixels of an exposure to those of the plane at some pixels, (k, 2, 2)."""
+        if not len(xy):
+            # which astropy cannot convert
+            return np.empty((0, 2, 2))
+        middle = np.array(pixel_to_pixel(part.arrays.wcs, self._plane.wcs, *xy.T))
+        sides = []
+        for step in ([1.0, 0.0], [0.0, 1.0]):
+            moved = np.array(pixel_to_pixel(part.arrays.wcs, self._plane.wcs, *(xy + step).T))
+            sides.append((moved - middle).T)
+        return np.stack(sides, axis=-1)
+
+    def _settled(self, fit):
+        """
+        The fit with bright isolated sources moved to where the exposures show them, as for one image.
+
+        Nothing is done if offsets do not scatter beyond their errors, or if all have a large one in common.
+        """
+        if not len(fit.rows):
+            return fit
+        width = gaussian_width(self._settings.mean_kernel) / self._scale
+        offsets = np.zeros((len(fit.xy), 2))
+        first_parts = self._parts
+        for _ in range(_OFFSET_PASSES):
+            step, error, neighbors = self._offsets(fit)
+            snr = np.zeros(len(fit.xy))
+            snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
+            good = (snr > _BRIGHT_SNR) & (neighbors < _ISOLATED) & ~fit.noisy & np.isfinite(error)
+            good &= (fit.light > 0.9).all(axis=1) & (error < width / _BRIGHT_SNR * 2)
+            measured = offsets + np.where(good[:, None], step, 0.0)
+            good &= np.hypot(*measured.T) < _LARGEST_OFFSET * width
+            if np.count_nonzero(good) < _FEWEST_SOURCES:
+                break
+            error = np.hypot(error, _OFFSET_FLOOR)
+            common = np.median(measured[good], axis=0)
+            if np.hypot(*common) > _COMMON_OFFSET * np.sqrt(8 * np.log(2)) * width:
+                break
+            # of two normal errors the median distance is 1.18
+            distance = np.median(np.hypot(*measured[good].T)) / 1.1774
+            scatter = distance**2 - np.median(error[good]) ** 2
+            if scatter <= _OFFSET_FLOOR**2:
+                break
+            new = np.zeros_like(offsets)
+            new[good] = measured[good] * (scatter / (scatter + error[good] ** 2))[:, None]
+            change = np.abs(new - offsets).max()
+            offsets = new
+            moved = []
+            for part, like in zip(first_parts, fit.parts, strict=True):
+                inverse = np.empty((len(part.source), 2, 2))
+                inverse[part.bank.order] = np.linalg.inv(self._turns(part, part.bank.xy))
+                steps = np.einsum("kij,kj->ki", inverse, offsets[part.source])
+                moved.append(part.moved(steps, like))
+            fit = self._fit(moved)
+            if change < _OFFSET_FLOOR / 2:
+                break
+        return fit

@@ -1,0 +1,450 @@
+"""From a fit of several exposures to its result: diagnostics, flags, errors, tables and images."""
+
+import dataclasses
+
+import numpy as np
+import scipy.sparse
+from astropy.nddata import StdDevUncertainty
+from astropy.stats import mad_std
+from astropy.table import QTable
+
+from miricigale.instrument import pixel_area_map
+from miricigale.instrument.image import Image
+from miricigale.photometry._core.stamps import residual_statistics
+from miricigale.photometry.detection.residual_sources import residual_peaks, unexplained_neighbors
+from miricigale.photometry.fit.exposure_fit import gaussian_width
+from miricigale.photometry.fit.result_table import new_source_table
+from miricigale.photometry.fit.results import ForcedPhotometryResult, crowded
+from miricigale.photometry.fit.template_fit import BLOCK_CORE, BLOCK_HALO, psf_errors
+from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
+from miricigale.utils.exceptions import PhotometryWarning, warn
+from miricigale.utils.meta import provenance
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
+
+#: Largest light of the model, over the noise, of pixels that count as free of sources.
+_FREE = 0.3
+
+#: Fewest such pixels of which the noise is measured, and by how much it may be another than is stated.
+_FEWEST_PIXELS = 400
+_OTHER_NOISE = 0.1
+
+#: Least offset (pixels) that is warned of, with so many sources above so many sigma (as for one image).
+_OFFSET = 0.1
+_FEWEST_BRIGHT = 5
+_BRIGHT = 10.0
+
+#: uJy per MJy.
+_MICRO = 1e12
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class ExposureResults:
+    """
+    What a joint fit leaves of each exposure.
+
+    Attributes
+    ----------
+    table : `~astropy.table.QTable`
+        A row for each exposure: ``exposure`` (its number from 0), ``source`` (its file), ``n_sources``,
+        ``sky`` and ``sky_err`` (its mean level, MJy/sr), ``offset_east``, ``offset_north`` and ``offset_err`` (of
+        the exposure from the templates, arcsec; fitted with ``max_shift``), ``noise`` (robust rms of the residual
+        over the stated error, in pixels without sources) and ``correlation`` (of neighboring pixels there).
+    model_images, residual_images : tuple of `~astropy.nddata.CCDData`
+        MJy/sr, on the pixels of each exposure; the model has its sky, the residual its errors and mask. Empty
+        if the result was read from a file.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import imager_wcs
+    >>> from miricigale.photometry import ForcedPhotometer
+    >>> from miricigale.psf import gaussian_psf
+    >>> star = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> rng = np.random.default_rng(1)
+    >>> exposures = []
+    >>> for roll, sky in ((20, 3.0), (50, 5.0)):
+    ...     wcs = imager_wcs(star[0], roll * u.deg, subarray="SUB64")
+    ...     data = sky + rng.normal(0, 0.1, (64, 72))
+    ...     error = StdDevUncertainty(np.full(data.shape, 0.1))
+    ...     exposures.append(CCDData(data, unit="MJy/sr", wcs=wcs, uncertainty=error))
+    >>> psf = gaussian_psf(0.5 * u.arcsec, pixel_scale=0.06 * u.arcsec, fov=3 * u.arcsec)
+    >>> result = ForcedPhotometer(psf=psf).measure(exposures, star)
+    >>> result.exposures
+    <ExposureResults of 2 exposures>
+    >>> result.exposures.table["sky"].round(2)
+    <Quantity [3., 5.] MJy / sr>
+    """
+
+    table: QTable
+    model_images: tuple = ()
+    residual_images: tuple = ()
+
+    def __len__(self):
+        return len(self.table)
+
+    def __repr__(self):
+        return f"<ExposureResults of {len(self)} exposures>"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _PlaneFit:
+    """What `residual_peaks` needs of a fit: the mean residual in the plane."""
+
+    inverse_sigma: np.ndarray
+    psf_width: float
+    bank: object  # With the executor.
+
+
+def plane_peaks(fit, plane, xy, sign=1.0):
+    """
+    Peaks of the mean residual of all exposures in their common plane, and the plane's usable pixels.
+
+    ``xy``, (n, 2), are all known sources; with ``sign`` -1 the peaks of the negative.
+    """
+    models, residuals, sigmas = _images(fit)
+    return _peaks(fit, plane, xy, models, residuals, sigmas, sign)
+
+
+def _images(fit):
+    """Model without sky, residual and inverse errors of each exposure, in MJy/sr."""
+    models = []
+    residuals = []
+    inverse = []
+    for k, part in enumerate(fit.parts):
+        area = part.arrays.areas()
+        model = fit.model(k)
+        residuals.append(fit.residual(k, model) / area)
+        models.append(model / area)
+        inverse.append(part.inverse_sigma * area)
+    return models, residuals, inverse
+
+
+def _peaks(fit, plane, xy, models, residuals, inverse, sign=1.0):
+    weights = [image.astype(float) ** 2 for image in inverse]
+    residual, weight = plane.mean(residuals, weights)
+    model, _ = plane.mean(models, weights)
+    area = pixel_area_map(plane.wcs, plane.shape) * _MICRO
+    width = gaussian_width(fit.settings.mean_kernel) / fit.scale
+    view = _PlaneFit(np.sqrt(weight) / area, width, fit.parts[0].bank)
+    return residual_peaks(view, sign * residual * area, model * area, xy), weight > 0
+
+
+def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
+    """
+    Make the `ForcedPhotometryResult` of a fit of exposures.
+
+    Parameters
+    ----------
+    fit : `~miricigale.photometry.fit.exposure_fit.ExposureFit`
+        The fit.
+    plane : `~miricigale.photometry.images.coadd.Plane`
+        What exposures have in common.
+    images : list of `~astropy.nddata.CCDData`
+        The exposures.
+    catalog : `~miricigale.photometry.fit.result_table.CatalogRows`
+        The catalog; ``near`` lists the fit's sources.
+    new_xy : `~numpy.ndarray`, shape (m, 2)
+        Positions of sources that it lacks, in the plane: the last of the fit's sources.
+    evidence : dict or None
+        Of a second pass.
+    offsets : tuple
+        Of the exposures from the templates, east and north in arcsec, shape (k, 2), and their errors, (k,).
+    meta : dict
+        The ``template``, and the ``filter`` if that is known.
+    """
+    n = len(catalog.id)
+    n_all = n + len(new_xy)
+    place = np.concatenate([catalog.near, np.arange(n, n_all)])
+    models, residuals, inverse = _images(fit)
+    chi2, residual_fraction, poor, checks = _compared(fit, models, residuals)
+    terms, common, blending = _covariances(fit)
+    joint = scipy.sparse.csr_array((n_all, n_all))
+    errors = {name: np.full(n_all, np.nan) for name in ("", "_noise", "_template", "_psf")}
+    flux = np.full(n_all, np.nan)
+    measured = place[fit.rows]
+    flux[measured] = fit.flux[fit.rows]
+    if len(fit.rows):
+        k = np.arange(len(measured))
+        gather = scipy.sparse.coo_array((np.ones(len(k)), (measured, k)), shape=(n_all, len(k)))
+        spread = [(gather @ term @ gather.T).tocsr() for term in terms]
+        joint = (spread[0] + spread[1] + spread[2]).tocsr()
+        joint.sort_indices()
+        for name, term in zip(errors, (joint, *spread), strict=True):
+            errors[name][measured] = np.sqrt(np.maximum(term.diagonal()[measured], 0.0))
+    xy = np.concatenate([catalog.xy, new_xy])
+    peaks, _ = _peaks(fit, plane, xy, models, residuals, inverse)
+    flags, coverage = _flags(fit, place, n_all, flux, blending, poor)
+    flags[:n] |= catalog.flags
+    flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
+    has_neighbor = unexplained_neighbors(peaks, xy, flux)
+    flags[has_neighbor & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage}
+    columns["chi2"] = _spread_over(chi2, place, n_all)
+    columns["residual_fraction"] = _spread_over(residual_fraction, place, n_all)
+    for name, term in errors.items():
+        columns[f"flux_err{name}"] = term * FNU
+    new = None
+    if fit.settings.second_pass or len(new_xy):
+        names = ("flux", "flux_err", "flags", "coverage", "chi2")
+        rows = {name: columns[name][n:] for name in names}
+        new = new_source_table(catalog, new_xy, plane.wcs, rows)
+    exposures = _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
+    model, residual = _plane_images(plane, models, residuals, inverse, meta)
+    sky = exposures.table["sky"]
+    weight = exposures.table["sky_err"] ** -2
+    reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
+    background = {}
+    if len(fit.rows):
+        background["background"] = np.sum(sky * weight) / np.sum(weight)
+        background["background_err"] = np.sum(weight) ** -0.5
+    counted = {} if evidence is None else {"second_pass": evidence}
+    has_offset = np.isfinite(offsets[1])
+    if has_offset.any():
+        # along x and y of the plane, as for one image
+        weights = offsets[1][has_offset] ** -2.0
+        east, north = np.average(offsets[0][has_offset], axis=0, weights=weights)
+        counted["offset"] = [round(-float(east), 5), round(float(north), 5)]
+        counted["offset_err"] = [round(float(np.sum(weights) ** -0.5), 5)] * 2
+    return ForcedPhotometryResult(
+        id=np.array(catalog.id),
+        sky=catalog.sky,
+        **{name: values[:n] for name, values in columns.items()},
+        covariance=joint[:n, :n],
+        template=catalog.template,
+        template_snr=catalog.template_snr,
+        crowded=crowded(catalog.sky, reference),
+        x=catalog.xy[:, 0].copy(),
+        y=catalog.xy[:, 1].copy(),
+        **background,
+        new_sources=new,
+        psf_fwhm=np.sqrt(8 * np.log(2)) * gaussian_width(fit.settings.mean_kernel) * ANGLE,
+        model_image=model,
+        residual_image=residual,
+        exposures=exposures,
+        meta=provenance(
+            **meta,
+            pixel_scale=round(fit.scale, 6),
+            n_exposures=len(images),
+            correlated_noise=any(part.correlation is not None for part in fit.parts),
+            measured_noise=any(part.arrays.measured_noise for part in fit.parts),
+            **counted,
+        ),
+    )
+
+
+def _spread_over(values, place, n):
+    """Values of the fit's sources at their places among n; NaN elsewhere."""
+    found = np.full(n, np.nan)
+    found[place] = values
+    return found
+
+
+def _compared(fit, models, residuals):
+    """Chi-square of each source, light left, whether that is poor; noise and correlation of each exposure."""
+    n = len(fit.xy)
+    square, weight, light_left, core = np.zeros((4, n))
+    checks = []
+    for part, model, residual in zip(fit.parts, models, residuals, strict=True):
+        area = part.arrays.areas()
+        source = part.row_source
+        row_light = np.zeros(len(part.source))
+        statistics = np.full((len(part.source), 3), np.nan)
+        residual_flux = np.asarray(residual * area, np.float32)
+        for block in part.bank.blocks():
+            rows = slice(block.first, block.last)
+            residual_statistics(*block.stamps, residual_flux, part.inverse_sigma, statistics[rows])
+            for row, (first, last) in enumerate(
+                zip(block.start[:-1], block.start[1:], strict=True)
+            ):
+                row_light[block.first + row] = block.values[first:last].sum()
+        good = np.isfinite(statistics[:, 0]) & (row_light > 0)
+        np.add.at(square, source[good], (row_light * statistics[:, 0])[good])
+        np.add.at(weight, source[good], row_light[good])
+        np.add.at(light_left, source[good], statistics[good, 1])
+        np.add.at(core, source[good], statistics[good, 2])
+        checks.append(
+            _noise_check(
+                residual_flux * part.inverse_sigma, model * area * part.inverse_sigma, part
+            )
+        )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        chi2 = square / weight
+        light_left = light_left / (fit.flux * core)
+    out = np.ones(n, bool)
+    out[fit.rows] = False
+    chi2[out] = np.nan
+    light_left[out] = np.nan
+    poor = chi2 > POOR_CHI2
+    if fit.free is not None:
+        poor[fit.rows] |= fit.free.strain > POOR_STRAIN
+    return chi2, light_left, poor, checks
+
+
+def _noise_check(white, model, part):
+    """Robust rms of a whitened residual where no source is, and the correlation of neighbors; NaN without sky."""
+    free = part.arrays.usable & (np.abs(model) < _FREE)
+    if np.count_nonzero(free) < _FEWEST_PIXELS:
+        return np.nan, np.nan
+    rms = float(mad_std(white[free]))
+    if not rms > 0:
+        return rms, np.nan
+    calm = free & (np.abs(white) < 5 * rms)
+    products = []
+    for first, second in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        calm_pairs = calm[first] & calm[second]
+        products.append(np.mean(white[first][calm_pairs] * white[second][calm_pairs], dtype=float))
+    return rms, float(np.mean(products) / np.mean(white[calm] ** 2, dtype=float))
+
+
+def _covariances(fit):
+    """Covariances by noise, templates and PSF, that of the common parameters, and blending of all sources."""
+    blending = np.full(len(fit.xy), np.nan)
+    if not len(fit.rows):
+        return [], None, blending
+    n = len(fit.rows)
+    fixed = fit.fit
+    changes = fit.free
+    solution = fixed
+    xy = fit.xy[fit.rows]
+    noise_filling = fit.noise_filling()
+    fillings = [noise_filling]
+    if changes is not None:
+        solution = changes.fit
+        xy = np.concatenate([xy, changes.xy])
+        if noise_filling is None:
+            # the priors are no noise
+            white = (solution.matrix - scipy.sparse.diags_array(changes.prior)).tocsr()
+            fillings = [(white, solution.border, solution.corner)]
+        n_common = len(solution.corner_rhs)
+        nothing = np.zeros((len(solution.rhs), n_common)), np.zeros((n_common, n_common))
+        fillings.append((changes.filling(fixed.matrix), *nothing))
+    coo = fixed.matrix.tocoo()
+    pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=solution.matrix.shape)
+    covariances, all_blending = solution.covariances(
+        xy, fillings, core=BLOCK_CORE / fit.scale, halo=BLOCK_HALO / fit.scale, pattern=pattern
+    )
+    noise, common = covariances[0]
+    noise = noise[:n][:, :n]
+    blending[fit.rows] = all_blending[:n]
+    template = scipy.sparse.csr_array((n, n))
+    if changes is not None:
+        blending[fit.rows] *= np.sqrt(changes.alone())
+        template, change_common = covariances[1]
+        template = template[:n][:, :n]
+        common = common + change_common
+    light = [light is not None and light.kind == "cutout" for light in fit.cutouts()]
+    error = psf_errors(fit, np.array(light, bool))[fit.rows]
+    coo = noise.tocoo()
+    data = error[coo.row] * error[coo.col]
+    psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
+    return [noise, template, psf], common, blending
+
+
+def _flags(fit, place, n_all, flux, blending, poor):
+    """Flags of all sources, and the fraction of each template on the exposure that shows most of it."""
+    flags = np.zeros(n_all, int)
+    inside = np.zeros(n_all)
+    coverage = np.zeros(n_all)
+    inside[place] = fit.light[:, 0]
+    coverage[place] = np.clip(fit.light[:, 1], 0.0, 1.0)
+    flags[inside < 0.9] |= int(ForcedFlags.EDGE)
+    flags[coverage < 0.9 * np.minimum(inside, 1.0)] |= int(ForcedFlags.MASKED)
+    for rows, flag in (
+        (fit.degenerate, ForcedFlags.DEGENERATE),
+        (fit.noisy, ForcedFlags.NOISY_SEGMENT),
+        (blending > 2, ForcedFlags.BLENDED),
+        (poor, ForcedFlags.POOR_FIT),
+    ):
+        flags[place[rows]] |= int(flag)
+    lost = np.isnan(flux) & (flags & int(ForcedFlags.DEGENERATE) == 0)
+    flags[lost] |= int(ForcedFlags.NO_DATA)
+    return flags, coverage
+
+
+def _exposures(fit, images, models, residuals, inverse, common, checks, offsets):
+    """The `ExposureResults` of a fit."""
+    table = QTable({"exposure": np.arange(len(images))})
+    table["source"] = [str(image.meta.get("source", k)) for k, image in enumerate(images)]
+    table["n_sources"] = [_n_seen(part) for part in fit.parts]
+    first = [places["sky"].start for places in fit.places]
+    errors = np.full(len(fit.common), np.nan)
+    if common is not None:
+        errors = np.sqrt(np.diag(common))
+    table["sky"] = fit.common[first] * SURFACE_BRIGHTNESS
+    table["sky_err"] = errors[first] * SURFACE_BRIGHTNESS
+    table["offset_east"], table["offset_north"] = offsets[0].T * ANGLE
+    table["offset_err"] = offsets[1] * ANGLE
+    table["noise"], table["correlation"] = np.transpose(checks)
+    _warn_of_offsets(fit, offsets)
+    for row in table:
+        if abs(row["noise"] - 1) > _OTHER_NOISE:
+            msg = (
+                f"exposure {row['exposure']} ({row['source']}): noise between the sources is {row['noise']:.3g} "
+                "times its stated errors, and so are the errors of fluxes"
+            )
+            warn(msg, PhotometryWarning)
+    model_images, residual_images = [], []
+    for k, part in enumerate(fit.parts):
+        usable = part.arrays.usable
+        sky = fit.sky(k) / part.arrays.areas()
+        with np.errstate(divide="ignore"):
+            sigma = np.where(usable, 1 / inverse[k], np.nan)
+        options = {"unit": SURFACE_BRIGHTNESS, "wcs": part.arrays.wcs}
+        image_meta = {
+            key: images[k].meta[key] for key in ("filter", "source") if key in images[k].meta
+        }
+        model_images.append(Image(models[k] + sky, meta=dict(image_meta), **options))
+        residual = np.where(usable, residuals[k], np.nan)
+        noise = StdDevUncertainty(sigma)
+        residual_images.append(
+            Image(residual, mask=~usable, uncertainty=noise, meta=dict(image_meta), **options)
+        )
+    return ExposureResults(table, tuple(model_images), tuple(residual_images))
+
+
+def _warn_of_offsets(fit, offsets):
+    """Warn of exposures that lie off their templates, if sources are bright and no shift is fitted."""
+    if fit.settings.max_shift is not None or not len(fit.rows):
+        return
+    snr = fit.fit.flux * np.sqrt(fit.fit.matrix.diagonal())
+    offset = np.hypot(*offsets[0].T)
+    far = (offset > _OFFSET * fit.scale) & (offset > 3 * offsets[1])
+    if far.any() and np.count_nonzero(snr > _BRIGHT) >= _FEWEST_BRIGHT:
+        msg = (
+            f"{np.count_nonzero(far)} exposures lie up to {offset.max():.3f} arcsec from their templates: "
+            "'max_shift' fits that"
+        )
+        warn(msg, PhotometryWarning)
+
+
+def _n_seen(part):
+    """Number of sources that are on an exposure."""
+    ny, nx = part.arrays.flux.shape
+    x, y = part.bank.sources.xy.T
+    return int(np.count_nonzero((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)))
+
+
+def _plane_images(plane, models, residuals, inverse, meta):
+    """Mean model and residual in the plane, for pictures."""
+    weights = [image.astype(float) ** 2 for image in inverse]
+    model, weight = plane.mean(models, weights)
+    residual, _ = plane.mean(residuals, weights)
+    usable = weight > 0
+    sigma = np.full(plane.shape, np.nan)
+    sigma[usable] = weight[usable] ** -0.5
+    residual[~usable] = np.nan
+    image_meta = {key: meta[key] for key in ("filter",) if key in meta}
+    options = {"unit": SURFACE_BRIGHTNESS, "wcs": plane.wcs}
+    return (
+        Image(model, meta=dict(image_meta), **options),
+        Image(
+            residual,
+            mask=~usable,
+            uncertainty=StdDevUncertainty(sigma),
+            meta=dict(image_meta),
+            **options,
+        ),
+    )

@@ -1,0 +1,219 @@
+"""What photometry keeps in files: results and templates."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+import scipy.sparse
+from astropy.coordinates import SkyCoord
+from astropy.nddata import StdDevUncertainty
+from astropy.table import QTable, Table
+
+from miricigale.instrument.image import Image
+from miricigale.photometry.detection.cutouts import Cutout
+from miricigale.photometry.errors.error_files import write_ecsv
+from miricigale.photometry.fit.exposure_result import ExposureResults
+from miricigale.photometry.fit.offsets import OffsetMap
+from miricigale.photometry.fit.results import ForcedPhotometryResult
+from miricigale.photometry.images.fields import SmoothField
+from miricigale.photometry.images.fits_images import grid_text, text_grid
+from miricigale.photometry.shapes.shapes import FITTED, not_fitted
+from miricigale.photometry.templates.sources import SourceTemplates
+from miricigale.utils.file_formats import register
+from miricigale.utils.positions import sky_as_angles
+from miricigale.utils.store import native, open_parts, write_parts
+from miricigale.utils.tables import ascii_ids
+from miricigale.utils.units import SURFACE_BRIGHTNESS
+
+
+def _sky_columns(sky):
+    icrs = sky.icrs
+    return {"ra": icrs.ra.deg, "dec": icrs.dec.deg}
+
+
+def _columns(table):
+    """Columns of a table that was read, without masks: what is not finite stays so."""
+    return {name: native(np.asarray(table[name])) for name in table.colnames}
+
+
+def _sky(columns):
+    return SkyCoord(columns.pop("ra"), columns.pop("dec"), unit="deg")
+
+
+def _write_templates(templates, path, *, overwrite=False):
+    names = ("sersic", "flags", "snr", "flux", "components")
+    table = {"id": ascii_ids(templates.id, "id"), **_sky_columns(templates.sky)}
+    table |= {k: getattr(templates, k) for k in names if getattr(templates, k) is not None}
+    table |= {f"fitted_{name}": templates.fitted[name] for name in FITTED.names}
+    layers = []
+    for row, light in enumerate(templates.light):
+        if light is None:
+            continue
+        layers += [(row, False, layer) for layer in light.layers]
+        if light.whole is not None:
+            layers += [(row, True, layer) for layer in light.whole.layers]
+    rows = {
+        "row": np.array([row for row, _, _ in layers], int),
+        "whole": np.array([whole for _, whole, _ in layers], bool),
+        "corner": np.array([layer.origin for *_, layer in layers], int).reshape(-1, 2),
+        "shape": np.array([layer.data.shape for *_, layer in layers], int).reshape(-1, 2),
+        "noise": np.array([layer.noise for *_, layer in layers], float),
+        "convolved": np.array([layer.convolved for *_, layer in layers], bool),
+    }
+    pixels = np.concatenate([layer.data.ravel() for *_, layer in layers] or [np.empty(0)])
+    arrays = {"pixels": pixels} | ({} if templates.psf is None else {"psf": templates.psf})
+    grid = None if templates.wcs is None else grid_text(templates.wcs)
+    write_parts(
+        path, "source-templates-3", text={"meta": templates.meta, "grid": grid}, arrays=arrays,
+        tables={"sources": Table(table), "layers": Table(rows)}, overwrite=overwrite,
+    )  # fmt: skip
+
+
+def _read_templates(path):
+    with open_parts(path, ("source-templates-3",), wanted="templates of sources") as parts:
+        text = parts.text
+        columns, rows = (_columns(parts.table(name)) for name in ("sources", "layers"))
+        pixels = parts.array("pixels") if "pixels" in parts else np.empty(0)
+        light = [None] * len(columns["id"])
+        wholes = list(light)
+        ends = np.cumsum(np.prod(rows["shape"], axis=1, dtype=int))
+        # the last layer of a source first: each is what is added to the one before
+        for k in range(len(ends) - 1, -1, -1):
+            h, w = (int(n) for n in rows["shape"][k])
+            row, origin = int(rows["row"][k]), tuple(int(c) for c in rows["corner"][k])
+            data = pixels[ends[k] - h * w : ends[k]].reshape(h, w)
+            form = {
+                "noise": float(rows["noise"][k]),
+                "convolved": bool(rows["convolved"][k]),
+            }
+            if rows["whole"][k]:
+                wholes[row] = Cutout(data, origin, rest=wholes[row], **form)
+            else:
+                light[row] = Cutout(data, origin, rest=light[row], whole=wholes[row], **form)
+        fitted = not_fitted(len(light))
+        for name in FITTED.names:
+            fitted[name] = columns.pop(f"fitted_{name}")
+        grid = text["grid"]
+        return SourceTemplates(
+            sky=_sky(columns),
+            **columns,
+            light=light,
+            fitted=fitted,
+            wcs=None if grid is None else text_grid(grid),
+            psf=parts.array("psf") if "psf" in parts else None,
+            meta=text["meta"],
+        )
+
+
+#: Columns of a result's table, its quantities that are few, and its sparse matrices.
+_ROWS = [
+    "flux", "flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf", "flags", "coverage",
+    "chi2", "residual_fraction", "template", "template_snr", "crowded", "x", "y", "flux_point",
+    "flux_point_err",
+]  # fmt: skip
+_QUANTITIES = ("background", "background_err", "shift", "shift_err", "psf_fwhm")
+_MATRICES = ("covariance", "joint_covariance")
+
+
+def _given(result, names):
+    return {k: getattr(result, k) for k in names if getattr(result, k) is not None}
+
+
+def _write_result(result, path, *, overwrite=False):
+    residual = result.residual_image
+    arrays = {
+        "model": result.model_image.data,
+        "residual": residual.data,
+        "sigma": residual.uncertainty.array,
+        "mask": np.asarray(residual.mask),
+        **_given(result, ("noise_correlation",)),
+    }
+    for name, matrix in _given(result, _MATRICES).items():
+        arrays |= {f"{name}_{k}": getattr(matrix, k) for k in ("data", "indices", "indptr")}
+    text = {
+        "meta": result.meta,
+        "image_meta": residual.meta,
+        "wcs": grid_text(residual.wcs),
+        "quantities": {
+            k: (v.value, v.unit.to_string()) for k, v in _given(result, _QUANTITIES).items()
+        },
+    }
+    table = {"id": ascii_ids(result.id, "id"), **_sky_columns(result.sky)}
+    tables = {"sources": QTable({**table, **_given(result, _ROWS)})}
+    fields = {"background_field": result.background_field}
+    if result.offset_map is not None:
+        fields["offset_map"] = result.offset_map.field
+        tables["offsets"] = sky_as_angles(result.offset_map.sources)
+    if result.exposures is not None:
+        tables["exposures"] = result.exposures.table
+    if result.new_sources is not None:
+        tables["new"] = sky_as_angles(result.new_sources)
+    for name, field in fields.items():
+        if field is not None:
+            text[name] = {**dataclasses.asdict(field)}
+    parts = {"shown": result.to_table(), "text": text, "arrays": arrays, "tables": tables}
+    write_parts(path, "forced-photometry-1", **parts, overwrite=overwrite)
+
+
+def _read_result(path):
+    with open_parts(path, ("forced-photometry-1",), wanted="forced photometry") as parts:
+        text = parts.text
+        wcs = text_grid(text["wcs"])
+        columns = _table(parts, "sources")
+        found = {name: columns[name] for name in ("id", *_ROWS) if name in columns.colnames}
+        for name, (value, unit) in text["quantities"].items():
+            found[name] = value * u.Unit(unit)
+        n = len(columns)
+        for name, size in zip(_MATRICES, (n, 2 * n), strict=True):
+            if f"{name}_indptr" in parts:
+                arrays = [
+                    parts.array(f"{name}_{k}") if f"{name}_{k}" in parts else np.empty(0, kind)
+                    for k, kind in (("data", float), ("indices", np.int32), ("indptr", np.int32))
+                ]
+                found[name] = scipy.sparse.csr_array(tuple(arrays), shape=(size, size))
+        if "noise_correlation" in parts:
+            found["noise_correlation"] = parts.array("noise_correlation")
+        if "background_field" in text:
+            found["background_field"] = _field(text["background_field"])
+        if "offset_map" in text:
+            field = _field(text["offset_map"])
+            found["offset_map"] = OffsetMap(_table(parts, "offsets"), field, wcs)
+        if "exposures" in parts:
+            found["exposures"] = ExposureResults(QTable(parts.table("exposures")))
+        if "new" in parts:
+            found["new_sources"] = _table(parts, "new")
+        options = {"unit": SURFACE_BRIGHTNESS, "wcs": wcs}
+        return ForcedPhotometryResult(
+            sky=columns["sky"],
+            **found,
+            model_image=Image(parts.array("model"), meta=dict(text["image_meta"]), **options),
+            residual_image=Image(
+                parts.array("residual"),
+                mask=parts.array("mask").astype(bool),
+                uncertainty=StdDevUncertainty(parts.array("sigma"), copy=False),
+                meta=dict(text["image_meta"]),
+                **options,
+            ),
+            meta=text["meta"],
+        )
+
+
+def _table(parts, name):
+    """A table with positions."""
+    read = parts.table(name)
+    columns = _columns(read)
+    sky = _sky(columns)
+    units = {k: read[k].unit for k in columns}
+    table = QTable({k: v if units[k] is None else v * units[k] for k, v in columns.items()})
+    table.add_column(sky, name="sky", index=1)
+    return table
+
+
+def _field(state):
+    coefficients = np.array(state["coefficients"])
+    return SmoothField(coefficients, tuple(state["shape"]), state["order"])
+
+
+register(SourceTemplates, read=_read_templates, write=_write_templates)
+register(ForcedPhotometryResult, read=_read_result, write=_write_result)
+register(ForcedPhotometryResult, write=write_ecsv, name="ascii.ecsv")

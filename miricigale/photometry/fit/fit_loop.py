@@ -1,0 +1,194 @@
+"""The fits of one image: the catalog, then with what its residual shows to be lacking."""
+
+import numpy as np
+from astropy.wcs.utils import pixel_to_pixel
+from scipy.special import ndtr
+
+from miricigale.photometry.detection.residual_sources import LEFT_SNR, new_sources, residual_peaks
+from miricigale.photometry.fit.diagnostics import diagnose
+from miricigale.photometry.fit.offsets import fit_offsets, settled, source_offsets
+from miricigale.photometry.fit.template_fit import TemplateFit
+from miricigale.photometry.images.arrays import local_maps
+from miricigale.utils.units import ANGLE
+
+#: How often positions of new sources are refined, and the errors by which the center of a profile
+#: differs from the catalog's position where it is taken instead.
+_REFINED, _ELSEWHERE = 2, 3.0
+
+#: Largest share of false ones with which new sources are fitted where the evidence decides.
+_FALSE_RATE = 0.1
+
+
+def fit_image(arrays, bank, settings, catalog, grid_wcs):
+    """
+    Fit an image, and once more with second components and sources that the catalog lacks.
+
+    Parameters
+    ----------
+    arrays, bank, settings
+        As for `~miricigale.photometry.fit.template_fit.TemplateFit`.
+    catalog : `~miricigale.photometry.fit.result_table.CatalogRows`
+        The catalog; ``near`` lists the bank's sources.
+    grid_wcs : `~astropy.wcs.WCS`
+        Of the grid on which templates are made.
+
+    Returns
+    -------
+    fit, diagnostics
+        The `TemplateFit` and its `Diagnostics`.
+    new_xy : `~numpy.ndarray`, shape (m, 2)
+        Positions, in the catalog's frame, of sources that it lacks: the last of the fit's sources.
+    """
+    if settings.offset_order is None:
+        fit = TemplateFit(arrays, bank, settings)
+    else:
+        fit = fit_offsets(arrays, bank, settings, catalog)
+    if not settings.second_pass:
+        # where the catalog is known to lack sources, these would move their neighbors
+        fit = settled(fit, bank, catalog)
+    more = _More(bank, fit, catalog, grid_wcs)
+    by_catalog = catalog.double is not None
+    double = np.flatnonzero(catalog.double[catalog.near]) if by_catalog else np.empty(0, int)
+    new_xy, poor = np.empty((0, 2)), np.empty(0, int)
+    choose = settings.components == 2 and not by_catalog
+    if choose:
+        # before templates may change, which hides some of the light of a point in their middle
+        poor = _poor(fit, catalog, new_xy)
+    evidence = None
+    if settings.second_pass is not False:
+        # templates that may change absorb some of the light of their neighbors
+        new_xy, evidence = _new_positions(fit, catalog)
+    if len(new_xy) or len(double):
+        new_xy = more.refined(double, new_xy)
+        fit = more.fit(double, new_xy)
+        if choose:
+            # sources that are poorly fitted also with the new sources next to them
+            poor = _poor(fit, catalog, new_xy)
+    if fit.free is None:
+        fit.free_templates(catalog.fitted)
+    diagnostics = diagnose(fit, np.concatenate([catalog.xy, new_xy]))
+    if len(poor):
+        fit, diagnostics = _split(fit, diagnostics, more, poor, new_xy)
+    fit.evidence = evidence
+    return fit, diagnostics, new_xy
+
+
+def _poor(fit, catalog, new_xy):
+    """Which of the catalog's sources in a bank are poorly fitted."""
+    diagnostics = diagnose(fit, np.concatenate([catalog.xy, new_xy]))
+    source = fit.bank.order[diagnostics.poor]
+    return np.sort(source[source < len(catalog.near)])
+
+
+def _new_positions(fit, catalog):
+    """
+    Where the residual shows sources that the catalog lacks, in the catalog's frame, and the evidence for them.
+
+    The false ones are taken to be as many as the negative of the residual shows, and those of Gaussian noise.
+    Where the evidence decides (``second_pass`` is None) there are none unless they are few.
+    """
+    found, xy = diagnose(fit, catalog.xy), catalog.xy + fit.displacement(catalog.xy)
+    flux = np.full(len(xy), np.nan)
+    flux[catalog.near[fit.bank.order]] = fit.total
+    peaks, usable, decide = found.peaks, fit.arrays.usable, fit.settings.second_pass is None
+    # a background that is not fitted is no source
+    residual = found.residual - usable * np.median(found.residual[usable])
+    if decide:
+        peaks = residual_peaks(fit, residual, found.model, xy)
+    negative = residual_peaks(fit, -residual, found.model, xy)
+    form = {"usable": usable} if decide else {}
+    new, false = (new_sources(one, xy, flux, **form) for one in (peaks, negative))
+    n_beams = np.count_nonzero(usable) / (4 * np.pi * fit.psf_width**2)
+    n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
+    rate = float(n_false / max(np.count_nonzero(new), 1))
+    done = fit.settings.second_pass or rate <= _FALSE_RATE
+    at = peaks.refined[new & done]
+    evidence = {"peaks": int(new.sum()), "threshold": LEFT_SNR, "false_rate": float(f"{rate:.2g}")}
+    return at - fit.displacement(at), evidence | {"fitted": bool(done and len(at))}
+
+
+def _split(fit, diagnostics, more, poor, new_xy):
+    """Fit with second components of those sources that are better fitted with them."""
+
+    def chi2(fit, diagnostics):
+        found = np.empty(len(fit.host))
+        found[fit.bank.order] = diagnostics.chi2
+        return found[poor]
+
+    split, chosen = (fit, diagnostics), poor
+    before = chi2(*split)
+    for _ in range(2):
+        found = more.fit(chosen, new_xy)
+        found.free_templates(more.catalog.fitted)
+        split = found, diagnose(found, np.concatenate([more.catalog.xy, new_xy]))
+        better = poor[chi2(*split) < before]
+        if len(chosen) == len(better) or not len(better):
+            break
+        chosen = better
+    return split if len(better) else (fit, diagnostics)
+
+
+class _More:
+    """Fits of a bank's sources with points that are added, templates moved as in a first fit."""
+
+    def __init__(self, bank, first, catalog, grid_wcs):
+        self._bank, self.catalog, self._grid_wcs = bank, catalog, grid_wcs
+        self._first, self._made = first, first.bank
+
+    def fit(self, double, new_xy, search=None):
+        """Fit with second components of some of the sources, and new sources after those."""
+        first, near = self._first, self.catalog.near
+        arrays, settings, own = first.arrays, first.settings, first.own
+        n = len(near)
+        host = np.concatenate([np.arange(n), double, n + len(double) + np.arange(len(new_xy))])
+        all_xy = np.concatenate([self.catalog.xy[near], self._centers(double), new_xy])
+        xy = all_xy[n:]
+        half = settings.mean_kernel.target.shape[0] // 2 + 1
+        half = half * settings.mean_kernel.pixel_scale.to_value(ANGLE) / first.scale / 2
+        poly = local_maps(xy, np.full(len(xy), half), arrays.wcs, self._grid_wcs)
+        bank = self._bank.with_points(xy, poly)
+        moved = np.array(first.displacement(all_xy))
+        moved[:n] += 0.0 if own is None else own
+        one = first.offset_map is None and own is None
+        # positions are refined without a shift
+        shifted = first.shift is not None and search is None
+        if search is None:
+            # a shift that was rejected is not searched again
+            search = first.shift is not None and own is None
+        form = {"host": host, "moved": moved[0] if one else moved, "search": search}
+        fit = TemplateFit(arrays, bank, settings, like=self._made, **form)
+        if shifted and not search:
+            fit.include_shift(first.shift)
+        fit.offset_map, self._made = first.offset_map, fit.bank
+        return fit
+
+    def _centers(self, double):
+        """Positions of sources: of the catalog, or of their profiles where those are surely elsewhere."""
+        xy, fitted = self.catalog.xy[self.catalog.near[double]], self.catalog.fitted[double]
+        # what is fitted to a piece of a galaxy is the whole of it
+        whole = fitted["galaxy"] == 0
+        rows = np.flatnonzero(np.isfinite(fitted["parameters"][:, 0]) & whole)
+        if len(rows):
+            center = fitted["parameters"][rows, :2]
+            place = pixel_to_pixel(self._first.arrays.wcs, self._grid_wcs, *xy[rows].T)
+            offset = center - np.stack(place, axis=1)
+            inverse = np.linalg.pinv(fitted["covariance"][rows, 1:3, 1:3])
+            far = np.einsum("ki,kij,kj->k", offset, inverse, offset) > _ELSEWHERE**2
+            if far.any():
+                found = pixel_to_pixel(self._grid_wcs, self._first.arrays.wcs, *center[far].T)
+                xy[rows[far]] = np.stack(found, axis=1)
+        return xy
+
+    def refined(self, double, new_xy):
+        """Positions of new sources after some fits of where they are."""
+        first_new = len(self.catalog.near) + len(double)
+        new_xy = new_xy.copy()
+        for _ in range(_REFINED if len(new_xy) else 0):
+            fit = self.fit(double, new_xy, search=False)
+            rows = fit.rows[fit.bank.order[fit.rows] >= first_new]
+            model = fit.model()
+            step, error, _ = source_offsets(fit, fit.residual(model), model, rows)
+            good = error < 0.25 * fit.psf_width
+            step = np.clip(step[good], -fit.psf_width, fit.psf_width)
+            new_xy[fit.bank.order[rows[good]] - first_new] += step
+        return new_xy

@@ -1,0 +1,513 @@
+"""Forced photometry: all sources of a catalog fitted at once, with templates."""
+
+import dataclasses
+import os
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable, Table
+from photutils.segmentation import SegmentationImage
+
+from miricigale.instrument import epoch_of
+from miricigale.photometry._core.stamps import add_model
+from miricigale.photometry.detection.prior_catalog import detected_prior, read_catalog, read_prior
+from miricigale.photometry.fit.exposure_kernels import ExposureKernels
+from miricigale.photometry.fit.fit_loop import fit_image
+from miricigale.photometry.fit.result_table import CatalogRows, package
+from miricigale.photometry.fit.stars import with_stars
+from miricigale.photometry.images.arrays import fit_arrays, image_arrays, pixel_scale
+from miricigale.photometry.images.flags import ForcedFlags
+from miricigale.photometry.images.mosaics import as_mosaic
+from miricigale.photometry.images.repeated_pixels import own_pixels
+from miricigale.photometry.images.sky_noise import warn_of_background
+from miricigale.photometry.templates.placement import Placement
+from miricigale.photometry.templates.sources import SourceTemplates
+from miricigale.psf import KernelField, MatchingKernel, as_kernel
+from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
+from miricigale.utils.interactive import Interactive
+from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.parallel import single_threaded, thread_count, threads
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, is_number, positive, to_array
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorSettings:
+    """
+    What the errors of fluxes are made of.
+
+    Parameters
+    ----------
+    correlated_noise : bool, optional
+        Whether the noise's autocorrelation is measured on source-free pixels and goes into
+        the errors; otherwise the image's uncertainty is taken as white noise. With fewer than 400 pixels
+        it is what the mosaic states (``meta["noise_correction"]``), if it does.
+    size_scatter : float or None, optional
+        Templates fitted to the high-resolution image (``"auto"`` and ``"cutout"`` with ``wings``) may
+        change as far as their fit leaves them open, and in size by this standard deviation of ln size,
+        since galaxies are not of one size in all bands. None takes them without error. Shapes that a
+        catalog states always are.
+    psf_error : float, optional
+        Error of a point source's flux, as a fraction, by that of the image's PSF: about 0.8 of the
+        fractional error of its width. By default that of the kernel's encircled energy, for templates
+        that are images, and none for the others, which need the kernel's target only.
+
+    Raises
+    ------
+    ValueError
+        If a fraction is not at least 0 and below 1.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import ErrorSettings
+    >>> ErrorSettings(psf_error=0.02)
+    ErrorSettings(correlated_noise=True, size_scatter=0.1, psf_error=0.02)
+    """
+
+    correlated_noise: bool = True
+    size_scatter: float | None = 0.1
+    psf_error: float | None = None
+
+    def __post_init__(self):
+        for name in ("size_scatter", "psf_error"):
+            value = getattr(self, name)
+            check_that(value is None or 0 <= value < 1, name, "at least 0 and below 1", value)
+
+
+@dataclasses.dataclass(frozen=True)
+class MemorySettings:
+    """
+    What is kept in memory during a fit; it changes nothing in the result.
+
+    Parameters
+    ----------
+    max_bytes : float, optional
+        Memory for templates; beyond it they are made anew for each pass.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import MemorySettings
+    >>> MemorySettings(max_bytes=4e9)
+    MemorySettings(max_bytes=4000000000.0)
+    """
+
+    max_bytes: float = 1.5e9
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class ForcedPhotometer(Interactive):
+    """
+    Measure the sources of a catalog on an image of lower resolution.
+
+    Each source's light on a high-resolution image is brought to the image's resolution
+    and pixels; the sum of all such templates, each times its flux, is fitted to the image.
+
+    Parameters
+    ----------
+    kernel : `~miricigale.psf.MatchingKernel`, `~miricigale.psf.KernelField` or other, optional
+        From the high-resolution image's PSF (``source``) to the image's (``target``), on the
+        pixels of the high-resolution image. ``target`` must be the PSF of the image that is
+        measured: that of a drizzled mosaic for a drizzled mosaic. With kernels of several places
+        each source has that of its own; shapes are fitted with the mean of the sources. Of a kernel
+        without PSFs sources are the segments as they are (``template="cutout"``, ``wings=False``),
+        which a warning says; those without a segment are not measured. Files, and arrays with their pixel scale
+        (``(array, 0.03 * u.arcsec)``), are taken by `~miricigale.psf.as_kernel`. For exposures that are fitted
+        together a list of kernels, or `ExposureKernels`, one for each.
+    psf, highres_psf : `~photutils.psf.ImagePSF`, str or other, optional
+        In place of the kernel the PSFs of the image and of the high-resolution image, in the forms of
+        `~miricigale.psf.MatchingKernel.from_psfs`, which makes the kernel. Of an image without a
+        high-resolution one that of the image alone: sources are points.
+    template : {"auto", "cutout", "psf", "sersic"}, optional
+        What sources look like. ``"auto"`` cuts them from the high-resolution image where a
+        segment of enough signal-to-noise belongs to them, otherwise takes a point source.
+        ``"cutout"`` does so without regard to the signal-to-noise. ``"sersic"`` draws the
+        profile that the catalog states.
+    wings : bool, optional
+        Whether cutouts are carried on beyond their well-measured core by a profile scaled to what is
+        seen; otherwise they are the segments as they are.
+    background_order : int, optional
+        If given, a background is fitted with the sources: a polynomial in position of this order, 0 (a
+        constant) to 4. Its terms are images that are kept during the fit.
+    max_shift : `~astropy.units.Quantity`, optional
+        If given, a shift of the whole image is fitted too. A larger one than this is
+        rejected with a warning, and the image is measured without.
+    offset_order : int, optional
+        If given (0 to 3), a map of offsets takes the place of the one shift: a polynomial in position of
+        this order through the offsets of bright isolated sources that are below ``max_shift``. With too few
+        of them the order is lowered, or one shift fitted, and a warning says so.
+    integrate : bool, optional
+        Whether templates are averaged over the image's pixels, for a kernel whose target
+        does not include the response of the pixel.
+    components : {1, 2}, optional
+        With 2, sources whose template without error fits poorly are fitted once more as their template and
+        a point on top of it, and stay so where chi-square is less than without the point. Column
+        ``components`` of the catalog (1 or 2) says which those are instead. The point is at the catalog's
+        position, or at the center of the fitted profile if that is more than 3 sigma away.
+    second_pass : bool or None, optional
+        Whether peaks of the residual above 5 sigma that the catalog lacks are fitted together with it, as
+        points; they are listed in ``new_sources`` of the result. None leaves it to the evidence: they are
+        where at most a tenth of them are false, by the peaks of the residual's negative and of Gaussian noise.
+    psf_stars : bool or None, optional
+        Whether stars on the image and on the high-resolution image correct the two PSFs, as far as stars that
+        are left out confirm it (`~miricigale.photometry.fit.stars.kernel_stars`); the error that remains is
+        ``psf_error``, unless that is given, and ``psf_stars`` of the result says what was found. None corrects
+        the PSF of an image only if it shows three stars at least, each of which the others can confirm.
+    errors : `ErrorSettings`, optional
+        What the errors are made of.
+    memory : `MemorySettings`, optional
+        What is kept in memory.
+    n_threads : int, optional
+        Number of threads; by default one for each processor. It changes nothing in the
+        result.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range, or the kernel has no PSFs and points or profiles are asked for.
+
+    Notes
+    -----
+    Normal equations in whitened form are factorized sparsely. Errors are the diagonal of
+    H (A^T W C W A) H, where H is the inverse normal matrix and C the measured covariance
+    of the noise; their scale is thus the one of the residuals, not that of the uncertainty.
+
+    Templates are not exact. The profile of each source is known up to the covariance of its fit to the
+    high-resolution image; at the image's resolution this is a few independent changes of its template,
+    which are fitted with the fluxes, each with a normal prior of the width it is known to. A bright source
+    thus finds its size in the image that is measured, a faint one keeps the high-resolution
+    image's, and errors (``flux_err_template``) are those of the two together. Changes that are
+    below 0.3 of the noise in all pixels together are left out.
+
+    Cutouts of noisy segments make the fit too faint, since the template's own noise adds to
+    its power: that part (noise variance times the kernel's power) is taken off the diagonal.
+
+    References
+    ----------
+    Merlin et al. 2015, A&A 582, A15 (T-PHOT); Yang et al. 2021, ApJ 908, 144, section 3.4;
+    Fuller 1987, Measurement Error Models (errors in variables).
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import ForcedPhotometer
+    >>> from miricigale.psf import gaussian_psf, psf_image
+    >>> psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    >>> sky = SkyCoord([53.1], [-27.8], unit="deg")
+    >>> wcs = north_up_wcs(sky[0], 0.1 * u.arcsec, (61, 61))
+    >>> light = psf_image(psf, pixel_scale=0.1 * u.arcsec, shape=61)
+    >>> noise = np.random.default_rng(1).normal(0, 0.01, (61, 61))
+    >>> image = CCDData(2 * light + noise, unit="uJy", wcs=wcs)
+    >>> result = ForcedPhotometer(psf=psf).measure(image, sky)
+    >>> print(f"{result.flux[0]:.2f} +- {result.flux_err[0]:.2f}")
+    2.02 uJy +- 0.06 uJy
+    """
+
+    kernel: object = None
+    _: dataclasses.KW_ONLY
+    psf: dataclasses.InitVar[object] = None
+    highres_psf: dataclasses.InitVar[object] = None
+    template: str = "auto"
+    wings: bool = True
+    background_order: int | None = None
+    max_shift: u.Quantity | None = None
+    offset_order: int | None = None
+    integrate: bool = False
+    components: int = 1
+    second_pass: bool | None = False
+    psf_stars: bool | None = False
+    errors: ErrorSettings = dataclasses.field(default_factory=ErrorSettings)
+    memory: MemorySettings = dataclasses.field(default_factory=MemorySettings)
+    n_threads: int | None = None
+
+    def __post_init__(self, psf, highres_psf):
+        got = "neither" if psf is None else "both"
+        check_that((self.kernel is None) != (psf is None), "kernel, psf", "one of them given", got)
+        if self.kernel is not None:
+            object.__setattr__(self, "kernel", _as_kernels(self.kernel))
+        if self.kernel is not None and highres_psf is not None:
+            wanted = "given with 'psf', not with 'kernel'"
+            raise argument_error("highres_psf", wanted, "a kernel too")
+        template, kernel = self.template, self.kernel
+        check_choice(template, "template", ("auto", "cutout", "psf", "sersic"))
+        if kernel is None and highres_psf is None:
+            kernel = MatchingKernel.identity(psf)
+            template = "psf" if template == "auto" else template
+        elif kernel is None:
+            kernel = MatchingKernel.from_psfs(highres_psf, psf)
+        # the kernel that all have in common: the mean, with PSFs in any case
+        mean = kernel if isinstance(kernel, MatchingKernel) else kernel.mean
+        bare = mean.source is None or mean.target is None
+        changed = {"kernel": kernel, "template": template, "bare": bare, "mean_kernel": mean}
+        changed["n_threads"] = thread_count(self.n_threads)
+        if bare:
+            wanted = f"a MatchingKernel with its PSFs for template={template!r}"
+            check_that(template in ("auto", "cutout"), "kernel", wanted, "one without")
+            msg = (
+                "the kernel has no PSFs: sources are their segments as they are, without wings, and "
+                "those without a segment are not measured"
+            )
+            warn(msg, PhotometryWarning)
+            # as far as it reaches, and as wide
+            mean = dataclasses.replace(mean, source=mean.array, target=mean.array)
+            changed |= {"template": "cutout", "wings": False, "mean_kernel": mean}
+        for name, largest in (("background_order", 4), ("offset_order", 3)):
+            order = getattr(self, name)
+            if order is not None and not (is_number(order, np.integer) and 0 <= order <= largest):
+                raise argument_error(name, f"an integer from 0 to {largest}", repr(order))
+        if self.offset_order is not None and self.max_shift is None:
+            raise argument_error("max_shift", "given with 'offset_order'", "None")
+        check_choice(self.components, "components", (1, 2))
+        for name in ("second_pass", "psf_stars"):
+            check_choice(getattr(self, name), name, (False, True, None))
+        for name, kind in (("errors", ErrorSettings), ("memory", MemorySettings)):
+            if not isinstance(getattr(self, name), kind):
+                raise argument_error(name, kind.__name__, repr(getattr(self, name)))
+        if self.max_shift is not None:
+            changed["max_shift"] = positive(self.max_shift, ANGLE, "max_shift") * ANGLE
+        for name, value in changed.items():
+            object.__setattr__(self, name, value)
+
+    replace = dataclasses.replace
+
+    def __repr__(self):
+        return f"<ForcedPhotometer template={self.template!r}, {self.kernel!r}>"
+
+    def _facts(self):
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    def measure(self, image, highres=None, segmentation=None, catalog=None, *, templates=None):
+        """
+        Measure all sources of a catalog.
+
+        Parameters
+        ----------
+        image : `~astropy.nddata.CCDData`, path-like or other (see `as_mosaic`)
+            The image, in units of surface brightness or of the flux in a pixel, background subtracted unless
+            it is fitted, with WCS, uncertainty and mask. Any pixel scale and orientation. A list of exposures of
+            one filter is fitted together, each on its own pixels and with a sky of its own (a polynomial of
+            ``background_order``, a constant for None).
+        highres : `~astropy.nddata.CCDData`, path-like or other, optional
+            The high-resolution image, background subtracted, on pixels of the kernel (or the catalog,
+            where there is none). Needed for cutouts; without it the kernel's grid is taken to be north up.
+        segmentation : `~photutils.segmentation.SegmentationImage`, array or path-like, optional
+            Segments of ``highres``; for cutouts they are detected (`detect_sources`) if not given.
+        catalog : table in any form, path-like or `~astropy.coordinates.SkyCoord`, optional
+            Positions (pixels ``x`` and ``y`` are those of ``highres``, or of ``image`` without it), and what
+            `SourceTemplates.from_images`, or for Sersic templates `SourceTemplates.from_catalog`, take; by
+            default a source for each segment.
+        templates : `SourceTemplates`, optional
+            What the sources look like, in place of the three above, made once for several
+            images. The settings ``template`` and ``wings`` are then theirs.
+
+        Returns
+        -------
+        result : `ForcedPhotometryResult`
+
+        Raises
+        ------
+        ValueError, TypeError, `~astropy.units.UnitsError`
+            If an input does not fit; the message says which.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.PhotometryWarning`
+            If no source is on the image, labels are not those of the segmentation, areas that are
+            exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
+            goes into the fluxes.
+        """
+        if isinstance(image, (list, tuple)):
+            from miricigale.photometry.fit.exposure_photometry import measure_exposures
+
+            prior = (highres, segmentation, catalog)
+            return measure_exposures(self, image, *prior, templates=templates)
+        if isinstance(self.kernel, ExposureKernels):
+            wanted = f"{len(self.kernel)} exposures, one for each kernel"
+            raise argument_error("image", wanted, "one image")
+        if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
+            highres, catalog = None, highres
+        image = own_pixels(as_mosaic(image, "image"))
+        arrays = fit_arrays(image, "image")
+        given = [one is not None for one in (highres, segmentation, catalog)]
+        if templates is None:
+            highres, segmentation, catalog = self._prior(image, highres, segmentation, catalog)
+            sources = SourceTemplates.from_catalog(catalog)
+            sources = dataclasses.replace(sources, sky=catalog["sky"])
+        elif any(given):
+            raise argument_error("templates", "given alone with the image", "a catalog too")
+        elif not isinstance(templates, SourceTemplates):
+            msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
+            raise TypeError(msg)
+        else:
+            sources = templates
+        if self.psf_stars is not False and not self.bare:
+            known = QTable({"id": sources.id, "sky": sources.sky})
+            one, stars = with_stars(self, image, known, highres, sources.wcs)
+            prior = (highres, segmentation, catalog) if templates is None else ()
+            return stars.noted(one.measure(image, *prior, templates=templates))
+        place = Placement.of(self, arrays, sources.sky)
+        if len(sources.id) and not len(place.near):
+            msg = (
+                f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
+            )
+            warn(msg, PhotometryWarning)
+        if templates is None:
+            templates = self._templates(highres, segmentation, catalog[place.near])
+        else:
+            templates = templates[place.near]
+        self._check_grid(templates)
+        rows, templates = self._rows(sources, place, templates)
+        meta = {"template": templates.meta.get("template", self.template)}
+        name = image.meta.get("filter", image.meta.get("FILTER"))
+        meta |= {} if name is None else {"filter": str(name)}
+        meta |= {k: v for k, v in image.meta.items() if k == "repeated_pixels"}
+        with threads(self.n_threads) as executor, single_threaded():
+            bank = place.bank(rows.near, templates, executor)
+            found = fit_image(arrays, bank, self, rows, place.grid(templates))
+            result = package(*found, rows, meta)
+        if self.background_order is None:
+            warn_of_background(result, self.mean_kernel)
+        return result
+
+    __call__ = measure
+
+    def render(self, image, templates, flux):
+        """
+        Draw sources as they are seen on an image.
+
+        Parameters
+        ----------
+        image : `~astropy.nddata.CCDData`
+            The image, as for `measure`; the values of its pixels do not count.
+        templates : `SourceTemplates`
+            What the sources look like.
+        flux : `~astropy.units.Quantity`, shape (n,)
+            Their fluxes.
+
+        Returns
+        -------
+        model : `~astropy.units.Quantity`, shape (ny, nx)
+            Surface brightness in MJy/sr.
+
+        Raises
+        ------
+        ValueError, TypeError, `~astropy.units.UnitsError`
+            If an input does not fit; the message says which.
+        """
+        arrays = image_arrays(as_mosaic(image, "image"), "image")
+        flux = to_array(flux, FNU, "flux", ndim=1)
+        if len(flux) != len(templates):
+            raise argument_error("flux", f"{len(templates)} fluxes, one for each source", len(flux))
+        place = Placement.of(self, arrays, templates.sky)
+        near = templates[place.near]
+        self._check_grid(near)
+        model = np.zeros(arrays.flux.shape)
+        with threads(self.n_threads) as executor, single_threaded():
+            bank = place.bank(place.near, near, executor)
+            values = flux[place.near][bank.order]
+            for block in bank.blocks():
+                some = values[block.first : block.last]
+                add_model(model, block.values, block.box, block.start, some)
+        return model / arrays.area * SURFACE_BRIGHTNESS
+
+    def _rows(self, sources, place, templates):
+        """The catalog as the fit takes it, and the templates of its sources that are near."""
+        n, near = len(sources.id), place.near
+        flags, snr, kinds = np.zeros(n, int), np.full(n, np.nan), np.full(n, "none", "U6")
+        flags[near], snr[near] = templates.flags, templates.snr
+        if self.bare:
+            # there is no PSF for points
+            kept = np.flatnonzero(templates.kind != "point")
+            near, templates = near[kept], templates[kept]
+        kinds[near] = templates.kind
+        rows = CatalogRows(
+            id=np.asarray(sources.id),
+            sky=sources.sky,
+            xy=place.xy,
+            near=near,
+            flags=flags,
+            template=kinds,
+            template_snr=snr,
+            fitted=templates.fitted,
+            reference=sources.flux,
+            double=None if sources.components is None else sources.components == 2,
+        )
+        return rows, templates
+
+    def _prior(self, image, highres, segmentation, catalog):
+        """High-resolution image, segments and catalog, detected where cutouts need what was not given."""
+        if highres is None and catalog is None:
+            raise argument_error("catalog", "given without a high-resolution image", "None")
+        if highres is not None:
+            highres = as_mosaic(highres, "highres")
+            if highres.wcs is None:
+                image_arrays(highres, "highres")
+            self._check_scale("highres", highres.wcs)
+        if catalog is not None:
+            # pixels of a catalog are those of the image it was made of
+            place = image if highres is None else highres
+            catalog = read_catalog(catalog, place.wcs, epoch_of(place))
+        if self.template in ("psf", "sersic") or highres is None:
+            return highres, segmentation, catalog
+        if segmentation is None:
+            return highres, *detected_prior(highres, catalog)
+        if catalog is not None and not isinstance(segmentation, (str, os.PathLike)):
+            # labels are those of the catalog, or by position
+            return highres, segmentation, catalog
+        if isinstance(segmentation, SegmentationImage):
+            segmentation = segmentation.data
+        return highres, *read_prior(highres, segmentation=segmentation, catalog=catalog)
+
+    def _templates(self, highres, segmentation, catalog):
+        """The templates that the settings ask for."""
+        if highres is None and segmentation is not None:
+            raise argument_error("highres", "the image that the segments belong to", "None")
+        for name, value in (("highres", highres), ("segmentation", segmentation)):
+            if value is None and self.template == "cutout":
+                raise argument_error(name, "given for cutouts", "None")
+        if self.template in ("psf", "sersic") or segmentation is None:
+            kind = "sersic" if self.template == "sersic" else "psf"
+            grid = None if highres is None else highres.wcs
+            found = SourceTemplates.from_catalog(catalog, template=kind, wcs=grid)
+            if self.template != "auto":
+                return found
+            flags = np.full(len(found), int(ForcedFlags.NO_SEGMENT))
+            return dataclasses.replace(found, flags=flags, meta={**found.meta, "template": "auto"})
+        return SourceTemplates.from_images(
+            highres, segmentation, catalog, psf=self.mean_kernel.source, template=self.template,
+            wings=self.wings, n_threads=self.n_threads,
+        )  # fmt: skip
+
+    def _check_scale(self, name, wcs):
+        scale = self.mean_kernel.pixel_scale.to_value(ANGLE)
+        have = pixel_scale(wcs)
+        wanted = f"on the kernel's pixels of {scale:.4g} arcsec"
+        check_that(not abs(have / scale - 1) > 0.01, name, wanted, f"{have:.4g} arcsec")
+
+    def _check_grid(self, templates):
+        """Refuse templates on other pixels than the kernel's, warn of those of another PSF."""
+        if templates.wcs is None:
+            return
+        self._check_scale("templates", templates.wcs)
+        if templates.psf is not None:
+            source = self.mean_kernel.source
+            peaks = templates.psf.max(), source.max() / source.sum()
+            if abs(peaks[0] / peaks[1] - 1) > 0.1:
+                msg = (
+                    f"the templates were made with a PSF whose peak holds {peaks[0]:.3g} of the light, the "
+                    f"kernel is from one whose peak holds {peaks[1]:.3g}: is it of the same image?"
+                )
+                warn(msg, PhotometryWarning)
+
+
+def _as_kernels(kernel):
+    """Kernel of an image, or those of exposures, of anything that stands for them."""
+    if isinstance(kernel, ExposureKernels):
+        return kernel
+    of_kernels = (MatchingKernel, KernelField)
+    if isinstance(kernel, (list, tuple)) and all(isinstance(each, of_kernels) for each in kernel):
+        return ExposureKernels(kernel)
+    return as_kernel(kernel)

@@ -1,0 +1,307 @@
+"""Offsets of an image against a catalog: source by source, and as a smooth map."""
+
+import dataclasses
+
+import numpy as np
+import scipy.optimize
+from astropy.table import QTable
+
+from miricigale.photometry._core.stamps import offset_sums
+from miricigale.photometry.fit.template_fit import TemplateFit
+from miricigale.photometry.images.fields import SmoothField, legendre_terms, n_terms
+from miricigale.photometry.images.flags import ForcedFlags
+from miricigale.utils.exceptions import PhotometryWarning, warn
+from miricigale.utils.parallel import chunks
+from miricigale.utils.units import ANGLE
+
+#: Least signal-to-noise of sources whose offsets are measured, largest light of others relative to
+#: their own, both below their template, and least number of sources for each term of the map.
+_BRIGHT, _ISOLATED, _SOURCES = 20.0, 0.2, 3
+
+#: Least error (pixels) of a measured offset, distance from the map in errors beyond
+#: which a source does not count, and change of the map (pixels) at which it is done.
+_FLOOR, _CLIP, _DONE = 0.01, 4.0, 5e-3
+
+#: How often sources are moved by their own offsets, and how far at most in rms widths of the PSF; offset of all,
+#: in full widths at half maximum, of which there is a warning.
+_SETTLED, _OWN, _NOTICED = 3, 0.3, 0.05
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class OffsetMap:
+    """
+    Where an image shows sources, less where the catalog has them.
+
+    Attributes
+    ----------
+    sources : `~astropy.table.QTable`
+        The sources it was measured on: ``id``, ``sky``, ``x_centroid``, ``y_centroid`` (pixels),
+        ``dx``, ``dy`` (arcsec along the image's axes), their error ``offset_err``, and ``used``,
+        False for those that are too far off.
+    field : `~miricigale.photometry.SmoothField`
+        (dx, dy) in arcsec.
+    wcs : `~astropy.wcs.WCS`
+        The image's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.table import QTable
+    >>> import astropy.units as u
+    >>> from miricigale.instrument import north_up_wcs
+    >>> from miricigale.photometry import OffsetMap, SmoothField
+    >>> sky = SkyCoord(53.1, -27.8, unit="deg")
+    >>> wcs = north_up_wcs(sky, 0.1 * u.arcsec, (101, 101))
+    >>> field = SmoothField(np.array([[0.02, -0.01], [0.005, 0], [0, 0]]), (101, 101), 1)
+    >>> offsets = OffsetMap(QTable({"used": [True]}), field, wcs)
+    >>> offsets.evaluate(sky).round(3)
+    <Quantity [ 0.02, -0.01] arcsec>
+    """
+
+    sources: QTable
+    field: SmoothField
+    wcs: object
+
+    def __repr__(self):
+        n = int(np.count_nonzero(self.sources["used"]))
+        return f"<OffsetMap of order {self.field.order}, {n} of {len(self.sources)} sources>"
+
+    def evaluate(self, sky):
+        """
+        Offsets at positions.
+
+        Parameters
+        ----------
+        sky : `~astropy.coordinates.SkyCoord`
+            Positions.
+
+        Returns
+        -------
+        offset : `~astropy.units.Quantity`, shape (..., 2)
+            (dx, dy) along the image's axes, in arcsec.
+        """
+        return self.field(*self.wcs.world_to_pixel(sky)) * ANGLE
+
+    def plot(self, ax=None, **kwargs):
+        """
+        Draw the measured offsets over those of the map, as arrows.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw.
+        **kwargs
+            Passed to `~miricigale.plotting.images.plot_offsets`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+        """
+        from miricigale.plotting.images import plot_offsets
+
+        table = self.sources
+        offset = np.stack([table["dx"].value, table["dy"].value], axis=1)
+        xy = np.stack([table["x_centroid"], table["y_centroid"]], axis=1)
+        return plot_offsets(xy, offset, self.field, used=np.asarray(table["used"]), ax=ax, **kwargs)
+
+
+def source_offsets(fit, residual, model, rows):
+    """
+    Measure the offsets of sources from their templates.
+
+    Parameters
+    ----------
+    fit : `~miricigale.photometry.fit.template_fit.TemplateFit`
+        The fit.
+    residual, model : `~numpy.ndarray`, shape (ny, nx)
+        What it left, and the model of all sources.
+    rows : int `~numpy.ndarray`, shape (k,), sorted
+        Rows of the bank that were fitted.
+
+    Returns
+    -------
+    step : `~numpy.ndarray`, shape (k, 2)
+        (dx, dy) in pixels; NaN where they cannot be measured.
+    error, others : `~numpy.ndarray`, shape (k,)
+        1 sigma along an axis, for white noise of the size of the residuals; light of others below the
+        template, over the template's own.
+
+    Notes
+    -----
+    The template times its flux and the derivatives of that by x and y are fitted to the residual within
+    two full widths at half maximum of the PSF. Derivatives are differences of neighboring pixels:
+    steps are right to some tens of percent, so that they must be repeated.
+    """
+    out = np.empty((len(rows), 18))
+    half = max(3, int(np.ceil(2 * 2.3548 * fit.psf_width)))
+    at = np.rint(fit.bank.xy[rows]).astype(int)
+    for block in fit.bank.blocks():
+        low, high = np.searchsorted(rows, [block.first, block.last])
+
+        def measure(part, block=block, low=low):
+            part = slice(low + part.start, low + part.stop)
+            own = rows[part] - block.first
+            light = block.values, block.box[own], block.start[own], fit.flux[rows[part]]
+            offset_sums(*light, at[part], half, model, residual, fit.inverse_sigma, out[part])
+
+        fit.bank.map(measure, chunks(high - low, 256))
+    products, (rest, seen) = out[:, :16].reshape(-1, 4, 4), out[:, 16:].T
+    scale = np.sqrt(products.diagonal(axis1=1, axis2=2))[:, :3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normal = products[:, :3, :3] / (scale[:, :, None] * scale[:, None])
+        normal[~(np.linalg.det(normal) > 1e-12)] = np.nan
+        inverse, found = np.linalg.inv(normal), products[:, :3, 3] / scale
+        step = np.einsum("kij,kj->ki", inverse, found)
+        left = np.maximum(products[:, 3, 3] - np.sum(step * found, axis=1), 0)
+        variance = np.mean((inverse.diagonal(axis1=1, axis2=2) / scale**2)[:, 1:], axis=1)
+        error = np.sqrt(variance * left / np.maximum(seen - 3, 1))
+        return (step / scale)[:, 1:], error, rest / scale[:, 0] ** 2
+
+
+def fit_offsets(arrays, bank, settings, catalog):
+    """
+    The `TemplateFit` of an image with templates at positions that follow a smooth map of offsets.
+
+    Where too few bright isolated sources are left, with one shift of the image, and a warning. Parameters
+    are those of `~miricigale.photometry.fit.fit_loop.fit_image`.
+    """
+    fit, moved = TemplateFit(arrays, bank, settings), 0.0
+    xy, limit = catalog.xy[catalog.near], settings.max_shift.value / fit.scale
+    for _ in range(6):
+        rows, offset, error = _bright_offsets(fit, catalog, moved)
+        good = np.hypot(*offset.T) < limit
+        order = settings.offset_order
+        while order >= 0 and np.count_nonzero(good) < _SOURCES * n_terms(order):
+            order -= 1
+        if order < 0:
+            _too_few(0, good, "one shift is fitted to all sources instead")
+            return TemplateFit(arrays, bank, settings, search=True)
+        member = fit.bank.order[rows]
+        field, used = _robust_field(xy[member], offset, error, good, arrays.flux.shape, order)
+        change = field(*xy.T) - moved
+        if np.abs(change).max(initial=0.0) < _DONE:
+            break
+        moved = moved + change
+        fit.bank.forget()
+        fit = TemplateFit(arrays, bank, settings, moved=moved)
+    if order < settings.offset_order:
+        _too_few(settings.offset_order, good, f"order {order} is taken")
+    near = catalog.near[member]
+    table = QTable({"id": catalog.id[near], "sky": catalog.sky[near]})
+    table["x_centroid"], table["y_centroid"] = xy[member].T
+    table["dx"], table["dy"] = offset.T * fit.scale * ANGLE
+    table["offset_err"] = error * fit.scale * ANGLE
+    table["used"] = used
+    in_arcsec = SmoothField(field.coefficients * fit.scale, field.shape, order)
+    fit.offset_map = OffsetMap(table, in_arcsec, arrays.wcs)
+    return fit
+
+
+def _too_few(order, good, instead):
+    """Warn of an offset map with fewer sources than it needs."""
+    needed = f"needs {_SOURCES * n_terms(order)} bright isolated sources within 'max_shift'"
+    msg = f"an offset map of order {order} {needed}, got {np.count_nonzero(good)}: {instead}"
+    warn(msg, PhotometryWarning)
+
+
+def settled(fit, bank, catalog):
+    """
+    A fit with bright isolated sources moved to where the image shows them.
+
+    Registration and colors move sources against each other by some milliarcseconds, which bright ones show. Each
+    goes by its own offset, as far as offsets scatter beyond their errors; nothing is done if they do not, or if
+    what all have in common is large enough for a warning: ``max_shift`` is for that.
+
+    Parameters
+    ----------
+    fit, bank
+        A `TemplateFit`, and the templates before they were moved.
+    catalog : `~miricigale.photometry.fit.result_table.CatalogRows`
+        The catalog; ``near`` lists the bank's sources.
+
+    Returns
+    -------
+    fit : `TemplateFit`
+        Its ``own``, (k, 2), are what each source was moved by (pixels), None if nothing was done.
+    """
+    xy, shape = catalog.xy[catalog.near], fit.arrays.flux.shape
+    common = np.array(fit.displacement(xy))
+    own, first = np.zeros_like(common), fit
+    for _ in range(_SETTLED):
+        rows, offset, error = _bright_offsets(fit, catalog, common + own)
+        found = offset - common[fit.bank.order[rows]]
+        # what is farther off is another source
+        good = np.hypot(*found.T) < _OWN * fit.psf_width
+        member, found, error = fit.bank.order[rows][good], found[good], error[good]
+        if len(member) <= _SOURCES:
+            break
+        order = max(k for k in range(4) if k == 0 or len(member) > _SOURCES**2 * n_terms(k))
+        smooth, _ = _robust_field(xy[member], found, error, good[good], shape, order)
+        smooth = smooth(*xy[member].T)
+        if np.abs(smooth).max() > _NOTICED * np.sqrt(8 * np.log(2)) * fit.psf_width:
+            break
+        # of two normal errors the median distance is 1.18
+        scatter = (np.median(np.hypot(*found.T)) / 1.1774) ** 2 - np.median(error) ** 2
+        if scatter <= _FLOOR**2:
+            break
+        new = np.zeros_like(own)
+        new[member] = found * (scatter / (scatter + error**2))[:, None]
+        change, own = np.abs(new - own).max(), new
+        fit = TemplateFit(
+            fit.arrays, bank, fit.settings, moved=common + own, like=fit.bank, search=False
+        )
+        fit.shift, fit.offset_map, fit.own = first.shift, first.offset_map, own
+        if change < _DONE:
+            break
+    if fit is not first and first.shift is not None:
+        fit.include_shift(first.shift)
+    return fit
+
+
+def _bright_offsets(fit, catalog, moved):
+    """Rows, offsets from the catalog (pixels) and errors of bright isolated sources."""
+    if not len(fit.rows):
+        return np.empty(0, int), np.empty((0, 2)), np.empty(0)
+    moved = np.broadcast_to(moved, (len(fit.bank.order), 2))
+    model = fit.model()
+    residual = fit.residual(model)
+    snr = np.zeros(len(fit.bank.order))
+    snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
+    source = catalog.near[fit.bank.order]
+    bad = int(ForcedFlags.SHARED_SEGMENT | ForcedFlags.NOISY_SEGMENT)
+    whole = (fit.light > 0.9).all(axis=1) & (catalog.flags[source] & bad == 0)
+    rows = np.flatnonzero(whole & ~fit.noisy & (snr > _BRIGHT))
+    step, error, others = source_offsets(fit, residual, model, rows)
+    with np.errstate(invalid="ignore"):
+        # where residuals are larger than the stated noise the latter overstates the significance
+        keep = np.isfinite(error) & (others < _ISOLATED) & (error < fit.psf_width / _BRIGHT * 2)
+    rows = rows[keep]
+    offset = moved[fit.bank.order[rows]] + step[keep]
+    return rows, offset, np.hypot(error[keep], _FLOOR)
+
+
+def _robust_field(xy, offset, error, good, shape, order):
+    """Polynomial through offsets that some of the sources do not follow, and which ones do."""
+    terms = np.stack(legendre_terms(*xy.T, shape, order), axis=-1)
+
+    def weighted(rows, total):
+        return terms[rows] / total[rows, None], offset[rows] / total[rows, None]
+
+    a, b = weighted(good, error)
+    start = np.linalg.lstsq(a, b)[0]
+
+    def misfit(flat):
+        return (a @ flat.reshape(start.shape) - b).ravel()
+
+    found = scipy.optimize.least_squares(misfit, start.ravel(), loss="soft_l1")
+    coefficients = found.x.reshape(start.shape)
+    for _ in range(5):
+        distance = np.hypot(*(offset - terms @ coefficients).T)
+        # galaxies differ from band to band: what scatters beyond the errors (of two normal
+        # errors the median distance is 1.18) is added to them
+        scatter = (np.median(distance[good]) / 1.1774) ** 2 - np.median(error[good]) ** 2
+        total = np.hypot(error, np.sqrt(max(scatter, 0.0)))
+        used = good & (distance < _CLIP * total)
+        coefficients = np.linalg.lstsq(*weighted(used, total))[0]
+    return SmoothField(coefficients, shape, order), used

@@ -1,0 +1,264 @@
+"""From a fit in the order of its templates to the result in the order of the catalog."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import scipy.sparse
+from astropy.coordinates import SkyCoord
+from astropy.nddata import StdDevUncertainty
+from astropy.table import QTable
+
+from miricigale.instrument.image import Image
+from miricigale.photometry.detection.residual_sources import unexplained_neighbors
+from miricigale.photometry.fit.diagnostics import canceling, source_flags
+from miricigale.photometry.fit.results import ForcedPhotometryResult, crowded
+from miricigale.photometry.fit.template_fit import fit_covariances
+from miricigale.photometry.images.fields import SmoothField
+from miricigale.photometry.images.flags import ForcedFlags
+from miricigale.utils.exceptions import PhotometryWarning, warn
+from miricigale.utils.meta import provenance
+from miricigale.utils.parallel import chunks
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
+
+#: Names of the errors of a flux after ``flux_err``: their sum, and its terms.
+_TERMS = ("", "_noise", "_template", "_psf")
+
+#: Least offset (pixels) that is warned of, with so many sources above so many sigma; relative error of templates.
+_OFFSET, _FEWEST, _BRIGHT, _TEMPLATE = 0.1, 5, 10.0, 0.1
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class CatalogRows:
+    """The sources of a catalog, as far as they are known before the fit."""
+
+    #: As in `~miricigale.photometry.ForcedPhotometryResult`, shape (n,).
+    id: np.ndarray
+    sky: SkyCoord
+    flags: np.ndarray
+    template: np.ndarray
+    template_snr: np.ndarray
+    xy: np.ndarray  # (n, 2): Positions on the image; NaN far outside.
+    near: np.ndarray  # (k,): The sources that have a template, in the order of the bank's sources.
+    fitted: np.ndarray  # (k,): What is known of the shapes of these.
+    #: Fluxes by which crowded sources are found; None for those that are measured.
+    reference: np.ndarray | None = None
+    #: Which sources have two components; None where their fits decide.
+    double: np.ndarray | None = None
+
+
+def package(fit, diagnostics, new_xy, catalog, meta):
+    """
+    Make the `ForcedPhotometryResult` of a fit.
+
+    ``fit``, ``diagnostics`` and ``new_xy``, (m, 2), are what `~miricigale.photometry.fit.fit_loop.fit_image`
+    returns, ``catalog`` are the `CatalogRows`, ``meta`` is provenance: the ``template``, and the
+    ``filter`` if that is known.
+    """
+    n, n_columns = len(catalog.sky), len(fit.columns)
+    n_all = n + len(new_xy)
+    # sources that were added have the last numbers, after second components
+    owner = np.full(len(fit.host), -1)
+    owner[: len(catalog.near)] = catalog.near
+    owner[len(owner) - len(new_xy) :] = np.arange(n, n_all)
+    place, main = owner[fit.host[fit.bank.order]], fit.main
+    common = np.full((n_columns, n_columns), np.nan)
+    blending = np.full(len(place), np.nan)
+    flux, flux_err = np.full(n_all, np.nan), np.full((4, n_all), np.nan)
+    chi2, left = np.full(n_all, np.nan), np.full(n_all, np.nan)
+    joint = scipy.sparse.csr_array((2 * n_all, 2 * n_all))
+    if len(fit.rows):
+        *covariances, common, blending[fit.rows] = fit_covariances(fit, diagnostics.correlation)
+        terms = [_by_source(one, place[fit.rows], main[fit.rows], n_all) for one in covariances]
+        joint = terms[0] + terms[1] + terms[2]
+        measured = fit.rows[main[fit.rows]]
+        flux[place[measured]] = fit.total[measured]
+        for error, one in zip(flux_err, (joint, *terms), strict=True):
+            error[place[measured]] = np.sqrt(np.maximum(one.diagonal()[place[measured]], 0.0))
+    flags, coverage = source_flags(fit, diagnostics, place, flux, blending)
+    flags[:n] |= catalog.flags
+    flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
+    xy = np.concatenate([catalog.xy, new_xy])
+    near = unexplained_neighbors(diagnostics.peaks, xy + fit.displacement(xy), flux)
+    flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    seen = np.full(n_all, np.nan)
+    seen[place[main]] = diagnostics.seen[main]
+    flags[canceling(flux, flux_err[0], seen)] |= int(ForcedFlags.CANCELING)
+    chi2[place[main]] = diagnostics.chi2[main]
+    left[place[main]] = diagnostics.residual_fraction[main]
+    columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage, "chi2": chi2}
+    columns["residual_fraction"] = left
+    for name, error in zip(_TERMS, flux_err, strict=True):
+        columns[f"flux_err{name}"] = error * FNU
+    new = None
+    if fit.settings.second_pass or len(new_xy):
+        names = ("flux", "flux_err", "flags", "coverage", "chi2")
+        rows = {name: columns[name][n:] for name in names}
+        new = new_source_table(catalog, new_xy, fit.arrays.wcs, rows)
+    reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
+    return ForcedPhotometryResult(
+        id=np.array(catalog.id),
+        sky=catalog.sky,
+        **{name: values[:n] for name, values in columns.items()},
+        covariance=joint[:n, :n],
+        template=catalog.template,
+        template_snr=catalog.template_snr,
+        crowded=crowded(catalog.sky, reference),
+        x=catalog.xy[:, 0].copy(),
+        y=catalog.xy[:, 1].copy(),
+        noise_correlation=diagnostics.correlation,
+        new_sources=new,
+        psf_fwhm=np.sqrt(8 * np.log(2)) * fit.psf_width * fit.scale * ANGLE,
+        meta=provenance(
+            **meta,
+            pixel_scale=round(fit.scale, 6),
+            correlated_noise=diagnostics.correlation is not None,
+            measured_noise=fit.arrays.measured_noise,
+            **_registration(fit, diagnostics, common, np.sum(flux > _BRIGHT * flux_err[0])),
+            **({} if fit.evidence is None else {"second_pass": fit.evidence}),
+        ),
+        **_components(fit, catalog, joint, place, n_all),
+        **_common(fit, common),
+        **_images(fit, diagnostics, {k: v for k, v in meta.items() if k == "filter"}),
+    )
+
+
+def _registration(fit, diagnostics, common, n_bright):
+    """
+    How far the image lies from the prior, and the error of that, arcsec along x and y: for the meta dictionary.
+
+    The shift that was fitted, the mean of the sources of a map, or else what the residuals show, to first order:
+    then the error is the jackknife's over strips of rows, which has errors of single templates in it, and there
+    is a warning of what a fitted shift would have mended, if sources are bright.
+    """
+    if fit.shift is not None:
+        return _offset_meta(fit.shift, _common_errors(fit, common, "shift") * fit.scale)
+    if fit.offset_map is not None:
+        table = fit.offset_map.sources[fit.offset_map.sources["used"]]
+        values = np.stack([table["dx"].value, table["dy"].value])
+        return _offset_meta(values.mean(axis=1), values.std(axis=1) / np.sqrt(len(table)))
+    model, sums = diagnostics.model, []
+    for part in chunks(len(model), int(np.clip(len(model) // 16, 4, 256))):
+        # a row more on both sides for the gradient
+        first, last = max(part.start - 1, 0), min(part.stop + 1, len(model))
+        own, weight = slice(part.start - first, part.stop - first), fit.inverse_sigma[part]
+        # templates have errors too: the brightest shall not decide alone
+        weight = weight / np.hypot(1.0, _TEMPLATE * model[part] * weight)
+        columns = [-one[own] * weight for one in np.gradient(model[first:last])[::-1]]
+        columns = np.stack([*columns, diagnostics.residual[part] * weight]).reshape(3, -1)
+        sums.append(columns @ columns.T)
+    sums = np.array(sums, float)
+    # of all strips, and of all but each
+    every = np.concatenate([[sums.sum(axis=0)], sums.sum(axis=0) - sums])
+    normal = every[:, :2, :2]
+    if np.linalg.det(normal).min() <= 0:
+        return {}
+    found = np.linalg.solve(normal, every[:, :2, 2:])[..., 0]
+    offset, without = found[0], found[1:]
+    error = np.sqrt((len(sums) - 1) * np.var(without, axis=0))
+    far = np.any((np.abs(offset) > _OFFSET) & (np.abs(offset) > 3 * error)) and n_bright >= _FEWEST
+    # a shift that was asked for and is too large has a warning of its own
+    if far and fit.settings.max_shift is None:
+        x, y = offset * fit.scale
+        msg = f"the image lies about {x:+.3f}, {y:+.3f} arcsec (x, y) from its templates: 'max_shift' fits that"
+        warn(msg, PhotometryWarning)
+    return _offset_meta(offset * fit.scale, error * fit.scale)
+
+
+def _offset_meta(offset, error):
+    """Offset and error in arcsec as plain values."""
+    return {"offset": offset.round(5).tolist(), "offset_err": error.round(5).tolist()}
+
+
+def _by_source(covariance, place, main, n):
+    """Covariance of sources' total fluxes, and after them of their second components, (2 n, 2 n)."""
+    k = np.arange(len(place))
+    rows = np.concatenate([place, n + place[~main]])
+    gather = scipy.sparse.coo_array(
+        (np.ones(len(rows)), (rows, np.concatenate([k, k[~main]]))), shape=(2 * n, len(k))
+    ).tocsr()
+    found = (gather @ covariance @ gather.T).tocsr()
+    found.sort_indices()
+    return found
+
+
+def _components(fit, catalog, joint, place, n_all):
+    """Fluxes of points on top of templates, if any were asked for."""
+    if catalog.double is None and fit.settings.components == 1:
+        return {}
+    n = len(catalog.sky)
+    flux, error = np.full(n, np.nan), np.full(n, np.nan)
+    second = fit.pairs[:, 1]
+    flux[place[second]] = fit.flux[second]
+    error[place[second]] = np.sqrt(joint.diagonal()[n_all + place[second]])
+    keep = np.concatenate([np.arange(n), n_all + np.arange(n)])
+    return {
+        "flux_point": flux * FNU,
+        "flux_point_err": error * FNU,
+        "joint_covariance": joint[keep][:, keep],
+    }
+
+
+def new_ids(ids, n):
+    """Ids of ``n`` sources, (n,), that are not among ``ids``, and of their kind."""
+    if ids.dtype.kind in "iu":
+        return int(ids.max(initial=0)) + 1 + np.arange(n)
+    known = set(ids.tolist())
+    names = (f"new-{k}" for k in itertools.count(1))
+    new = list(itertools.islice((name for name in names if name not in known), n))
+    return np.array(new) if n else ids[:0]
+
+
+def new_source_table(catalog, xy, wcs, columns):
+    """Table of sources at pixels (x, y), (m, 2), that a catalog (`CatalogRows`) lacks, with their columns."""
+    table = QTable({"id": new_ids(np.asarray(catalog.id), len(xy))})
+    table["sky"] = wcs.pixel_to_world(*xy.T).transform_to(catalog.sky.frame)
+    table["x_centroid"], table["y_centroid"] = xy.T
+    for name, values in columns.items():
+        table[name] = values
+    table["snr"] = (table["flux"] / table["flux_err"]).value
+    return table
+
+
+def _common(fit, covariance):
+    """Parameters of the whole image with their errors."""
+    found = {}
+    order, shape = fit.settings.background_order, fit.arrays.flux.shape
+    if order is not None and fit.fit is not None:
+        terms = fit.common[fit.places["background"]]
+        errors = _common_errors(fit, covariance, "background")
+        found["background"] = terms[0] * SURFACE_BRIGHTNESS
+        found["background_err"] = errors[0] * SURFACE_BRIGHTNESS
+        found["background_field"] = SmoothField(terms, shape, order)
+    if fit.shift is not None:
+        found["shift"] = fit.shift * ANGLE
+        found["shift_err"] = _common_errors(fit, covariance, "shift") * fit.scale * ANGLE
+    if fit.offset_map is not None:
+        found["offset_map"] = fit.offset_map
+    return found
+
+
+def _common_errors(fit, covariance, name):
+    """Errors of the common parameters of a name."""
+    return np.sqrt(np.diag(covariance)[fit.places[name]])
+
+
+def _images(fit, diagnostics, meta):
+    arrays = fit.arrays
+    # images can be large: what the fit needs no longer becomes the result
+    model, residual = diagnostics.model, diagnostics.residual
+    fit.add_background(model)
+    sigma, area = arrays.inverse_sigma, arrays.areas(out=arrays.flux)
+    for image in (residual, sigma):
+        image[~arrays.usable] = np.nan
+    np.divide(1, sigma, out=sigma)
+    for image in (model, residual, sigma):
+        image /= area
+    options = {"unit": SURFACE_BRIGHTNESS, "wcs": arrays.wcs}
+    return {
+        "model_image": Image(model, meta=dict(meta), **options),
+        "residual_image": Image(
+            residual, mask=~arrays.usable, uncertainty=StdDevUncertainty(sigma, copy=False),
+            meta=dict(meta), **options,
+        ),
+    }  # fmt: skip

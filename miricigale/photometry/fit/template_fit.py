@@ -1,0 +1,391 @@
+"""The fit of one image: all templates at once, with what they have in common."""
+
+import numpy as np
+import scipy.sparse
+from scipy.signal import oaconvolve
+
+from miricigale.photometry._core.stamps import add_model
+from miricigale.photometry.images.arrays import pixel_scale
+from miricigale.photometry.images.fields import legendre_terms
+from miricigale.photometry.shapes.shapes import not_fitted
+from miricigale.photometry.templates.free_templates import free_templates
+from miricigale.photometry.templates.normal_equations import (
+    LinearFit,
+    normal_matrix,
+    sandwich_matrix,
+)
+from miricigale.utils.exceptions import PhotometryWarning, warn
+from miricigale.utils.parallel import chunks
+from miricigale.utils.units import ANGLE
+
+#: Size of the covariance's blocks and of the margin around them, arcsec.
+BLOCK_CORE = 18.0
+BLOCK_HALO = 6.0
+
+
+def fit_covariances(fit, correlation):
+    """
+    Covariances of a `TemplateFit`, with the correlation of the noise; None if that is white.
+
+    Returns
+    -------
+    noise, template, psf : `~scipy.sparse.csr_array`, shape (n, n)
+        Of the fitted rows: by the image's noise, by what is not known of the templates, and by the PSF, whose
+        errors go together.
+    common : `~numpy.ndarray`, shape (g, g)
+        Of the common parameters.
+    blending : `~numpy.ndarray`, shape (n,)
+        Formal error over that of the source alone.
+    """
+    n, g, plain, free = len(fit.rows), len(fit.columns), fit.fit, fit.free
+    solution, xy = plain, fit.bank.xy[fit.rows]
+    fillings = [None if correlation is None else _sandwich(fit, correlation)]
+    if free is not None:
+        solution, xy = free.fit, np.concatenate([xy, free.xy])
+        if correlation is None:
+            white = (solution.matrix - scipy.sparse.diags_array(free.prior)).tocsr()
+            fillings = [(white, solution.border, solution.corner)]
+        nothing = np.zeros((len(solution.rhs), g)), np.zeros((g, g))
+        fillings.append((free.filling(plain.matrix), *nothing))
+    coo = plain.matrix.tocoo()
+    pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=solution.matrix.shape)
+    found, blending = solution.covariances(
+        xy, fillings, core=BLOCK_CORE / fit.scale, halo=BLOCK_HALO / fit.scale, pattern=pattern
+    )
+    noise, common = found[0]
+    noise, blending = noise[:n][:, :n], blending[:n]
+    template = scipy.sparse.csr_array((n, n))
+    if free is not None:
+        blending = blending * np.sqrt(free.alone())
+        template, more = found[1]
+        template, common = template[:n][:, :n], common + more
+    if len(fit.pairs):
+        # that of the sum of two components
+        first, second = np.searchsorted(fit.rows, fit.pairs.T)
+        filling = plain.matrix if fillings[0] is None else fillings[0][0]
+        alone = np.sqrt(filling.diagonal()[:n]) / plain.matrix.diagonal()
+        both = np.array([noise[i, j] for i, j in zip(first, second, strict=True)])
+        variance = noise.diagonal()
+        blending[first] = np.sqrt(variance[first] + variance[second] + 2 * both) / alone[first]
+        blending[second] = blending[first]
+    parts = fit.bank.parts(np.arange(len(fit.flux)))
+    image = np.array([one is not None and one.kind == "cutout" for one in parts], bool)
+    coo, error = noise.tocoo(), psf_errors(fit, image)[fit.rows]
+    data = error[coo.row] * error[coo.col]
+    psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
+    return noise, template, psf, common, blending
+
+
+def psf_errors(fit, image):
+    """Errors of the fluxes of all rows by that of the PSF; ``image``, (n,), says whose template is one."""
+    settings, kernel = fit.settings.errors, fit.settings.mean_kernel
+    fraction = settings.psf_error
+    if fraction is None:
+        if settings.size_scatter is None:
+            return np.zeros(len(fit.flux))
+        fraction = image * np.max(np.abs(kernel.encircled_energy_error()))
+    point = np.sum(kernel.target**2) * (fit.scale / kernel.pixel_scale.to_value(ANGLE)) ** 2
+    return fraction * np.minimum(fit.power / point, 1.0) * np.abs(fit.flux)
+
+
+def _sandwich(fit, correlation):
+    """What correlated noise does to the right-hand side: matrix, border and corner."""
+    keep = fit.rows
+    white = [fit.arrays.whitened(column) for column in fit.columns]
+    spread = [_spread(fit, image, correlation) for image in white]
+    middle, border = sandwich_matrix(fit.bank, fit.inverse_sigma, correlation, spread)
+    middle, border = middle[keep][:, keep], border[keep]
+    if fit.free is not None:
+        middle, border = fit.free.sandwich(fit, correlation, middle, border, spread)
+    corner = np.array([[inner(a, b) for b in spread] for a in white])
+    return middle, border, corner.reshape(len(white), len(white))
+
+
+def _spread(fit, image, correlation):
+    """An image convolved with the noise correlation."""
+    kernel, lag = correlation.astype(image.dtype), correlation.shape[0] // 2
+    out = fit.arrays.new()
+
+    def convolve(part):
+        rows = slice(max(part.start - lag, 0), part.stop + lag)
+        found = oaconvolve(image[rows], kernel, mode="same")
+        out[part] = found[part.start - rows.start :][: part.stop - part.start]
+
+    fit.bank.map(convolve, chunks(len(image), 512))
+    return out
+
+
+#: Squared cosine between two components from which their sum alone is measured: errors of each are then
+#: ten times that of the sum, and the difference is that of a template that is a few percent wrong.
+_SEPARABLE = 0.99
+
+#: Least part of a template's light on usable pixels: sources with less are not measured.
+MIN_COVERAGE = 0.05
+
+
+class TemplateFit:
+    """
+    Least-squares fluxes of all templates of an image.
+
+    Parameters
+    ----------
+    arrays : `~miricigale.photometry.images.arrays.FitArrays`
+        The image.
+    bank : `~miricigale.photometry.templates.templates.TemplateBank`
+        The templates of the sources on or near it.
+    settings : `~miricigale.photometry.ForcedPhotometer`
+        How they are fitted.
+    host : int `~numpy.ndarray`, shape (n,), optional
+        For each source of the bank the one whose component it is: a second component has the
+        number of that source, all others have their own.
+    moved : `~numpy.ndarray`, shape (2,) or (n, 2), optional
+        Pixels by which templates are moved; a shift that is fitted is searched from there.
+    like : `~miricigale.photometry.templates.templates.TemplateBank`, optional
+        A bank whose templates are taken where they are the same; it forgets its own.
+    search : bool, optional
+        Whether one shift of the image is fitted; if the settings ask for one by default.
+
+    Attributes
+    ----------
+    scale : float
+        Arcsec per pixel.
+    bank, fit, free
+        The templates where they were fitted; the solution (`LinearFit`, None without rows); that with
+        templates that may change (`FreeTemplates` or None), whose fluxes are ``flux`` then.
+    flux : `~numpy.ndarray`, shape (n,)
+        uJy, in the order of the bank's rows as all that follows; zero where not fitted.
+    rows : int `~numpy.ndarray`
+        Rows that were fitted.
+    degenerate, noisy, inseparable : bool `~numpy.ndarray`, shape (n,)
+        Templates that equal another's; those whose power is mostly noise; second components that
+        cannot be distinguished from the first.
+    pairs : int `~numpy.ndarray`, shape (k, 2)
+        Rows of the two components of the sources that have two.
+    power, light : `~numpy.ndarray`, shape (n,) and (n, 2)
+        Sums of squares of the templates; their fractions on the image, and on its usable pixels.
+    columns : list of `~numpy.ndarray`
+        The common parameters' images.
+    places : dict of str to slice
+        Where common parameters stand among ``columns`` and ``common``, by name: ``"background"`` and, where it is
+        fitted, ``"shift"`` (x and y).
+    shift, offset_map
+        In arcsec, shape (2,), and the `OffsetMap` by which templates are moved; None without.
+    evidence
+        For a second pass (dict), where that was asked for; None otherwise.
+    own : `~numpy.ndarray`, shape (n, 2)
+        Pixels by which each source of the bank is moved beyond that; None without.
+    """
+
+    def __init__(self, arrays, bank, settings, *, host=None, moved=None, like=None, search=None):
+        self.arrays, self.settings = arrays, settings
+        self.host = np.arange(len(bank.order)) if host is None else host
+        self.scale = pixel_scale(arrays.wcs)
+        self.inverse_sigma = arrays.inverse_sigma
+        self._background = (
+            self._background_columns() if settings.background_order is not None else []
+        )
+        self.shift = self.offset_map = self.free = self.own = self.evidence = None
+        moved = np.zeros(2) if moved is None else moved
+        self.bank = bank.shifted(moved) if np.any(moved) else bank
+        if like is not None:
+            self.bank.reuse(like)
+        self._solve(self.bank, [])
+        if search is None:
+            search = settings.max_shift is not None and settings.offset_order is None
+        if search and len(self.rows):
+            self._find_shift(bank, moved)
+
+    def _background_columns(self):
+        area, order = self.arrays.areas(), self.settings.background_order
+        if order == 0:
+            return [area]
+        y, x = np.ogrid[: area.shape[0], : area.shape[1]]
+        terms = legendre_terms(x, y, area.shape, order)
+        return [
+            np.multiply(area, term, out=self.arrays.new(), casting="same_kind") for term in terms
+        ]
+
+    def _solve(self, bank, gradients):
+        """Fit fluxes and common parameters with the templates of a bank."""
+        if bank is not self.bank:
+            self.bank.forget()
+        self.bank = bank
+        self.columns = list(self._background)
+        self.places = {"background": slice(0, len(self.columns))}
+        if gradients:
+            self.places["shift"] = slice(len(self.columns), len(self.columns) + len(gradients))
+            self.columns += gradients
+        white = [self.arrays.whitened(column) for column in self.columns]
+        data = self.arrays.whitened(self.arrays.flux)
+        matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
+        self.light, self.power = light / bank.full_light()[:, None], power
+        diagonal = matrix.diagonal()
+        rows = (self.light[:, 1] >= MIN_COVERAGE) & (diagonal > 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            excess = bank.noise_terms() / np.where(power > 0, power, np.inf)
+        self.noisy = excess > 0.5
+        correction = scipy.sparse.diags_array(np.minimum(excess, 0.5) * diagonal)
+        self.degenerate = duplicates(matrix, rows, bank.order)
+        matrix = (matrix - correction).tocsr()
+        self._find_pairs(matrix, rows & ~self.degenerate)
+        self.rows = np.flatnonzero(rows & ~self.degenerate & ~self.inseparable)
+        matrix = matrix[self.rows][:, self.rows]
+        g = len(white)
+        corner = np.array([[inner(a, b) for b in white] for a in white]).reshape(g, g)
+        corner_rhs = np.array([inner(a, data) for a in white])
+        self.fit, self.flux = None, np.zeros(len(bank.order))
+        if len(self.rows):
+            rhs, border = projection[self.rows, 0], projection[self.rows, 1:]
+            self.fit = LinearFit(matrix, rhs, border, corner, corner_rhs)
+            self.flux[self.rows] = self.fit.flux
+
+    def free_templates(self, fitted):
+        """
+        Let templates change as far as they are not known, and fit once more.
+
+        ``fitted`` (`~miricigale.photometry.shapes.shapes.FITTED`, (k,)) is what is known of the bank's first
+        sources;
+        those after them are points.
+        """
+        if self.fit is None or self.settings.errors.size_scatter is None:
+            return
+        known = not_fitted(len(self.bank.order))
+        known[: len(fitted)] = fitted
+        # a point on top of a template leaves open how it is shaped, not whether it is a point
+        hosts = self.host[self.bank.order[self.pairs[:, 1]]]
+        known["point"][hosts] = 0.0
+        # positions move no flux to first order, unless there are two components
+        lone = np.setdiff1d(np.arange(len(known)), hosts)
+        known["covariance"][lone, 1:3] = 0.0
+        known["covariance"][lone, :, 1:3] = 0.0
+        self.free = free_templates(self, known[self.bank.order[self.rows]])
+        if self.free is not None:
+            self.flux[self.rows] = self.free.flux
+
+    def _find_pairs(self, matrix, rows):
+        """Find the second components that can be fitted together with the first."""
+        order = self.bank.order
+        row = np.argsort(order)
+        second = np.flatnonzero(self.host[order] != order)
+        first = row[self.host[order[second]]]
+        power = matrix.diagonal()
+        overlap = np.array([matrix[i, j] for i, j in zip(first, second, strict=True)])
+        apart = overlap**2 < _SEPARABLE * power[first] * power[second]
+        apart &= rows[first] & rows[second]
+        self.inseparable = np.zeros(len(order), bool)
+        self.inseparable[second[~apart]] = True
+        self.degenerate[second] = False
+        self.pairs = np.stack([first, second], axis=1)[apart]
+
+    def _find_shift(self, plain, shift):
+        limit = self.settings.max_shift.value / self.scale
+        for _ in range(8):
+            step = self._fit_step(plain.shifted(shift))
+            found = shift + step
+            if np.hypot(*found) > limit:
+                msg = (
+                    f"a shift of {np.round(found * self.scale, 3)} arcsec is beyond 'max_shift' "
+                    f"{self.settings.max_shift}: measured without a shift"
+                )
+                warn(msg, PhotometryWarning)
+                self._solve(plain, [])
+                return
+            if np.hypot(*step) < 1e-3:
+                break
+            shift = shift + np.clip(step, -1.0, 1.0)
+        self.shift = found * self.scale
+
+    def _fit_step(self, bank):
+        """Fit with the templates of a bank and a small step of all of them: the step (x, y) in pixels."""
+        dy, dx = np.gradient(self.model())
+        self._solve(bank, [-dx, -dy])
+        return self.fit.common[self.places["shift"]]
+
+    def include_shift(self, shift):
+        """
+        Fit once more with a shift about the one that the templates have, so that it has an error.
+
+        Parameters
+        ----------
+        shift : `~numpy.ndarray`, shape (2,)
+            Arcsec (x, y) by which the templates were moved.
+        """
+        if self.fit is not None:
+            self.shift = shift + self._fit_step(self.bank) * self.scale
+
+    def displacement(self, xy):
+        """Positions of templates less those of the catalog, (x, y) in pixels."""
+        if self.offset_map is not None:
+            return self.offset_map.field(*xy.T) / self.scale
+        shift = np.zeros(2) if self.shift is None else self.shift / self.scale
+        return np.broadcast_to(shift, xy.shape)
+
+    @property
+    def main(self):
+        """Which rows are no second components, shape (n,)."""
+        return self.host[self.bank.order] == self.bank.order
+
+    @property
+    def total(self):
+        """Flux of each row, that of both components where there are two."""
+        total = self.flux.copy()
+        first, second = self.pairs.T
+        total[first] += self.flux[second]
+        return total
+
+    @property
+    def psf_width(self):
+        """Rms width in pixels of a Gaussian as peaked as the image's PSF."""
+        target = self.settings.mean_kernel.target
+        fine = self.settings.mean_kernel.pixel_scale.to_value(ANGLE)
+        return np.sqrt(target.sum() / (2 * np.pi * target.max())) * fine / self.scale
+
+    @property
+    def common(self):
+        """The common parameters, shape (g,)."""
+        return (self.fit if self.free is None else self.free.fit).common
+
+    def add_background(self, image, factor=1.0):
+        """Add the fitted background, in uJy per pixel, times a factor to an image in place."""
+        if self.fit is None:
+            return
+        values = self.common[self.places["background"]]
+        for column, value in zip(self._background, values, strict=True):
+            image += np.float32(factor * value) * column
+
+    def model(self):
+        """The sources' model in uJy per pixel, without background."""
+        image = self.arrays.new()
+        layers = [(self.bank, self.flux)]
+        if self.free is not None:
+            flux = np.zeros(len(self.flux))
+            flux[self.rows], change = self.free.amplitudes
+            layers = [(self.bank, flux), (self.free.bank, change)]
+        for bank, flux in layers:
+            for block in bank.blocks():
+                part = flux[block.first : block.last]
+                add_model(image, block.values, block.box, block.start, part)
+        return image
+
+    def residual(self, model):
+        """Image less a model of its sources and less the background, zero where not usable."""
+        found = np.subtract(self.arrays.flux, model, out=self.arrays.new())
+        self.add_background(found, -1.0)
+        found *= self.arrays.usable
+        return found
+
+
+def inner(one, other):
+    """Sum of the products of two images, in double precision."""
+    return float(np.einsum("ij,ij->", one, other, dtype=float, casting="same_kind"))
+
+
+def duplicates(matrix, rows, order):
+    """Templates that equal another one's; the first in the catalog is kept."""
+    coo = matrix.tocoo()
+    scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
+    same = coo.data > (1 - 1e-6) * scale[coo.row] * scale[coo.col]
+    same &= rows[coo.row] & rows[coo.col] & (order[coo.row] > order[coo.col])
+    found = np.zeros(len(rows), bool)
+    found[coo.row[same]] = True
+    return found

@@ -1,0 +1,1 @@
+"""Images and mosaics that are measured: files, grids, noise, flags."""

@@ -1,0 +1,219 @@
+"""From images with units and coordinates to the plain arrays that photometry works on."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.stats import mad_std
+from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
+
+from miricigale.instrument import ImageFacts, north_up_wcs, pixel_area_map
+from miricigale.photometry.images.sky_noise import mask_filled
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
+from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, to_array
+
+#: uJy per MJy.
+_MICRO = 1e12
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImageArrays:
+    """An image as arrays of flux per pixel."""
+
+    #: (ny, nx): Data and noise in uJy per pixel; zero and infinite where not usable.
+    flux: np.ndarray
+    sigma: np.ndarray
+    usable: np.ndarray  # (ny, nx): False where masked, not finite or without noise.
+    area: np.ndarray  # (ny, nx): uJy per MJy/sr: the solid angle of each pixel.
+    wcs: object  # The image's coordinates.
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FitArrays:
+    """An image as templates are fitted to it, in single precision: images can be large."""
+
+    flux: np.ndarray  # (ny, nx): Data in uJy per pixel, zero where not usable.
+    inverse_sigma: np.ndarray  # (ny, nx): Inverse of the noise, zero where not usable.
+    #: As for `ImageArrays`.
+    usable: np.ndarray
+    wcs: object
+    measured_noise: bool  # Whether the noise was measured on the image for want of an uncertainty.
+    noise_correction: float = 1.0  # As the image states it (`ImageFacts`).
+
+    def new(self, dtype=np.float32):
+        """A new image of zeros."""
+        return np.zeros(self.usable.shape, dtype)
+
+    def areas(self, out=None):
+        """The ``area`` of `ImageArrays`, made anew."""
+        return _areas(self.wcs, self.new() if out is None else out)
+
+    def whitened(self, image):
+        """An image over the noise, zero where not usable."""
+        return np.multiply(image, self.inverse_sigma, out=self.new())
+
+
+def _areas(wcs, out):
+    area = pixel_area_map(wcs, out.shape, out=out)
+    area *= _MICRO
+    return area
+
+
+def image_arrays(image, name, dtype=float):
+    """
+    Take a `~astropy.nddata.CCDData` apart.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        Two-dimensional, in units of surface brightness or of the flux in a pixel, with a celestial WCS.
+        Without an uncertainty the noise is 1.4826 times the median absolute deviation of the image.
+    name : str
+        The argument's name, for messages.
+    dtype : type, optional
+        That of the arrays; single precision for large images.
+
+    Returns
+    -------
+    arrays : `ImageArrays`
+
+    Raises
+    ------
+    TypeError
+        If it is no CCDData.
+    ValueError
+        If it is not two-dimensional or has no celestial WCS or no usable pixel.
+    `~astropy.units.UnitsError`
+        If the unit is neither of surface brightness nor of flux density.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.PhotometryWarning`
+        If areas that are exactly 0 are taken as without data.
+    """
+    *given, usable = _checked(image, name)
+    area = _areas(image.wcs, np.empty(usable.shape, dtype))
+    # in place, for images can be large
+    flux, sigma = (np.multiply(*one, dtype=dtype, casting="same_kind") for one in given)
+    # a surface brightness, and not the flux in each pixel
+    if not image.unit.is_equivalent(FNU):
+        flux *= area
+        sigma *= area
+    flux[~usable], sigma[~usable] = 0.0, np.inf
+    return ImageArrays(flux, sigma, usable, area, image.wcs)
+
+
+def fit_arrays(image, name):
+    """Take a `~astropy.nddata.CCDData` apart for a fit of templates; see `image_arrays`."""
+    one = image_arrays(image, name, np.float32)
+    inverse = np.divide(np.float32(1), one.sigma, out=one.sigma)
+    facts = image.uncertainty is None, ImageFacts.of(image).noise_correction
+    return FitArrays(one.flux, inverse, one.usable, one.wcs, *facts)
+
+
+def _checked(image, name):
+    """Data and noise, each with its factor to MJy/sr or to uJy in a pixel, and which pixels are usable."""
+    if not isinstance(image, CCDData):
+        msg = f"'{name}' must be a CCDData, got {type(image).__name__}"
+        raise TypeError(msg)
+    data = np.asarray(image.data)
+    check_that(data.ndim == 2, name, "a two-dimensional image", f"shape {data.shape}")
+    if image.wcs is None or not image.wcs.has_celestial:
+        raise argument_error(name, "an image with a celestial WCS", "one without")
+    unit = FNU if image.unit.is_equivalent(FNU) else SURFACE_BRIGHTNESS
+    factor = float(to_array(1 * image.unit, unit, name))
+    usable = np.isfinite(data)
+    if image.mask is not None:
+        usable &= ~np.asarray(image.mask, bool)
+    if image.uncertainty is None:
+        spread = mad_std(np.asarray(data[usable], float)) if usable.any() else 0.0
+        noise = np.broadcast_to(np.float64(spread), data.shape), factor
+    else:
+        # which takes the size of what is below 0
+        negative = np.count_nonzero(np.asarray(image.uncertainty.array)[usable] < 0)
+        wanted = "an image with uncertainties of 0 (no data) or more"
+        check_that(not negative, name, wanted, f"{negative} pixels below 0")
+        given = image.uncertainty.represent_as(StdDevUncertainty)
+        scale = factor if given.unit is None else (1 * given.unit).to_value(unit)
+        noise = np.asarray(given.array), float(scale)
+    usable &= np.isfinite(noise[0]) & (noise[0] > 0)
+    mask_filled(data, usable, f"'{name}'")
+    check_that(usable.any(), name, "an image with usable pixels", "none (masked, NaN or no noise)")
+    return (data, factor), noise, usable
+
+
+def pixel_scale(wcs):
+    """Mean pixel scale of a WCS at its reference, in arcsec."""
+    return float(np.sqrt(np.prod(proj_plane_pixel_scales(wcs.celestial))) * 3600.0)
+
+
+def same_grid(one, other):
+    """Whether two WCSs put a square of pixels at the same places (to 1e-3 pixel)."""
+    x, y = np.array([0.0, 1000.0, 0.0, 1000.0]), np.array([0.0, 0.0, 1000.0, 1000.0])
+    found = other.world_to_pixel(one.pixel_to_world(x, y))
+    return bool(np.all(np.abs(np.array(found) - [x, y]) < 1e-3))
+
+
+def fine_wcs(image_wcs, shape, scale):
+    """North-up grid of pixels of ``scale`` arcsec about the middle of an image."""
+    middle = image_wcs.pixel_to_world((shape[1] - 1) / 2, (shape[0] - 1) / 2).icrs
+    return north_up_wcs(middle, scale * u.arcsec, (1, 1))
+
+
+def sky_pixels(sky, wcs, shape, margin):
+    """
+    Pixels (x, y) of those coordinates that are on or near an image, shape (n, 2).
+
+    NaN for positions outside of the image, of a shape, and of a rim of ``margin`` pixels.
+    """
+    xy = np.full((len(sky), 2), np.nan)
+    ny, nx = shape
+    middle = wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2)
+    radius = 1.05 * (np.hypot(nx, ny) / 2 + margin) * pixel_scale(wcs)
+    near = sky.separation(middle).arcsec < radius
+    if near.any():
+        xy[near] = np.stack(wcs.world_to_pixel(sky[near]), axis=-1)
+    low = -0.5 - margin
+    x, y = xy.T
+    # a NaN fails every comparison
+    inside = (x > low) & (x < nx - 1 - low) & (y > low) & (y < ny - 1 - low)
+    xy[~inside] = np.nan
+    return xy
+
+
+def nearest_values(plane, xy):
+    """Values of a plane at the nearest pixels, (n, 2) (0 outside), and whether a position is on it."""
+    ny, nx = plane.shape
+    column, row = np.rint(np.where(np.isfinite(xy), xy, -1.0)).astype(int).T
+    inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
+    values = np.zeros(len(xy), plane.dtype)
+    values[inside] = plane[row[inside], column[inside]]
+    return values, inside
+
+
+def local_maps(xy, half, image_wcs, grid_wcs):
+    """
+    Quadratic maps from pixel offsets on an image to positions on a finer grid, shape (n, 2, 6).
+
+    Coefficients of 1, u, v, u^2, u v, v^2 for x and y on the grid. They expand about the image positions
+    ``xy``, (n, 2), and are exact at offsets of ``half`` pixels, (n,).
+    """
+    step = np.maximum(np.asarray(half, float), 2.0)
+    u3, v3 = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0])
+    x = xy[:, 0, None, None] + step[:, None, None] * u3
+    y = xy[:, 1, None, None] + step[:, None, None] * v3
+    if len(xy) == 0:
+        return np.empty((0, 2, 6))
+    fine = pixel_to_pixel(image_wcs, grid_wcs, x.ravel(), y.ravel())
+    poly = np.empty((len(xy), 2, 6))
+    for axis, values in enumerate(fine):
+        f = np.asarray(values).reshape(-1, 3, 3)  # [source, v, u]
+        poly[:, axis, 0] = f[:, 1, 1]
+        poly[:, axis, 1] = (f[:, 1, 2] - f[:, 1, 0]) / (2 * step)
+        poly[:, axis, 2] = (f[:, 2, 1] - f[:, 0, 1]) / (2 * step)
+        poly[:, axis, 3] = (f[:, 1, 2] - 2 * f[:, 1, 1] + f[:, 1, 0]) / (2 * step**2)
+        poly[:, axis, 4] = (f[:, 2, 2] - f[:, 2, 0] - f[:, 0, 2] + f[:, 0, 0]) / (4 * step**2)
+        poly[:, axis, 5] = (f[:, 2, 1] - 2 * f[:, 1, 1] + f[:, 0, 1]) / (2 * step**2)
+    return poly

@@ -1,0 +1,540 @@
+"""Images that observers bring, in any unit and with any map of the noise, as images in MJy/sr."""
+
+import contextlib
+import dataclasses
+import functools
+import json
+import logging
+import os
+
+import astropy.units as u
+import numpy as np
+from astropy.io import fits
+from astropy.nddata import CCDData, Cutout2D, NDData, StdDevUncertainty
+
+from miricigale.filters.band_names import find_filter
+from miricigale.instrument.data_models import is_data_model, read_data_model
+from miricigale.instrument.dq_schemes import bad_pixels
+from miricigale.instrument.header_wcs import check_kind_of_exposure, image_wcs, is_exposure
+from miricigale.instrument.image import Image
+from miricigale.instrument.image_planes import (
+    NOISE_MAPS,
+    VARIANCE_PARTS,
+    check_plane,
+    companion,
+    noise_kind,
+    noise_planes,
+    plane_data,
+    plane_shape,
+)
+from miricigale.photometry.images.calibration import calibration, parsed_unit
+from miricigale.photometry.images.fits_images import (
+    Opened,
+    cut_wcs,
+    filter_name,
+    find_image,
+    open_image,
+    open_map,
+)
+from miricigale.photometry.images.sky_noise import mask_filled, sky_noise
+from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
+from miricigale.utils.options import check_data, check_that
+from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+
+_log = logging.getLogger(__name__)
+
+#: A scale of the noise further from 1 than this factor is warned of.
+_ODD_SCALE = 10.0
+
+
+def read_mosaic(path, **options):
+    """
+    Read an image of any origin.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS, packed or not; ``file.fits[EXTENSION]`` names an extension.
+    **options
+        Fields of `MosaicFile`: ``filter``, ``unit``, ``zero_point``, ``error``, ``variance``,
+        ``inverse_variance``, ``weight`` and ``background_box``.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+        See `MosaicFile.read`.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import read_mosaic
+    >>> image = read_mosaic("f444w_sci.fits.gz", weight="f444w_wht.fits.gz")  # doctest: +SKIP
+    """
+    return MosaicFile(path, **options).read()
+
+
+def as_mosaic(image, argument="image"):
+    """
+    Image of whatever holds one.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.NDData`, `~astropy.nddata.Cutout2D`, path-like, HDU, HDUs or data model of ``jwst``
+        Files, HDUs and data models are read as by `read_mosaic`. A cutout has the unit of its data.
+    argument : str, optional
+        The argument's name for messages.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+        Itself, if it is one.
+
+    Raises
+    ------
+    ValueError
+        If it is nothing of these, or has no unit.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> import numpy as np
+    >>> from astropy.nddata import NDData
+    >>> from miricigale.photometry import as_mosaic
+    >>> image = as_mosaic(NDData(np.zeros((4, 4)), unit=u.MJy / u.sr))
+    >>> type(image).__name__, image.unit
+    ('CCDData', Unit("MJy / sr"))
+    """
+    if isinstance(image, CCDData):
+        return image
+    if isinstance(image, (str, os.PathLike)):
+        return read_mosaic(image)
+    if is_data_model(image):
+        return read_data_model(image, read_mosaic)
+    if isinstance(image, (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)):
+        image = fits.HDUList([image])
+    if isinstance(image, fits.HDUList):
+        return read_mosaic(Opened(image))
+    if isinstance(image, Cutout2D):
+        wanted = "a Cutout2D of a Quantity, or CCDData(cutout.data, unit=..., wcs=cutout.wcs)"
+        is_quantity = isinstance(image.data, u.Quantity)
+        check_that(is_quantity, argument, wanted, "a Cutout2D without unit")
+        return CCDData(image.data.value, unit=image.data.unit, wcs=image.wcs)
+    wanted = "a CCDData, an NDData with unit and WCS, HDUs or the path of a FITS file"
+    if not isinstance(image, NDData) or image.unit is None:
+        raise argument_error(argument, wanted, type(image).__name__)
+    return CCDData(image)
+
+
+@dataclasses.dataclass(frozen=True)
+class MosaicFile:
+    """
+    A file with an image, and what is known of it beyond its header.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS, packed or not; ``file.fits[EXTENSION]`` names an extension. By default the
+        image is in SCI, or in the first extension with one.
+    filter : str, optional
+        Name of the filter; that of the header must be the same, if it has one.
+    unit : unit-like, optional
+        Unit of the pixels instead of the header's ``BUNIT``: a surface brightness, a flux in
+        each pixel (``"10 nJy"``), or a rate of counts.
+    zero_point : float or `~astropy.units.Quantity`, optional
+        AB magnitude of one count (or one count a second, if those are the pixels' values).
+        Without it rates of counts are calibrated by the header's PHOTMJSR or by PHOTFLAM and PHOTPLAM,
+        and counts likewise after division by EXPTIME.
+    error, variance, inverse_variance, weight : path-like, optional
+        File with a map of the noise, on the pixels of the image; at most one. Errors and variances
+        are in the unit of the image and its square, or in that of their own ``BUNIT``, and are taken
+        as they are, as inverse variances are. The scale of weights is measured on the sky. By default the first
+        extension of the image's own file among ERR, ERROR, RMS, UNCERT, SIGMA and STDDEV (errors), VAR and
+        VARIANCE, IVAR and INVVAR, WHT and WEIGHT, of the image's EXTVER, that is not all 0 or NaN; then the sum of
+        JWST's VAR_POISSON, VAR_RNOISE and VAR_FLAT. UTYPE says of what kind those of astropy are.
+    background_box : int, optional
+        If given, a background is measured in boxes of so many pixels and subtracted.
+    psf : path-like, optional
+        PSF of the image with the pixel and the drizzling in it: ``file.fits``, ``file.fits[EXTENSION]``, or of
+        a cube ``file.fits[EXTENSION,PLANE]`` (``mean`` for the mean of all planes). Its center is found.
+        That of MIRI, NIRCam's wide filters and WFC3/IR is compared with the model
+        (`~miricigale.psf.checked_psf`), which is taken where none is given (`~miricigale.psf.filter_psf`).
+    psf_scale, psf_angle : `~astropy.units.Quantity`, optional
+        Pixel of the PSF and position angle of its +y; by default those of its header. Else the angle is that of
+        the image, and so is the pixel where the filter has a model PSF that tests it; else it must be given.
+    pa_aper : `~astropy.units.Quantity`, optional
+        Position angle of the detector's +y axis, if the header does not state it.
+    section : tuple of slice, optional
+        Rows and columns (with start and stop) that are read, of the maps of the noise too, as if the
+        file had no others.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import MosaicFile, measure_files
+    >>> image = MosaicFile("f770w_sci.fits", weight="f770w_wht.fits", filter="F770W")
+    >>> prior = MosaicFile("f444w_sci.fits", weight="f444w_wht.fits", filter="F444W")
+    >>> table = measure_files(image, prior)  # doctest: +SKIP
+    """
+
+    path: object
+    _: dataclasses.KW_ONLY
+    filter: str | None = None
+    unit: object = None
+    zero_point: object = None
+    error: object = None
+    variance: object = None
+    inverse_variance: object = None
+    weight: object = None
+    background_box: int | None = None
+    psf: object = None
+    psf_scale: u.Quantity | None = None
+    psf_angle: u.Quantity | None = None
+    pa_aper: u.Quantity | None = None
+    section: tuple | None = None
+
+    replace = dataclasses.replace
+
+    def __post_init__(self):
+        if self.filter is not None:
+            object.__setattr__(self, "filter", find_filter(str(self.filter)) or str(self.filter))
+        given = [name for name in NOISE_MAPS if getattr(self, name) is not None]
+        check_that(
+            len(given) <= 1, ", ".join(NOISE_MAPS), "at most one of them", " and ".join(given)
+        )
+        if self.background_box is not None and not self.background_box >= 1:
+            raise argument_error("background_box", "at least 1 pixel", self.background_box)
+
+    @functools.cached_property
+    def header(self):
+        """
+        The contents of the header, a `MosaicHeader`, without reading the image.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is missing or damaged, or has no image with celestial coordinates.
+        ValueError
+            If the header states another filter or angle than ``filter`` and ``pa_aper``.
+        """
+        with open_image(self.path, "an image") as (hdus, extension):
+            index = find_image(hdus, extension, self.path, ("SCI",))
+            header, first = hdus[index].header, hdus[0].header
+            wcs = image_wcs(header, hdus)
+            shape = plane_shape(hdus[index])
+        check_data(wcs is not None, self.path, "has no celestial coordinates (WCS) in its header")
+        if self.section is not None:
+            wcs = cut_wcs(wcs, self.section, self.path)
+            shape = tuple(one.stop - one.start for one in self.section)
+
+        def get(key):
+            return header.get(key, first.get(key))
+
+        check_kind_of_exposure(get, self.path)
+        meta = {}
+        # of another program it may be no JSON
+        with contextlib.suppress(json.JSONDecodeError):
+            meta = json.loads(header.get("META", "{}"))
+        name = filter_name(get) or meta.get("filter")
+        good = self.filter is None or name in (None, self.filter)
+        check_that(good, "filter", f"{name!r}, the filter in {self.path}", repr(self.filter))
+        # a mosaic of our own has a list of angles
+        stated = {
+            "filter": self.filter or name,
+            "pa_aper": get("PA_APER"),
+            "subarray": get("SUBARRAY"),
+        }
+        stated = {key: meta.get(key) if value is None else value for key, value in stated.items()}
+        return MosaicHeader(
+            index=index,
+            shape=shape,
+            wcs=wcs,
+            filter=stated["filter"],
+            pa_aper=self._checked_angle(stated["pa_aper"]),
+            unit=_unit_of(header) if self.unit is None else str(self.unit),
+            exposure=is_exposure(get),
+            keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM", "EXPTIME")},
+            meta={**meta, **{key: value for key, value in stated.items() if value is not None}},
+        )
+
+    def _checked_angle(self, stated):
+        """The position angle that was given or that the header states (deg, or None), which must agree."""
+        stated = None if stated is None else np.asarray(stated, float) * u.deg
+        if self.pa_aper is None:
+            return stated
+        angle = float(to_array(self.pa_aper, u.deg, "pa_aper", finite=True)) * u.deg
+        apart = 0.0 if stated is None else (angle - stated).to_value(u.deg)
+        if np.max(np.abs((apart + 180) % 360 - 180)) > 1:
+            wanted = f"PA_APER of {self.path}, {np.round(stated.value, 2)} deg"
+            raise argument_error("pa_aper", wanted, angle)
+        return angle
+
+    def read(self, added=None):
+        """
+        Read the image.
+
+        Parameters
+        ----------
+        added : `~numpy.ndarray`, shape (ny, nx), optional
+            Surface brightness in MJy/sr that is added to the pixels before anything is measured on them.
+
+        Returns
+        -------
+        image : `~astropy.nddata.CCDData`
+            In MJy/sr, with WCS and mask (True where a pixel is not finite, has no weight or no
+            error, is one of an area that is exactly 0, or is marked in an extension MASK or, as not
+            to be used, in DQ), and with a
+            `~astropy.nddata.StdDevUncertainty` unless there is no map of the noise. Fluxes in
+            pixels are divided by the solid angle of each pixel. ``meta`` has ``filter``, ``pa_aper``
+            (deg), ``source`` (the file), ``source_unit``, ``calibration``, ``noise``, ``noise_scale``
+            (rms of the source-free pixels in units of the map's errors), ``weight_scale``
+            (by which errors of a weight map were multiplied), ``sky_over_noise`` (median over rms
+            of those pixels), ``n_filled`` (pixels in areas that are exactly 0) and ``n_masked``, as
+            far as they are known. None of a section without a usable pixel.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If a file is missing or damaged, has no unit or coordinates, or a map is not on the
+            pixels of the image.
+        ValueError
+            If the header names another filter, a count rate cannot be calibrated, or an error or (inverse)
+            variance is below 0 where the image has data.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.PhotometryWarning`
+            If there is no map of the noise, its scale departs from 1 by more than 10 times, or areas
+            that are exactly 0 are masked.
+        """
+        from miricigale.instrument import pixel_area_map
+
+        header = self.header
+        meta = {**header.meta, "source": str(self.path)}
+        with open_image(self.path, "an image") as (hdus, _):
+            data = _native(plane_data(hdus[header.index], self.section))
+            factor, how = calibration(self.path, header.unit, self.zero_point, header.keywords)
+            if factor.unit.is_equivalent(u.MJy):
+                area = pixel_area_map(header.wcs, header.shape)
+                factor = (factor.to_value(u.MJy) / area).astype(data.dtype)
+            else:
+                factor = data.dtype.type(factor.to_value(SURFACE_BRIGHTNESS))
+            usable = np.isfinite(data)
+            usable &= self._marked_good(hdus, header.index, meta)
+            kind, values, source = self._noise_map(hdus, header, usable)
+        meta.update(source_unit=header.unit, calibration=how)
+        sigma = None
+        if kind is None:
+            zeros = float(np.mean(data[usable] == 0)) if usable.any() else 0.0
+            extra = f", and {zeros:.0%} of its pixels are exactly 0" if zeros > 1e-3 else ""
+            msg = f"{self.path} has no map of the noise, which will be measured on the image{extra}"
+            warn(msg, PhotometryWarning)
+            meta["noise"] = "none"
+        else:
+            negative = 0 if kind == "weight" else np.count_nonzero(values[usable] < 0)
+            wanted = "a map of 0 (no data) or more"
+            got = f"{negative} pixels below 0 in {source}, for {self.path}"
+            check_that(not negative, kind, wanted, got)
+            sigma = _sigma(kind, values)
+            usable &= np.isfinite(sigma) & (sigma > 0)
+            meta["noise"] = f"{kind} ({source})"
+        filled = mask_filled(data, usable, self.path)
+        if filled:
+            meta["n_filled"] = filled
+        if self.section is not None and not usable.any():
+            return None
+        what = "has no usable pixel: all are masked, not finite or without weight"
+        check_data(usable.any(), self.path, what)
+        data *= factor
+        if added is not None:
+            data += added
+        if self.background_box is not None:
+            from miricigale.utils.sep_tools import background
+
+            data -= background(data, ~usable, self.background_box)[0]
+            meta["background_box"] = int(self.background_box)
+        relative = np.where(usable, data, 0)
+        if sigma is not None:
+            sigma *= factor
+            relative = relative / np.where(usable, sigma, 1)
+        level, scale, _ = sky_noise(relative, usable)
+        if sigma is not None:
+            done = "which are scaled by it" if kind == "weight" else "which are kept"
+            text = "%s: noise is %.4g times the errors of the %s map, %s"
+            _log.info(text, self.path, scale, kind, done)
+            if not 1 / _ODD_SCALE < scale < _ODD_SCALE:
+                msg = (
+                    f"{self.path}: noise on the sky is {scale:.4g} times what the {kind} map says, {done}; "
+                    "is it the map of this image, in its unit?"
+                )
+                warn(msg, PhotometryWarning)
+            meta["noise_scale"] = float(f"{scale:.6g}")
+        if kind == "weight":
+            what = "has weights of unknown scale, for its sky is constant"
+            check_data(scale > 0, self.path, what)
+            meta["weight_scale"] = meta["noise_scale"]
+            sigma *= sigma.dtype.type(scale)
+        meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
+        meta["n_masked"] = int(np.count_nonzero(~usable))
+        return Image(
+            data,
+            unit=SURFACE_BRIGHTNESS,
+            wcs=header.wcs,
+            mask=~usable,
+            uncertainty=None if sigma is None else StdDevUncertainty(sigma),
+            meta=meta,
+        )
+
+    def _noise_map(self, hdus, header, usable):
+        """Kind, values and place of the map of the noise; the kind is None if there is none."""
+        # a unit given by the caller holds for the map too
+        stated = "" if self.unit is not None else header.unit
+        for kind, names in NOISE_MAPS.items():
+            path = getattr(self, kind)
+            if path is None:
+                continue
+            whole = self.replace(section=None).header
+            image = whole.shape, whole.wcs, self.path
+            what = f"a map of the {kind.replace('_', ' ')}", f"the {kind} of {self.path}"
+            with open_map(path, *what, names, image) as hdu:
+                own_kind = noise_kind(hdu)
+                # inverse variances are weights too
+                is_other = own_kind not in (None, kind) and {own_kind, kind} != {
+                    "inverse_variance",
+                    "weight",
+                }
+                if is_other:
+                    said = hdu.header.get("UTYPE", hdu.name)
+                    wanted = f"a map of the {kind.replace('_', ' ')}"
+                    got = f"{path}, whose extension is {said}: give it as '{own_kind}'"
+                    raise argument_error(kind, wanted, got)
+                return kind, self._in_unit(hdu, kind, stated, path), str(path)
+        return self._own_noise_map(hdus, header, usable, stated)
+
+    def _own_noise_map(self, hdus, header, usable, stated):
+        """As `_noise_map`, of the image's own file."""
+        shape = plane_shape(hdus[header.index])
+        empty = []
+        for kind, hdu in noise_planes(hdus, header.index):
+            if plane_shape(hdu) is None and not hdu.shape:
+                empty.append(f"{hdu.name} (no data)")
+                continue
+            check_plane(hdu, shape, self.path, f"a map of the {kind.replace('_', ' ')}")
+            values = self._in_unit(hdu, kind, stated, f"{self.path}[{hdu.name}]")
+            if not self._has_noise(values, usable, hdu):
+                empty.append(f"{hdu.name} (nowhere finite and above 0)")
+                continue
+            if empty:
+                msg = f"{self.path}: {', '.join(empty)} holds no noise; {hdu.name} ({kind}) is used"
+                warn(msg, PhotometryWarning)
+            return kind, values, f"extension {hdu.name}"
+        parts = [companion(hdus, header.index, name) for name in VARIANCE_PARTS]
+        parts = [hdu for hdu in parts if hdu is not None and plane_shape(hdu) == shape]
+        if parts:
+            planes = [self._in_unit(hdu, "variance", stated, self.path) for hdu in parts]
+            total = np.sum([np.where(np.isfinite(plane), plane, 0) for plane in planes], axis=0)
+            if self._has_noise(total, usable, None):
+                names = " + ".join(hdu.name for hdu in parts)
+                return "variance", total.astype(planes[0].dtype), f"extensions {names}"
+        if any("nowhere" in text for text in empty):
+            what = f"holds no noise in {', '.join(empty)}, and no other map of it"
+            raise data_error(
+                self.path, f"{what}: give 'error', 'variance' or 'weight', or remove it"
+            )
+        return None, None, None
+
+    def _has_noise(self, values, usable, hdu):
+        """Whether a map of the noise has a value above 0 (or one below, which is refused later)."""
+        where = np.isfinite(values) & (values != 0)
+        if np.any(where):
+            return True
+        if self.section is None or hdu is None or not np.any(usable):
+            # a part without data says nothing of the map
+            return self.section is not None
+        whole = plane_data(hdu)
+        return bool(np.any(np.isfinite(whole) & (whole != 0)))
+
+    def _marked_good(self, hdus, index, meta):
+        """Pixels that no extension of marks or weights excludes; notes the scheme of the bits in ``meta``."""
+        header = hdus[index].header
+
+        def get(key):
+            return header.get(key, hdus[0].header.get(key))
+
+        good = True
+        for name in _MARKS:
+            hdu = companion(hdus, index, name)
+            if hdu is None or not hdu.is_image or (not hdu.shape and plane_shape(hdu) is None):
+                continue
+            check_plane(hdu, plane_shape(hdus[index]), self.path, "marks of pixels")
+            values = np.asarray(plane_data(hdu, self.section))
+            if name == "WHT":
+                good = good & (values > 0)
+                continue
+            has_planes = any(str(key).startswith("MP_") for key in hdu.header)
+            if name == "MASK" and not has_planes:
+                # a mask of astropy's has no bits
+                good = good & (values == 0)
+                continue
+            bad, scheme = bad_pixels(values, hdu.header, get, f"{self.path}[{name}]")
+            good = good & ~bad
+            meta["dq_scheme"] = scheme
+        return good
+
+    def _in_unit(self, hdu, kind, unit, path):
+        """A map of the noise in the unit that the image states, as far as both do."""
+        values = _native(plane_data(hdu, self.section))
+        text = _unit_of(hdu.header)
+        power = _POWERS.get(kind)
+        have, wanted = parsed_unit(text), parsed_unit(unit)
+        # headers of many variance maps state the unit of the image itself
+        if None in (power, have, wanted) or have in (wanted, wanted**power):
+            return values
+        try:
+            factor = have.to(wanted**power)
+        except u.UnitConversionError:
+            role = kind.replace("_", " ")
+            what = f"(the {role}) is in {text!r}, the image in {unit!r}: give 'unit' if a header is wrong"
+            raise data_error(path, what) from None
+        _log.info("%s: from %s to %s", path, have, wanted**power)
+        return values * values.dtype.type(factor)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MosaicHeader:
+    """Contents of the header of an image."""
+
+    index: int  # Extension of the image.
+    shape: tuple  # Rows and columns.
+    wcs: object  # Celestial coordinates.
+    filter: str | None  # As ``instrument.filter`` in lower case, or as it was given; None without.
+    pa_aper: object  # Position angle of the detector's +y axis; None without.
+    unit: str  # Unit of the pixels as the header or the caller has it; may be empty.
+    #: Whether it is a single exposure of JWST (``_cal``, ``_rate``) rather than a mosaic.
+    exposure: bool
+    keywords: dict  # Those of the photometric calibration.
+    meta: dict  # What our own files carry, with ``filter`` and ``pa_aper`` (deg).
+
+
+def _unit_of(header):
+    return str(header.get("BUNIT", "") or "").strip()
+
+
+def _native(data):
+    """A copy in native byte order; single precision stays single."""
+    data = np.asarray(data)
+    single = data.dtype.kind == "f" and data.dtype.itemsize <= 4
+    return np.array(data, dtype=np.float32 if single else np.float64)
+
+
+#: Power of the image's unit that a map of the noise has; the scale of weights is measured.
+_POWERS = {"error": 1, "variance": 2, "inverse_variance": -2}
+#: Extensions that mark pixels: 0 is good in MASK, bits of DQ are those of the telescope, weights are above 0.
+_MARKS = ("MASK", "DQ", "WHT")
+
+
+def _sigma(kind, values):
+    """1-sigma errors in the unit of the image, infinite where there are none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if kind == "error":
+            return values
+        if kind == "variance":
+            return np.sqrt(np.where(values > 0, values, np.inf))
+        return 1 / np.sqrt(np.where(values > 0, values, 0))

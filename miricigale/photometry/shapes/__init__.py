@@ -1,0 +1,1 @@
+"""Shapes of sources on the high-resolution image."""

@@ -1,0 +1,1 @@
+"""Templates of sources on the image's grid, and their normal equations."""

@@ -1,0 +1,439 @@
+"""Normal equations of forced photometry, and errors that are true for correlated noise."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import scipy.fft
+import scipy.sparse
+from astropy.stats import mad_std
+
+from miricigale.photometry._core.noise import autocorrelation
+from miricigale.photometry._core.solve import block_covariance, factorize, symmetric_lu
+from miricigale.photometry._core.stamps import (
+    convolve_stamps,
+    cross_pairs,
+    find_pairs,
+    pair_products,
+    projections,
+    whiten_stamps,
+)
+from miricigale.photometry.templates.templates import Block, batches
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.random import stream
+
+#: What correlations are multiplied by until the matrix is positive.
+_SHRINK = (1.0, 1 - 1e-9, 1 - 1e-6, 1 - 1e-4, 0.999, 0.99, 0.95, 0.9, 0.8, 0.5, 0.0)
+
+
+def correlated_draws(covariance, keys, size, seed):
+    """
+    Draw from normal distributions of zero mean with a sparse covariance, shape (size, m).
+
+    Parameters
+    ----------
+    covariance : sparse array, shape (m, m)
+        Rows without variance give NaN.
+    keys : sequence of tuple, length m
+        What each row's random stream is for (see `~miricigale.utils.random.stream`): a row that
+        is correlated with no other has the same draws whatever other rows there are.
+    size, seed : int
+        Number of draws, and their seed.
+
+    Notes
+    -----
+    By the Cholesky factor of the correlation matrix, sparse. Of long chains of blends the covariance is
+    known for pairs that overlap only, which need not be positive as a whole: correlations are then
+    shrunk by the least factor of a few that makes it so; variances never change.
+    """
+    error = np.sqrt(covariance.diagonal())
+    rows = np.flatnonzero(error > 0)
+    draws = np.full((size, len(error)), np.nan)
+    if not len(rows):
+        return draws
+    inverse = scipy.sparse.diags_array(1.0 / error[rows])
+    unit = (inverse @ covariance[rows][:, rows] @ inverse).tocoo()
+    lone = unit.row == unit.col
+    normal = np.stack([stream(seed, *keys[k]).standard_normal(size) for k in rows])
+    for factor in _SHRINK:
+        data = np.where(lone, 1.0, factor * unit.data)
+        found = _cholesky(scipy.sparse.coo_array((data, (unit.row, unit.col)), shape=unit.shape))
+        if found is not None:
+            break
+    lower, order = found
+    draws[:, rows] = ((lower @ normal[np.argsort(order)])[order]).T * error[rows]
+    return draws
+
+
+def _cholesky(matrix):
+    """Lower factor of a sparse matrix and the place of each row in it, None if it is not positive."""
+    try:
+        lu = symmetric_lu(matrix)
+    except RuntimeError:
+        return None
+    diagonal = lu.U.diagonal()
+    if not (diagonal > 0).all() or not np.array_equal(lu.perm_r, lu.perm_c):
+        return None
+    return lu.L @ scipy.sparse.diags_array(np.sqrt(diagonal)), lu.perm_r
+
+
+def noise_correlation(residual, usable, weight, *, executor=None):
+    """
+    Measure the covariance of pixels' noise on a whitened residual image.
+
+    Parameters
+    ----------
+    residual, usable : `~numpy.ndarray`, shape (ny, nx)
+        Data minus model, and which pixels are free of sources and have data.
+    weight : `~numpy.ndarray`, shape (ny, nx)
+        1 / sigma.
+    executor : `concurrent.futures.Executor`, optional
+        Threads to work with.
+
+    Returns
+    -------
+    correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1), m <= 8
+        Mean product at each separation, in units of sigma^2: the middle is 1 for true
+        sigmas, and the whole a single number for noise that is not correlated (0 for a
+        residual that is the same everywhere).
+
+    Raises
+    ------
+    ValueError
+        If fewer than 100 pixels are usable.
+    """
+    usable = np.asarray(usable, bool)
+    if np.count_nonzero(usable) < 100:
+        raise argument_error("usable", "100 pixels or more", np.count_nonzero(usable))
+
+    # some millions of pixels are enough for the mean and the spread
+    every = np.s_[:: max(1, np.count_nonzero(usable) // _SOME)]
+    some, inverse, where = (one.reshape(-1)[every] for one in (residual, weight, usable))
+    some = (some * inverse)[where]
+    middle, far = np.median(some), _CLIP * mad_std(some)
+    level = residual.dtype.type(some[np.abs(some - middle) <= far].mean(dtype=float))
+
+    def rows(part):
+        z = residual[part] * weight[part]
+        return z - level, usable[part] & (np.abs(z - middle) <= far)
+
+    lag = min(_MAX_LAG, (min(residual.shape) - 1) // 2)
+    strips = [one for one in chunks(len(usable), 256) if usable[one].any()]
+    # those of tens of millions of pixels are enough
+    strips = strips[:: 1 + np.count_nonzero(usable) // 20_000_000]
+    in_threads = functools.partial(parallel_map, executor=executor)
+    covariance, error = autocorrelation(rows, strips, lag, in_threads)
+    if not covariance[lag, lag] > 0:
+        return np.zeros((1, 1))
+    index = np.arange(-lag, lag + 1)
+    ring = np.maximum(np.abs(index)[:, None], np.abs(index)[None])
+    for outer in range(lag, 0, -1):
+        member = ring == outer
+        # a ring holds each value twice
+        mean = covariance[member].mean()
+        mean_error = error[member].mean() * np.sqrt(2.0 / np.count_nonzero(member))
+        peak = np.max(np.abs(covariance[member]) / error[member])
+        if abs(mean) > _SIGNIFICANCE * mean_error or peak > _SIGNIFICANCE + 1.5:
+            break
+        lag = outer - 1
+    keep = slice(len(index) // 2 - lag, len(index) // 2 + lag + 1)
+    return covariance[keep, keep].copy()
+
+
+def stated_correlation(factor):
+    """
+    Covariance of pixels' noise of a mosaic that is too small for it to be measured.
+
+    Parameters
+    ----------
+    factor : float
+        How much noisier sums over many pixels are than their errors in quadrature; above 1.
+
+    Returns
+    -------
+    correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1)
+        As `noise_correlation` gives it: along each axis a triangle whose values have the sum ``factor``.
+
+    Notes
+    -----
+    Of drizzled images, whose drops are as wide as the output's pixels, it is what many dithers make (lag 1: 1/4).
+
+    References
+    ----------
+    Fruchter & Hook 2002, PASP 114, 144, sec. 7; Casertano et al. 2000, AJ 120, 2747, appendix A.
+    """
+    lag = max(1, int(np.ceil(factor - 1)))
+    width = lag * (lag + 1) / (2 * lag + 1 - factor)
+    triangle = 1 - np.abs(np.arange(-lag, lag + 1)) / width
+    return np.outer(triangle, triangle)
+
+
+#: Largest separation (pixels) of the noise correlation; pixels further from the median than this many robust
+#: standard deviations do not take part; rings of separations whose mean is less significant than this are cut off.
+_MAX_LAG, _CLIP, _SIGNIFICANCE = 8, 5.0, 3.0
+
+#: Pairs of stamps that a thread works on at a time.
+_PAIRS = 1024
+
+#: Pixels of which the spread of the noise is taken, where there are more.
+_SOME = 4_000_000
+
+
+def _whitened(bank, block, inverse_sigma):
+    """A block's stamps over the noise, and their sums as `whiten_stamps` makes them."""
+    white = dataclasses.replace(block, values=np.empty_like(block.values))
+    sums = np.empty((len(block.box), 4))
+
+    def scale(part):
+        whiten_stamps(*block.some(part), inverse_sigma, white.values, sums[part])
+
+    bank.map(scale, block.parts())
+    return white, sums
+
+
+def _projected(bank, block, images):
+    """Sums of a block's stamps times images, shape (n, len(images))."""
+    out = np.empty((len(images), len(block.box)))
+
+    def project_part(part):
+        for image, one in zip(images, out, strict=True):
+            projections(*block.some(part), image, one[part])
+
+    bank.map(project_part, block.parts())
+    return out.T
+
+
+def _products(bank, left, right, pairs):
+    """Sums of the products of pairs of stamps of two blocks."""
+    out = np.empty(len(pairs))
+
+    def multiply(part):
+        pair_products(*left.stamps, *right.stamps, pairs[part], out[part])
+
+    bank.map(multiply, chunks(len(pairs), _PAIRS))
+    return out
+
+
+def _walk(bank, inverse_sigma, images, spread=None):
+    """
+    Products of all pairs of the whitened stamps, and their projections on images.
+
+    At most those blocks are in memory that can still overlap. ``spread`` is what is done to the right-hand block
+    of a pair; stamps grow by its ``lag``. Returns the matrix, (n, n), the projection, and the stamps' sums.
+    """
+    n, grow = len(bank.order), 0 if spread is None else spread.lag
+    pairs = find_pairs(bank.box, grow=grow)
+    products, diagonal = np.zeros(len(pairs)), np.empty(n)
+    sums, projection, live = np.empty((n, 4)), np.empty((n, len(images))), []
+    for block in bank.blocks():
+        rows = slice(block.first, block.last)
+        white, sums[rows] = _whitened(bank, block, inverse_sigma)
+        projection[rows] = _projected(bank, white, images)
+        mine, diagonal[rows] = white, sums[rows, 3]
+        if spread is not None:
+            mine = spread(white)
+            own = np.repeat(np.arange(len(block.box), dtype=np.int32), 2).reshape(-1, 2)
+            diagonal[rows] = _products(bank, white, mine, own)
+        live = [one for one in live if one.end + grow > block.box[0, 0]]
+        live.append(white)
+        for other in live:
+            low, high = np.searchsorted(pairs[:, 0], [other.first, other.last])
+            met = low + np.flatnonzero(
+                (pairs[low:high, 1] >= block.first) & (pairs[low:high, 1] < block.last)
+            )
+            if len(met):
+                local = pairs[met] - np.array([other.first, block.first], pairs.dtype)
+                products[met] = _products(bank, other, mine, local)
+    i, j = pairs.T.astype(np.int64)
+    where = np.concatenate([np.arange(n), i, j]), np.concatenate([np.arange(n), j, i])
+    data = np.concatenate([diagonal, products, products])
+    return scipy.sparse.coo_array((data, where), shape=(n, n)).tocsr(), projection, sums
+
+
+def normal_matrix(bank, inverse_sigma, images=()):
+    """
+    Build the whitened normal equations of the templates of a bank.
+
+    Parameters
+    ----------
+    bank : `~miricigale.photometry.templates.templates.TemplateBank`
+        n templates.
+    inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
+        1 / sigma, zero where masked.
+    images : list of `~numpy.ndarray`, shape (ny, nx)
+        Whitened images onto which the whitened templates are projected.
+
+    Returns
+    -------
+    matrix : `~scipy.sparse.csr_array`, shape (n, n)
+        Products of the whitened templates.
+    projection : `~numpy.ndarray`, shape (n, len(images))
+    power, light : `~numpy.ndarray`, shape (n,) and (n, 2)
+        Sums of squares of the templates without weights; their sums inside the image, and on usable pixels.
+    """
+    matrix, projection, sums = _walk(bank, inverse_sigma, images)
+    return matrix, projection, sums[:, 2], sums[:, :2]
+
+
+def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
+    """
+    Build A^T W C W A, (n, n), and its projection: what correlated noise does to the right-hand side.
+
+    ``correlation``, (2 m + 1, 2 m + 1), is the covariance of the whitened noise by separation; the rest is as
+    in `normal_matrix`. Stamps are convolved with it by transforms in single precision, that of the
+    correlation made once for each padded shape.
+    """
+    return _walk(bank, inverse_sigma, images, _Spread(correlation, bank))[:2]
+
+
+class _Spread:
+    """Convolves the whitened stamps of a block with the noise's correlation."""
+
+    def __init__(self, correlation, bank):
+        self.lag, self._map = correlation.shape[0] // 2, bank.map
+        self._kernel = np.asarray(correlation, np.float32)
+        self._transfer = functools.lru_cache(maxsize=64)(
+            lambda shape: scipy.fft.rfft2(self._kernel, s=shape)
+        )
+
+    def __call__(self, block):
+        lag = self.lag
+        if lag == 0:
+            return dataclasses.replace(block, values=block.values * self._kernel[0, 0])
+        box = block.box + np.array([-lag, -lag, 2 * lag, 2 * lag])
+        start = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
+        values = np.empty(int(start[-1]), np.float32)
+
+        def convolve(batch):
+            shape, rows = batch
+            transfer = self._transfer(shape)
+            convolve_stamps(*block.stamps, rows, transfer, shape, box, start, values)
+
+        # rounded up so that many stamps share a shape
+        shapes = -(-box[:, 2:] // 8) * 8
+        fast = {n: scipy.fft.next_fast_len(int(n), True) for n in np.unique(shapes)}
+        self._map(convolve, batches((fast[ny], fast[nx]) for ny, nx in shapes))
+        return Block(block.first, box, start, values)
+
+
+def cross_matrix(bank, other, inverse_sigma, correlation=None):
+    """
+    Products, (n, m), of the whitened stamps of two banks.
+
+    With a ``correlation`` (as of `sandwich_matrix`) the other bank's stamps are convolved with it.
+    """
+    rows, columns, values = [], [], []
+    spread = None if correlation is None else _Spread(correlation, other)
+    waiting, live = bank.blocks(), []
+    for block in other.blocks():
+        right = _whitened(other, block, inverse_sigma)[0]
+        right = right if spread is None else spread(right)
+        # of the first bank, those blocks only that this one and those after it can overlap
+        live = [one for one in live if one.end > right.box[0, 0]]
+        while not live or live[-1].box[0, 0] < right.end:
+            left = next(waiting, None)
+            if left is None:
+                break
+            live.append(_whitened(bank, left, inverse_sigma)[0])
+        for left in live:
+            pairs = cross_pairs(left.box, right.box)
+            if len(pairs):
+                values.append(_products(bank, left, right, pairs))
+                rows.append(pairs[:, 0] + left.first)
+                columns.append(pairs[:, 1] + right.first)
+    shape = len(bank.order), len(other.order)
+    if not values:
+        return scipy.sparse.csr_array(shape)
+    where = (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.coo_array((np.concatenate(values), where), shape=shape).tocsr()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LinearFit:
+    """
+    Least squares for sparse sources plus a few parameters of the whole image.
+
+    Notes
+    -----
+    The common parameters are eliminated by their Schur complement, so that the sparse
+    factor is that of the sources alone.
+    """
+
+    matrix: object  # (n, n): Normal matrix of the sources.
+    rhs: np.ndarray  # (n,)
+    border: np.ndarray  # (n, g): Products of sources and common parameters.
+    #: (g, g) and (g,): The common parameters' own part.
+    corner: np.ndarray
+    corner_rhs: np.ndarray
+
+    def __post_init__(self):
+        solve = factorize(self.matrix)
+        z = solve(self.border) if self.border.shape[1] else self.border
+        q = np.linalg.inv(self.corner - self.border.T @ z)
+        common = q @ (self.corner_rhs - z.T @ self.rhs)
+        found = {"solve": solve, "_z": z, "_q": q, "common": common}
+        found["flux"] = solve(self.rhs) - z @ common
+        # the class is frozen
+        self.__dict__.update(found)
+
+    @property
+    def common_covariance(self):
+        """Covariance of the common parameters for white noise, shape (g, g)."""
+        return self._q
+
+    def covariances(self, xy, fillings, *, core, halo, pattern=None):
+        """
+        Covariances of sources that overlap, and of the common parameters.
+
+        Parameters
+        ----------
+        xy : `~numpy.ndarray`, shape (n, 2)
+            Positions in pixels.
+        fillings : sequence of tuple or None
+            Fillings of the sandwich, each its sparse matrix, border and corner; None for noise
+            that is white with the given sigmas.
+        core, halo, pattern
+            See `~miricigale.photometry._core.solve.block_covariance`.
+
+        Returns
+        -------
+        covariances : list of tuple
+            For each filling the covariance of the sources (`~scipy.sparse.csr_array`, shape (n, n))
+            and that of the common parameters, shape (g, g).
+        blending : `~numpy.ndarray`, shape (n,)
+            Formal error over that of the source alone.
+        """
+        z, q = self._z, self._q
+        middles = [None if one is None else one[0] for one in fillings]
+        local, inverse = block_covariance(
+            self.matrix, *xy.T[::-1], core=core, halo=halo, pattern=pattern, middles=middles
+        )
+        inverse = inverse + np.einsum("kg,kg->k", z @ q, z)
+        blending = np.sqrt(inverse * self.matrix.diagonal())
+        found = [self._with_common(*both) for both in zip(local, fillings, strict=True)]
+        return found, blending
+
+    def _with_common(self, local, filling):
+        """The sources' covariance with what the common parameters add, and that of those."""
+        z, q = self._z, self._q
+        if not len(q):
+            return local, q
+        if filling is None:
+            return _add_low_rank(local, [(z @ q, z)]), q
+        middle, border, corner = filling
+        # theta = Q (b_g - Z^T b_s), x = S^-1 b_s - Z theta
+        cross = (border - middle @ z) @ q
+        common = corner - border.T @ z - z.T @ border + z.T @ (middle @ z)
+        common = q @ common @ q
+        e = self.solve(cross)
+        return _add_low_rank(local, [(z @ common, z), (-e, z), (-z, e)]), common
+
+
+def _add_low_rank(matrix, terms):
+    """Add sums of outer products to the non-zeros of a sparse matrix."""
+    coo = matrix.tocoo()
+    data = coo.data.copy()
+    for left, right in terms:
+        data += np.einsum("kg,kg->k", left[coo.row], right[coo.col])
+    return scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=matrix.shape).tocsr()

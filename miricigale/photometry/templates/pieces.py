@@ -1,0 +1,58 @@
+"""Pieces of divided galaxies in a fit, and the changes that they have in common."""
+
+import dataclasses
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Galaxy:
+    """A galaxy whose pieces are sources of their own."""
+
+    rows: np.ndarray  # (k,): Its pieces among the fitted rows.
+    shares: np.ndarray  # (k,): Their parts of the light on the high-resolution image, of unit sum.
+    flux: float  # Sum of their fluxes in a fit without a prior.
+
+    @property
+    def largest(self):
+        """The row of the largest piece."""
+        return int(self.rows[np.argmax(self.shares)])
+
+    def of_largest(self, change):
+        """
+        A change of the whole galaxy as one of its largest piece.
+
+        Changes that are fitted have an amplitude of their own, in units of the galaxy's flux; a fixed one has that
+        of the piece, which is its share of it.
+        """
+        if not change.fixed:
+            return change
+        cutout = change.cutout
+        larger = dataclasses.replace(cutout, data=cutout.data / self.shares.max())
+        return dataclasses.replace(change, cutout=larger)
+
+    def signal(self, matrix):
+        """Signal-to-noise of the whole galaxy by a normal matrix."""
+        own = matrix[self.rows][:, self.rows]
+        return self.flux * np.sqrt(self.shares @ (own @ self.shares))
+
+
+def divided_galaxies(fitted, flux):
+    """
+    Galaxies of which two pieces or more are fitted, and whose flux is positive.
+
+    Parameters
+    ----------
+    fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.shapes.FITTED`, shape (n,)
+        What is known of the rows.
+    flux : `~numpy.ndarray`, shape (n,)
+        Their fluxes.
+    """
+    number, share = fitted["galaxy"], fitted["share"]
+    galaxies = []
+    for galaxy in np.unique(number[number > 0]):
+        rows = np.flatnonzero((number == galaxy) & (share > 0))
+        total = flux[rows].sum()
+        if len(rows) > 1 and total > 0:
+            galaxies.append(Galaxy(rows, share[rows] / share[rows].sum(), float(total)))
+    return galaxies

@@ -1,0 +1,1 @@
+"""Alignment and combination of exposures."""

@@ -1,0 +1,137 @@
+"""The images of one filter put together: aligned, on one level, without outliers, drizzled."""
+
+import numpy as np
+
+from miricigale.instrument import ImageFacts, as_wcs
+from miricigale.reduction.combine.align import align_images
+from miricigale.reduction.images.images import check_images, own_grid, with_data
+from miricigale.reduction.mosaic.mosaic import drizzle_images, pixel_map, weight_map
+from miricigale.reduction.mosaic.outliers import reject_outliers
+from miricigale.reduction.results import ReductionResult
+from miricigale.reduction.sky.background import (
+    BackgroundFlags,
+    estimate_background,
+    remove_background,
+    subtractable,
+)
+from miricigale.reduction.sky.dither_background import dither_backgrounds, restored
+from miricigale.reduction.sky.sky_match import match_levels
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
+
+
+def drizzle(settings, images, wcs, variances=()):
+    """
+    As `~miricigale.reduction.Reducer.drizzle`.
+
+    Parameters
+    ----------
+    settings : `~miricigale.reduction.MosaicSettings`
+        How images are combined.
+    images, wcs
+        As of that method.
+    variances : list of dict, optional
+        As of `~miricigale.reduction.drizzle_images`.
+
+    Returns
+    -------
+    mosaic : `~miricigale.reduction.Mosaic`
+    images : list of `~astropy.nddata.CCDData`
+        The inputs on one level, with outliers masked.
+    """
+    images = list(images)
+    check_images(images, wcs)
+    weights = [weight_map(im) for im in images]
+    maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+    if settings.match_sky and len(images) > 1:
+        images = match_levels(images, wcs, pixel_maps=maps)
+    judged = all(ImageFacts.of(im).n_outliers is not None for im in images)
+    if settings.outlier_threshold is not None and len(images) >= 3 and not judged:
+        images = reject_outliers(
+            images, wcs, threshold=settings.outlier_threshold, weights=weights, pixel_maps=maps
+        )
+    options = {"weights": weights, "pixel_maps": maps, "variances": variances}
+    return drizzle_images(images, wcs, pixfrac=settings.pixfrac, **options), images
+
+
+def subtract_dithers(reducer, images, alone=None, wcs=None):
+    """As `~miricigale.reduction.Reducer.subtract_dithers`; ``alone`` is the background of each image by itself."""
+    if alone is None:
+        alone = [estimate_background(im, warn=False, **reducer.background.mesh) for im in images]
+    backgrounds = [
+        subtractable(background) for background in dither_backgrounds(images, alone, wcs=wcs)
+    ]
+    pairs = zip(images, backgrounds, strict=True)
+    return [remove_background(*pair, **reducer.background.negative) for pair in pairs], backgrounds
+
+
+def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes=()):
+    """
+    As `~miricigale.reduction.Reducer.combine`.
+
+    Parameters
+    ----------
+    reducer : `~miricigale.reduction.Reducer`
+        Settings.
+    images, backgrounds, rates, wcs, pixel_scale, align, planes
+        As of that method.
+
+    Returns
+    -------
+    result : `~miricigale.reduction.ReductionResult`
+    """
+    check_that(images, "images", "at least one image", "none")
+    if align is not None:
+        if isinstance(align, str) and align != "dithers":
+            raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))
+        images, _ = align_images(images, None if isinstance(align, str) else align)
+    if wcs is None:
+        wcs = own_grid(images, pixel_scale)
+    wcs = as_wcs(wcs)
+    notes = []
+    if reducer.mosaics.outlier_threshold is not None and len(images) < 3:
+        number = "a single dither" if len(images) == 1 else "two dithers"
+        notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
+    if reducer.background.method == "dithers":
+        if len(images) >= 3 and len(backgrounds) == len(images):
+            whole = [restored(im, b.level) for im, b in zip(images, backgrounds, strict=True)]
+            images, backgrounds = subtract_dithers(reducer, whole, backgrounds, wcs)
+        else:
+            notes.append("backgrounds are those of single exposures: it takes three and theirs")
+    doubts = [b for b in backgrounds if not b.trusted]
+    if doubts:
+        doubt = f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted"
+        notes.append(f"{doubt} ({_reasons(doubts)})")
+    known = len(backgrounds) == len(images)
+    whole = [im.data + b.level for im, b in zip(images, backgrounds, strict=True)] if known else []
+    drizzled, images = drizzle(reducer.mosaics, images, wcs, planes)
+    mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
+    subtracted = mosaic_background.level
+    if known:
+        # of the exposures too, and what brought them to one level
+        taken = [with_data(im, data - im.data) for im, data in zip(images, whole, strict=True)]
+        levels = drizzle_images(taken, wcs, pixfrac=reducer.mosaics.pixfrac).image
+        subtracted = subtracted + np.where(levels.mask, 0, levels.data)
+    if not mosaic_background.trusted:
+        reasons = _reasons([mosaic_background])
+        notes.append(f"the background of the mosaic cannot be trusted ({reasons})")
+    # the mosaic's own level would hide those of the dithers
+    for key in ("background", "background_error", "background_flags"):
+        mosaic.meta[f"mosaic_{key}"] = mosaic.meta.pop(key, None)
+        if key in drizzled.image.meta:
+            mosaic.meta[key] = drizzled.image.meta[key]
+    made = (
+        tuple(rates),
+        tuple(images),
+        tuple(backgrounds),
+        mosaic,
+        drizzled.weight,
+        drizzled.n_images,
+    )
+    return ReductionResult(*made, mosaic_background, subtracted, tuple(notes), drizzled.variances)
+
+
+def _reasons(backgrounds):
+    """Why backgrounds cannot be trusted."""
+    names = {name for one in backgrounds for name in BackgroundFlags.names(one.flags)}
+    return ", ".join(sorted(names)).replace("_", " ")

@@ -1,0 +1,1 @@
+"""Reduction from files to files."""

@@ -1,0 +1,1 @@
+"""Calibrated images: flags, readers, writers, repeated exposures."""

@@ -1,0 +1,380 @@
+"""Images of the pipeline's later stages as files: rates, calibrated images, mosaics."""
+
+import dataclasses
+import glob
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.nddata import CCDData
+
+from miricigale.detector import Charge, Ramp
+from miricigale.instrument import (
+    DQ,
+    ExposureHistory,
+    check_imager,
+    exposure_keywords,
+    imager_wcs,
+    joined_header,
+    kept_keywords,
+    read_dq,
+    subarrays,
+    with_own_bits,
+)
+from miricigale.instrument.data_models import is_data_model, read_data_model
+from miricigale.instrument.header_wcs import header_wcs, image_wcs
+from miricigale.instrument.image_planes import noise_kind, plane_data, plane_shape
+from miricigale.reduction.images.images import flagged_image, sigma
+from miricigale.utils.exceptions import DataError, argument_error, data_error
+from miricigale.utils.files import open_fits
+from miricigale.utils.parallel import check_memory
+from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
+
+_WANTED = "an image of JWST (FITS with SCI)"
+
+#: Planes beside the image, its errors and its flags.
+PLANES = ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT", "AREA", "WHT", "CON", "BKG")
+
+_VARIANCES = PLANES[:3]
+
+#: Keywords that become entries of the meta dictionary.
+_META = {
+    "NGROUPS": "n_groups", "NINTS": "n_integrations", "TGROUP": "group_time",
+    "PHOTMJSR": "photmjsr", "PA_APER": "pa_aper", "XPOSURE": "exposure_time",
+    "EFFEXPTM": "exposure_time", "RA_REF": "ra", "DEC_REF": "dec", "ROLL_REF": "roll",
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class ImageFile:
+    """
+    An image from a file, with all of its planes.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        With standard deviation, ``flags`` (`~miricigale.instrument.DQ`), mask (not to be used, or
+        not finite), WCS, and what `~miricigale.instrument.ImageFacts` reads in its meta dictionary.
+        Slopes are in adu / s, also of files that say DN/s.
+    planes : dict of str to `~numpy.ndarray`
+        Further planes of the file that are there: ``VAR_POISSON``, ``VAR_RNOISE``, ``VAR_FLAT``,
+        ``AREA``, ``WHT``, ``CON`` and ``BKG``.
+    header : `~astropy.io.fits.Header`
+        Keywords of the primary header and of SCI.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> exposure = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> file = Reducer().fit_ramp(ramp, planes=True)
+    >>> print(file.image.unit, sorted(file.planes))
+    adu / s ['VAR_POISSON', 'VAR_RNOISE']
+    """
+
+    image: CCDData
+    planes: Mapping
+    header: fits.Header
+
+    def __repr__(self):
+        ny, nx = self.image.shape
+        return f"<ImageFile {ny} x {nx} pixels, {self.image.unit}, {', '.join(self.planes)}>"
+
+
+def read_images(path):
+    """
+    Read an image file of the JWST pipeline, or one of our own.
+
+    Parameters
+    ----------
+    path : path-like
+        A ``_rate``, ``_rateints``, ``_cal``, ``_calints``, ``_crf`` or ``_i2d`` file of the MIRI imager, or what
+        `~miricigale.instrument.Image` wrote.
+
+    Returns
+    -------
+    files : list of `ImageFile`
+        One; or one for each integration.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing, truncated or no such image, or its planes do not fit together.
+    MemoryError
+        If it is larger than the memory.
+
+    Notes
+    -----
+    The errors are those of ERR, or, without it, of the variances. The world coordinates are
+    those of the FITS header; of a file without them, that of the gwcs in its ASDF extension (with
+    the package ``gwcs``); of a rate, whose header has their linear part only, those of the
+    imager at its pointing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> exposure = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> from miricigale.reduction import read_images, write_image
+    >>> rate = Reducer().fit_ramp(ramp, planes=True)
+    >>> path = write_image(rate, "sub64_rate.fits")  # doctest: +SKIP
+    >>> read_images("sub64_rate.fits")[0].image.unit  # doctest: +SKIP
+    """
+    path = Path(path)
+    with open_fits(path, wanted=_WANTED) as hdus:
+        if "META" in hdus[0].header and len(hdus[0].shape) == 2:
+            # as astropy names the planes of a CCDData
+            hdus[0].name = "SCI"
+            if "UNCERT" in hdus:
+                hdus["UNCERT"].name = "ERR"
+        if "SCI" not in hdus or hdus["SCI"].header.get("NAXIS") not in (2, 3):
+            raise data_error(path, f"cannot be read as {_WANTED}: it has no image in SCI")
+        header = joined_header(hdus)
+        own = json.loads(header["META"]) if "META" in header else None
+        check_imager(path, header, own=own)
+        shape = hdus["SCI"].shape
+        check_memory(24 * np.prod(shape, dtype=float), f"the image {path}", advice="cut it")
+        unit = _unit(hdus["SCI"].header, path)
+        meta = _meta(header, path) if own is None else own
+        meta.setdefault("keywords", kept_keywords(header))
+        wcs = _wcs(hdus, header, meta)
+        data = _plane(hdus, "SCI", shape, path)
+        error = _error(hdus, shape, path)
+        planes = {name: _plane(hdus, name, shape, path) for name in PLANES if name in hdus}
+        flags = _flags(hdus, shape, path)
+        if "MASK" in hdus:
+            flags |= np.where(_plane(hdus, "MASK", shape, path) != 0, int(DQ.DO_NOT_USE), 0)
+    if error is not None and not np.any(np.isfinite(error) & (error > 0)):
+        refused = "has no error in ERR, which is nowhere finite and above 0"
+        if not any(name in planes for name in _VARIANCES):
+            hint = (
+                "photometry.read_mosaic takes the errors of WHT" if "WHT" in planes else "mend it"
+            )
+            raise data_error(path, f"{refused}, and no variances: {hint}")
+        error = None
+    if error is None and (parts := [planes[name] for name in _VARIANCES if name in planes]):
+        error = np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
+    out = []
+    for number in range(shape[0]) if len(shape) == 3 else (...,):
+        one = flagged_image(
+            data[number],
+            unit,
+            error=None if error is None else error[number],
+            flags=flags[number],
+            wcs=wcs,
+            meta=meta if number is ... else {**meta, "integration": number},
+            mask=~(planes["WHT"][number] > 0) if "WHT" in planes else False,
+        )
+        part = {
+            name: plane if name == "CON" or plane.shape != shape else plane[number]
+            for name, plane in planes.items()
+        }
+        out.append(ImageFile(one, part, header))
+    return out
+
+
+def open_exposure(path):
+    """
+    Open a file of the pipeline at any stage.
+
+    Parameters
+    ----------
+    path : path-like
+        A ramp, as `~miricigale.detector.Ramp.read` takes it, or an image, as `read_images` does.
+
+    Returns
+    -------
+    exposure : `~miricigale.detector.Ramp` or `~astropy.nddata.CCDData`
+        Of a file with an image of each integration their mean, with its error.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If it is neither.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import open_exposure
+    >>> exposure = open_exposure("jw01180001001_02101_00001_mirimage_uncal.fits")  # doctest: +SKIP
+    """
+    exposure = open_file(path)
+    return exposure if isinstance(exposure, Ramp) else exposure.image
+
+
+def open_file(path):
+    """As `open_exposure`; images with their planes, `ImageFile`."""
+    with open_fits(path, wanted=_WANTED) as hdus:
+        ramp = "SCI" in hdus and hdus["SCI"].header.get("NAXIS") == 4
+    if ramp:
+        return Ramp.read(path)
+    files = read_images(path)
+    return files[0] if len(files) == 1 else _mean(files)
+
+
+def _mean(files):
+    """Mean of the integrations of an exposure; its flags are those of any, DO_NOT_USE those of all."""
+    images, error = [file.image for file in files], None
+    first = images[0]
+    mask = np.array([im.mask for im in images])
+    count = np.ma.masked_equal(np.count_nonzero(~mask, axis=0), 0)
+
+    def total(values):
+        return np.where(mask, 0, values).sum(axis=0, dtype=float)
+
+    mean = total([im.data for im in images]) / count
+    if all(im.uncertainty is not None for im in images):
+        error = np.sqrt(total([np.square(sigma(im)) for im in images])) / count
+        error = error.filled(np.nan)
+    flags = np.bitwise_or.reduce([im.flags for im in images]) & ~int(DQ.DO_NOT_USE)
+    flags |= np.where(mask.all(axis=0), int(DQ.DO_NOT_USE), 0)
+    image = flagged_image(
+        mean.filled(np.nan),
+        first.unit,
+        error=error,
+        flags=flags,
+        wcs=first.wcs,
+        meta=shared_meta(first),
+    )
+    planes = {
+        name: (total([file.planes[name] for file in files]) / count**2).filled(np.nan)
+        for name in _VARIANCES
+        if name in files[0].planes
+    }
+    return ImageFile(image, planes, files[0].header)
+
+
+def scaled_planes(planes, before, after):
+    """Variances and areas of an image, after it was multiplied as its errors say."""
+    kept = {"AREA": planes["AREA"]} if "AREA" in planes else {}
+    if before.uncertainty is None:
+        return kept
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.square(sigma(after) / sigma(before))
+    return kept | {name: planes[name] * factor for name in _VARIANCES if name in planes}
+
+
+def shared_meta(one):
+    """The meta dictionary of an exposure, of an image of one of its integrations."""
+    return {key: value for key, value in one.meta.items() if key != "integration"}
+
+
+def _unit(header, path):
+    """Unit of an image; DN is what astropy's CCDData and this package call adu."""
+    text = str(header.get("BUNIT", "")).strip()
+    try:
+        unit = u.Unit(text.replace("counts", "DN")) if text else None
+    except ValueError:
+        unit = None
+    brightness = SURFACE_BRIGHTNESS
+    for known, own in ((u.Unit("DN/s"), RATE), (RATE, RATE), (brightness, brightness)):
+        if unit is not None and unit.is_equivalent(known):
+            factor = unit.to(known)
+            return own if factor == 1 else u.Unit(factor * own)
+    wanted = "must state in BUNIT that it is a rate (DN/s, adu/s) or a surface brightness (MJy/sr)"
+    raise data_error(path, f"{wanted}, got {text!r}")
+
+
+def _plane(hdus, name, shape, path):
+    if name not in hdus:
+        return None
+    data = hdus[name].data
+    # maps and counts are those of all integrations
+    same = slice(-2, None) if name in ("CON", "AREA") else slice(None)
+    if data is None or data.shape[same] != shape[same]:
+        got = None if data is None else data.shape
+        raise data_error(path, f"must have {shape} pixels in {name}, as in SCI, got {got}")
+    kind = data.dtype.newbyteorder("=") if data.dtype.kind in "iu" else np.float32
+    return np.array(data, kind)
+
+
+def _error(hdus, shape, path):
+    """Standard deviation in ERR; a variance or its inverse if UTYPE says so; None without data."""
+    if "ERR" in hdus and hdus["ERR"].shape == ():
+        if plane_shape(hdus["ERR"]) != shape:
+            return None
+        return plane_data(hdus["ERR"])
+    values = _plane(hdus, "ERR", shape, path)
+    if values is None:
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kind = noise_kind(hdus["ERR"])
+        if kind == "variance":
+            return np.sqrt(values)
+        if kind == "inverse_variance":
+            return 1 / np.sqrt(values)
+    return values
+
+
+def _flags(hdus, shape, path):
+    if "DQ" not in hdus:
+        return np.zeros(shape, np.int64)
+    hdu = hdus["DQ"]
+    # planes without our legend are JWST's own
+    flags = read_dq(hdu) if "DQSCHEME" in hdu.header else np.asarray(hdu.data).astype(np.int64)
+    if flags.shape != shape:
+        raise data_error(path, f"must have {shape} pixels in DQ, as in SCI, got {flags.shape}")
+    return with_own_bits(flags, hdus)
+
+
+def _meta(header, path):
+    """Facts of an image from the keywords of JWST."""
+    meta = {name: header[key] for key, name in _META.items() if header.get(key) is not None}
+    name, readout, part, meta["dither"] = exposure_keywords(header)
+    part = part if part in subarrays() else None
+    stated = {"filter": name, "subarray": part, "readout": readout}
+    meta |= {key: value for key, value in stated.items() if value is not None}
+    meta |= ExposureHistory.from_header(header).meta()
+    meta["source"] = path.name
+    return meta
+
+
+def _wcs(hdus, header, meta):
+    """World coordinates of an image; None without any."""
+    pointed = all(name in meta for name in ("ra", "dec", "roll", "subarray"))
+    done = str(header.get("S_WCS", "")).strip().upper() == "COMPLETE"
+    if pointed and not done and "META" not in header:
+        # a rate: the header has the linear part
+        pointing = SkyCoord(meta["ra"] * u.deg, meta["dec"] * u.deg)
+        return imager_wcs(pointing, meta["roll"] * u.deg, subarray=meta["subarray"])
+    science = hdus["SCI"].header
+    if done:
+        wcs = image_wcs(science, hdus)
+    else:
+        wcs = header_wcs(science, where=hdus.filename())
+    if wcs is None:
+        return None
+    wcs.pixel_shape = (science["NAXIS1"], science["NAXIS2"])
+    return wcs
+
+
+def opened(given):
+    """An exposure of its file or data model; anything else itself."""
+    if is_data_model(given):
+        return read_data_model(given, open_exposure)
+    return open_exposure(given) if isinstance(given, (str, os.PathLike)) else given
+
+
+def several(given):
+    """Exposures of one, of a pattern of files, or of several."""
+    if isinstance(given, str) and glob.has_magic(given) and not os.path.exists(given):
+        paths = sorted(glob.glob(os.path.expanduser(given)))
+        if not paths:
+            msg = f"no file is called {given}"
+            raise DataError(msg)
+        return paths
+    if isinstance(given, (str, os.PathLike)) and os.path.isdir(given):
+        wanted = f"files, such as {os.path.join(given, '*_uncal.fits')!r}"
+        raise argument_error("ramps", wanted, "a folder")
+    one = isinstance(given, (str, os.PathLike, Ramp, Charge, CCDData)) or is_data_model(given)
+    return [given] if one else given

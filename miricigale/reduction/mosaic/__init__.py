@@ -1,0 +1,1 @@
+"""Mosaics of images, and rejection of outliers."""

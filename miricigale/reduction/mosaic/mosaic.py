@@ -1,0 +1,483 @@
+"""Dithers to one image by drizzling."""
+
+import dataclasses
+
+import drizzle
+import numpy as np
+from astropy.nddata import CCDData
+from astropy.wcs import NoConvergence
+from astropy.wcs.utils import proj_plane_pixel_area
+from drizzle.resample import Drizzle
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import distance_transform_edt
+
+from miricigale.instrument import DQ, ExposureHistory, ImageFacts
+from miricigale.instrument.sky_axes import pixel_to_radec, radec_axes
+from miricigale.reduction.images.files import PLANES
+from miricigale.reduction.images.images import (
+    check_images,
+    check_overlap,
+    flagged_image,
+    overlaps,
+    plain_mask,
+    sigma,
+)
+from miricigale.utils import sep_tools
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
+
+# pixels of the boxes by which the variance that gives weights is smoothed
+_WEIGHT_BOX = 32
+# share of the area of a map of pixels that is covered at least, but for so many pixels of the grid
+_LEAST_COVERED = 0.7
+_FEW_PIXELS = 25
+# nodes of the grid on which a distorted WCS is evaluated; between them bicubic splines
+_NODES = 49
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Mosaic:
+    """
+    A drizzled image.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        Surface brightness in the unit of the inputs, with uncertainty, mask and WCS.
+    weight : `~numpy.ndarray` of float32, shape (ny, nx)
+        Sum of the inverse variances that went into each pixel (area-weighted).
+    n_images : `~numpy.ndarray` of uint8, shape (ny, nx)
+        Number of inputs that touch each pixel.
+    variances : dict of str to `~numpy.ndarray`
+        Parts of the variance of a pixel (``VAR_POISSON``, ``VAR_RNOISE``, ``VAR_FLAT``) that all inputs have.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import drizzle_images
+    >>> drizzle_images(images, wcs)
+    <Mosaic 100 x 100 pixels of 3 images>
+    """
+
+    image: CCDData
+    weight: np.ndarray
+    n_images: np.ndarray
+    variances: dict = dataclasses.field(default_factory=dict)
+
+    def __repr__(self):
+        ny, nx = self.weight.shape
+        return f"<Mosaic {ny} x {nx} pixels of {int(self.n_images.max())} images>"
+
+
+def pixel_map(wcs_in, wcs_out, shape):
+    """
+    Where the pixels of one image lie in another.
+
+    Parameters
+    ----------
+    wcs_in, wcs_out : `~astropy.wcs.WCS`
+        Distorted or not.
+    shape : tuple of int
+        ``(ny, nx)`` of the first image.
+
+    Returns
+    -------
+    x, y : `~numpy.ndarray`, shape (ny, nx)
+        Coordinates in the second image. Polynomial distortion is evaluated on a grid of 49
+        x 49 nodes and interpolated by bicubic splines (1e-5 pixels or better); tables of
+        distortion are followed pixel by pixel. NaN on the other side of the sky.
+
+    Raises
+    ------
+    ValueError
+        If the distortion of ``wcs_out`` cannot be inverted there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import pixel_map
+    >>> finer = north_up_wcs(field, 0.055 * u.arcsec, (200, 200))
+    >>> x, y = pixel_map(wcs, finer, (100, 100))
+    >>> x[0, :3].round(2)
+    array([0.5, 2.5, 4.5])
+    """
+    ny, nx = shape
+    smooth = not any(
+        getattr(w, name, None) is not None
+        for w in (wcs_in, wcs_out)
+        for name in ("cpdis1", "cpdis2", "det2im1", "det2im2")
+    )
+    if smooth and min(ny, nx) > _NODES:
+        nodes_y, nodes_x = (np.linspace(0, n - 1, _NODES) for n in (ny, nx))
+    else:
+        nodes_y, nodes_x = np.arange(ny, dtype=float), np.arange(nx, dtype=float)
+    grid_x, grid_y = np.meshgrid(nodes_x, nodes_y)
+    sky = pixel_to_radec(wcs_in, grid_x.ravel(), grid_y.ravel())
+    world = radec_axes(wcs_out, *sky)
+    try:
+        found = wcs_out.all_world2pix(*world, 0)
+    except NoConvergence:
+        wanted = "a WCS whose distortion can be inverted where the image lies"
+        raise argument_error(
+            "wcs_out (the grid's wcs)", wanted, "one that diverges there"
+        ) from None
+    x, y = (np.reshape(values, grid_x.shape) for values in found)
+    if x.shape == (ny, nx):
+        return x, y
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        # splines know no NaN; images on the other side of the sky come here
+        return np.full((2, ny, nx), np.nan)
+    rows, columns = np.arange(ny, dtype=float), np.arange(nx, dtype=float)
+    return tuple(RectBivariateSpline(nodes_y, nodes_x, values)(rows, columns) for values in (x, y))
+
+
+def weight_map(source):
+    """
+    Inverse variance of an image that does not follow the data of single pixels.
+
+    Parameters
+    ----------
+    source : `~astropy.nddata.CCDData`
+        With uncertainty.
+
+    Returns
+    -------
+    weight : `~numpy.ndarray` of float32, shape (ny, nx)
+        Zero where the image is masked.
+
+    Notes
+    -----
+    The variance of a pixel is estimated from its own counts: weights by it would favor
+    pixels that fluctuated low, and lower the mosaic by about sigma^2 / rate. It is smoothed
+    by boxes of 32 pixels (their clipped modes, and medians of 3 x 3 boxes).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import weight_map
+    >>> print(f"{weight_map(images[0]).mean():.0f} per (MJy/sr)^2")
+    100 per (MJy/sr)^2
+    """
+    mask = plain_mask(source)
+    variance = np.square(np.asarray(sigma(source), float))
+    bad = mask | ~np.isfinite(variance) | (variance <= 0)
+    if bad.all():
+        return np.zeros(mask.shape, np.float32)
+    typical = np.median(variance[~bad])
+    smooth, _ = sep_tools.background(variance / typical, bad, _WEIGHT_BOX)
+    # the spline between boxes may overshoot: weights stay within a factor of ten
+    smooth = np.clip(smooth, 0.1, 10.0) * typical
+    return np.where(bad, 0.0, 1.0 / smooth).astype(np.float32)
+
+
+def noise_correction(pixfrac, ratio):
+    """
+    Noise of large areas of a drizzled image over what its pixels' noise says.
+
+    Parameters
+    ----------
+    pixfrac : float
+        Side of the drops in input pixels.
+    ratio : float
+        Side of an output pixel over that of an input pixel.
+
+    Returns
+    -------
+    factor : float
+        At least 1: drizzling correlates neighbors, so that the sum over N pixels is this
+        factor noisier than the pixels' errors in quadrature.
+
+    References
+    ----------
+    Fruchter & Hook 2002, PASP 114, 144, eqs. 9 and 10.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import noise_correction
+    >>> print(f"{noise_correction(pixfrac=1.0, ratio=0.06 / 0.11):.2f}")
+    2.24
+    """
+    r = pixfrac / ratio
+    return r / (1 - 1 / (3 * r)) if r >= 1 else 1 / (1 - r / 3)
+
+
+def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, variances=()):
+    """
+    Drizzle images onto one grid.
+
+    Parameters
+    ----------
+    images : list of `~astropy.nddata.CCDData`
+        Surface brightness in one unit, with uncertainty and WCS; masked pixels get no
+        weight.
+    wcs : `~astropy.wcs.WCS`
+        Of the output, with its ``pixel_shape``.
+    pixfrac : float, optional
+        Side of the drops in input pixels, 0-1.
+    weights : list of `~numpy.ndarray`, optional
+        Weight of each pixel; by default `weight_map`.
+    pixel_maps : list of (x, y), optional
+        Results of `pixel_map`, if they are there already. Pixels whose place is not finite have no weight.
+    variances : list of dict of str to `~numpy.ndarray`, optional
+        Parts of the variance of each image by name, as the planes of an `ImageFile`; they go through as
+        the variance does.
+
+    Returns
+    -------
+    mosaic : `Mosaic`
+        The brightness is the area- and weight-weighted mean (square kernel), so that the
+        sum of brightness times pixel area is conserved. Variances go through with squared
+        weights. ``image.meta["noise_correction"]`` says by how much sums over many
+        pixels are noisier than these variances state (`noise_correction`).
+
+    Raises
+    ------
+    ValueError
+        If there are no images, they are not surface brightness of one unit and filter, or
+        the output has no shape or lies elsewhere on the sky; or if drizzle covers less than 0.7 of the area of
+        an image's map of pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.coordinates import SkyCoord
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
+    >>> from miricigale.instrument import north_up_wcs
+    >>> field = SkyCoord(53, -27, unit="deg")
+    >>> wcs = north_up_wcs(field, 0.11 * u.arcsec, (100, 100))
+    >>> rng = np.random.default_rng(1)
+    >>> error = StdDevUncertainty(np.full((100, 100), 0.1))
+    >>> images = [
+    ...     CCDData(
+    ...         rng.normal(level, 0.1, (100, 100)),
+    ...         unit="MJy/sr",
+    ...         uncertainty=error,
+    ...         wcs=wcs,
+    ...     )
+    ...     for level in (5.0, 5.2, 5.1)
+    ... ]
+    >>> from miricigale.reduction import drizzle_images
+    >>> finer = north_up_wcs(field, 0.06 * u.arcsec, (180, 180))
+    >>> mosaic = drizzle_images(images, finer)
+    >>> print(f"{np.nanmean(mosaic.image.data):.2f} MJy/sr")
+    5.10 MJy/sr
+    """
+    images = list(images)
+    check_images(images, wcs)
+    check_that(0 < pixfrac <= 1, "pixfrac", "above 0 and at most 1", pixfrac)
+    shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
+    if pixel_maps is None:
+        pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+    check_overlap(pixel_maps, shape)
+    weights = [weight_map(im) for im in images] if weights is None else list(weights)
+    # drizzle works in float32: weights near one
+    medians = [np.median(w[w > 0]) for w in weights if np.any(w > 0)]
+    unit_weight = float(np.median(medians)) if medians else 1.0
+
+    sink = Drizzle(
+        kernel="square", fillval="NAN", fillval2="NAN", out_shape=shape, disable_ctx=True
+    )
+    n_images = np.zeros(shape, np.uint8)
+    before = np.zeros(shape, np.float32)
+    variances = list(variances) or [{}] * len(images)
+    names = [name for name in PLANES[:3] if all(name in own for own in variances)]
+    for im, own, weight, (x, y) in zip(images, variances, weights, pixel_maps, strict=True):
+        nowhere = ~(np.isfinite(x) & np.isfinite(y))
+        if nowhere.all():
+            continue
+        if nowhere.any():
+            x, y = (_filled(values, nowhere) for values in (x, y))
+        # an image of many may reach a small part of the grid
+        part = extent_of((x, y), shape)
+        weight = np.where(plain_mask(im) | nowhere, 0.0, np.asarray(weight) / unit_weight)
+        weight = weight.astype(np.float32)
+        if part is None or not weight.any():
+            continue
+        parts = [np.square(np.asarray(sigma(im), float)), *(own[name] for name in names)]
+        parts = [np.where(weight > 0, plane, 0.0).astype(np.float32) for plane in parts]
+        add_image(sink, im, weight, (x, y), wcs, pixfrac, data2=parts)
+        touched = sink.out_wht[part] > before[part]
+        _check_covered(touched, (x, y), weight > 0, shape, pixfrac)
+        n_images[part] += touched
+        before[part] = sink.out_wht[part]
+
+    if n_images.any():
+        data, parts, weight = sink.out_img, sink.out_img2, sink.out_wht
+    else:
+        data = np.full(shape, np.nan, np.float32)
+        parts, weight = [data] * (1 + len(names)), np.zeros(shape, np.float32)
+    covered = (weight > 0) & np.isfinite(data)
+    flags = np.where(covered, 0, int(DQ.NON_SCIENCE | DQ.DO_NOT_USE))
+    ratio = _scale(wcs) / float(np.mean([_scale(im.wcs) for im in images]))
+    before_drizzle = float(np.mean([ImageFacts.of(im).noise_correction for im in images]))
+    # an exposure without any usable pixel was not long
+    pairs = zip(images, weights, strict=True)
+    alive = [im for im, weight in pairs if np.any((np.asarray(weight) > 0) & ~plain_mask(im))]
+    meta = _meta(alive or images) | {
+        "pixfrac": float(pixfrac),
+        "pixel_scale": _scale(wcs) * 3600,
+        "noise_correction": noise_correction(pixfrac, ratio) * before_drizzle,
+    }
+    out = flagged_image(
+        np.where(covered, data, np.nan),
+        images[0].unit,
+        error=np.sqrt(np.where(covered, parts[0], np.nan)),
+        flags=flags,
+        wcs=wcs,
+        meta=meta,
+    )
+    weight = (weight * np.float32(unit_weight)).astype(np.float32)
+    return Mosaic(out, weight, n_images, dict(zip(names, parts[1:], strict=True)))
+
+
+def _check_covered(touched, pixel_map, used, shape, pixfrac):
+    """
+    Refuse a mosaic in which the area of an image is not that of its map of pixels.
+
+    Versions of drizzle have left out half of an image, or all of it, for one pixel of a map. ``touched`` are the
+    pixels of the grid that got some light, ``used`` those of the image that have a weight.
+    """
+    x, y = pixel_map
+    ny, nx = shape
+    if min(x.shape) < 2:
+        return
+    area = _pixel_area(x, y)
+    # whole pixels within the grid
+    reach = 0.5 * np.sqrt(area)
+    inside = used & (x > reach) & (x < nx - 1 - reach) & (y > reach) & (y < ny - 1 - reach)
+    expected = np.count_nonzero(inside) * area * pixfrac**2
+    covered = np.count_nonzero(touched)
+    if covered < _LEAST_COVERED * expected - _FEW_PIXELS:
+        wanted = f"a map that drizzle {drizzle.__version__} follows"
+        got = f"one of {expected:.0f} pixels of the grid, of which {covered} are covered"
+        raise argument_error("pixel_maps", wanted, got)
+
+
+def _pixel_area(x, y):
+    """Typical area of a pixel of an image in pixels of the grid, by its map."""
+    rows = np.arange(0, x.shape[0] - 1, 16)[:, None]
+    columns = np.arange(0, x.shape[1] - 1, 16)
+    along = x[rows, columns + 1] - x[rows, columns], y[rows, columns + 1] - y[rows, columns]
+    across = x[rows + 1, columns] - x[rows, columns], y[rows + 1, columns] - y[rows, columns]
+    return float(np.median(np.abs(along[0] * across[1] - along[1] * across[0])))
+
+
+def _filled(values, nowhere):
+    """
+    Coordinates with finite ones where there are none.
+
+    drizzle leaves out far more than the pixels of a map that are NaN, and takes corners of pixels from their
+    neighbors: they are filled by a plane through the others and what the nearest of these is off it.
+    """
+    y, x = np.nonzero(~nowhere)
+    terms = np.stack([np.ones(x.size), x, y], axis=1)
+    plane, *_ = np.linalg.lstsq(terms, values[~nowhere], rcond=None)
+    rows, columns = np.indices(values.shape)
+    smooth = plane[0] + plane[1] * columns + plane[2] * rows
+    nearest = distance_transform_edt(nowhere, return_distances=False, return_indices=True)
+    return np.where(nowhere, smooth + (values - smooth)[tuple(nearest)], values)
+
+
+def add_image(sink, im, weight, pixel_map, wcs, pixfrac=1.0, **planes):
+    """Drizzle an image onto a grid."""
+    sink.add_image(
+        np.where(weight > 0, im.data, 0.0).astype(np.float32),
+        exptime=1.0,
+        pixmap=np.dstack(pixel_map),
+        weight_map=weight,
+        pixfrac=float(pixfrac),
+        pixel_scale_ratio=_scale(wcs) / _scale(im.wcs),
+        in_units="cps",
+        **planes,
+    )
+
+
+def extent_of(pixel_map, shape):
+    """Rows and columns of a grid that an image reaches, or None: it lies beside the grid."""
+    if not overlaps(pixel_map, shape):
+        return None
+    x, y = pixel_map
+    ends = [(np.nanmin(values) - 2, np.nanmax(values) + 3) for values in (y, x)]
+    return tuple(
+        slice(max(0, int(low)), min(n, int(high) + 1))
+        for (low, high), n in zip(ends, shape, strict=True)
+    )
+
+
+def _scale(wcs):
+    """Side of a pixel at the reference position, deg."""
+    return float(np.sqrt(proj_plane_pixel_area(wcs)))
+
+
+def _meta(images):
+    """What the inputs say of themselves, put together."""
+    metas = [im.meta for im in images]
+    meta = {"n_exposures": len(images)}
+    for key in ("exposure_time", "n_negative", "n_outliers"):
+        if all(key in m for m in metas):
+            meta[key] = sum(m[key] for m in metas)
+    for key in ("pa_aper", "dither", "background", "background_error", "background_flags"):
+        if all(key in m for m in metas):
+            meta[key] = [m[key] for m in metas]
+    if any(words := [m.get("keywords", {}) for m in metas]):
+        shared = {k: card for k, card in words[0].items() if all(w.get(k) == card for w in words)}
+        # its pixels are others
+        meta["keywords"] = {k: card for k, card in shared.items() if not k.startswith("PIXAR")}
+    done = frozenset.intersection(*(ExposureHistory.of(im).steps for im in images))
+    meta["steps"] = sorted(done | {"resample"})
+    for key in metas[0]:
+        if key not in meta and all(m.get(key) == metas[0][key] for m in metas):
+            meta[key] = metas[0][key]
+    return meta

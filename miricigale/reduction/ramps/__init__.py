@@ -1,0 +1,1 @@
+"""Slopes of ramps: fits, settling, showers, reference pixels."""

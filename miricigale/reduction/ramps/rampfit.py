@@ -1,0 +1,381 @@
+"""
+Ramps to slopes: saturation, reference columns, linearity, jumps and the fit in one pass.
+
+The slope is the exact generalized-least-squares one for Poisson and read noise (Brandt
+2024a), and a jump is what raises the likelihood by more than a threshold (Brandt 2024b);
+see `miricigale.reduction._core` for the closed forms.
+
+Weights depend on the slope through the Poisson variance. That biases a fit whose variances
+are taken from the differences themselves; here the variance comes from the pixel's own
+optimal slope, common to all segments and integrations. Any change of the weights then adds
+a contrast of differences that is uncorrelated with this slope (Gauss-Markov theorem), so
+that there is no bias to first order.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from miricigale.depth._core import shared_photons
+from miricigale.instrument import DQ
+from miricigale.reduction._core.batched_pixels import fit_pixels
+from miricigale.reduction._core.pixel import own_charge
+from miricigale.reduction.ramps.showers import find_showers
+from miricigale.reduction.references.reference_maps import read_variance
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_positive, check_that
+from miricigale.utils.parallel import chunks, parallel_map, threads
+from miricigale.utils.units import check_count
+
+# rows that one call of the kernel fits; the events come out in this order
+_ROWS = 32
+
+# pixels that are fitted again in one call
+_PIXELS = 4096
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class RampFit:
+    """
+    Slopes of the ramps of one exposure.
+
+    Parameters
+    ----------
+    rate : `~numpy.ndarray` of float32, shape (ny, nx)
+        Slope in DN/s; NaN where there is none.
+    var_poisson, var_read : `~numpy.ndarray` of float32, shape (ny, nx)
+        The two parts of its variance, (DN/s)^2: of photons, and of the read-out.
+    n_used : `~numpy.ndarray` of int16, shape (ny, nx)
+        Differences of groups that the slope stands on, all integrations.
+    n_jump : `~numpy.ndarray` of int16, shape (ny, nx)
+        Jumps found in the pixel.
+    flags : `~numpy.ndarray` of int64, shape (ny, nx)
+        `~miricigale.instrument.DQ`.
+    jumps : `~numpy.ndarray`, shape (n_jumps,)
+        Every jump found: structured array with ``y``, ``x``, ``integration``, ``group`` (the
+        first after the jump) and signed ``significance`` in sigma.
+    settling : int or None, optional
+        First groups that had not settled after the reset (`settling_groups`); None if they were not looked at.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from miricigale import Detector, Exposure, Reducer
+    >>> exposure = Exposure("F770W", n_groups=20, subarray="SUB64", pointing="53 -27")
+    >>> sky = np.full(exposure.shape, 5.0) * u.MJy / u.sr
+    >>> ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    >>> fit = Reducer().fit_groups(ramp)
+    >>> print(f"{np.nanmedian(fit.rate):.1f} +- {np.nanmedian(fit.error):.1f} DN/s")
+    14.2 +- 3.0 DN/s
+    """
+
+    rate: np.ndarray
+    var_poisson: np.ndarray
+    var_read: np.ndarray
+    n_used: np.ndarray
+    n_jump: np.ndarray
+    flags: np.ndarray
+    jumps: np.ndarray
+    settling: int | None = None
+
+    @property
+    def error(self):
+        """Standard deviation of the slope, DN/s."""
+        return np.sqrt(self.var_poisson + self.var_read)
+
+    def noise_correction(self, kernel):
+        """
+        Noise of large areas over that of single pixels in quadrature.
+
+        Parameters
+        ----------
+        kernel : `~numpy.ndarray`
+            How pixels share their charge; its sum is 1.
+
+        Returns
+        -------
+        factor : float
+            Of the medians of the two parts of the variance; 1 without any slope.
+        """
+        good = np.isfinite(self.rate)
+        if not good.any():
+            return 1.0
+        photon, read = (float(np.median(v[good])) for v in (self.var_poisson, self.var_read))
+        shared = float(np.sum(kernel**2))
+        return float(np.sqrt((photon / shared + read) / (photon + read)))
+
+    def __repr__(self):
+        ny, nx = self.rate.shape
+        return f"<RampFit {ny} x {nx} pixels, {len(self.jumps)} jumps>"
+
+
+_JUMP_TYPE = np.dtype(
+    [("y", "i4"), ("x", "i4"), ("integration", "i4"), ("group", "i4"), ("significance", "f8")]
+)
+
+
+def fit_groups(
+    data,
+    maps,
+    *,
+    group_time,
+    drift=0.0,
+    usable=None,
+    group_dq=None,
+    first_group=0,
+    last_group=None,
+    jump_threshold=5.0,
+    neighbor_threshold=10.0,
+    shower_threshold=None,
+    poisson_factor=1.0,
+    n_frames=1,
+    n_threads=None,
+    progress_bar=False,
+):
+    """
+    Fit slopes to ramps, splitting them at jumps.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (n_int, n_group, ny, nx)
+        Groups in DN (one read each). It is read row by row and never copied as a whole.
+    maps : `DetectorMaps`
+        What the detector is taken for. The variance of rounding, 1/12, is added to that of reads
+        for integer data; the gain is infinite where photons make no noise. Of ``reset`` and
+        ``dark`` the last integration stands for all further ones, and a dark has no fewer groups
+        than are fitted.
+    group_time : float
+        Time between groups, s.
+    drift : array_like, shape (n_int, n_group) or (n_int, n_group, 1 or ny, 4), optional
+        What is added to the bias in each group, DN; of the four channels of the read-out, to which
+        columns belong in turn, and of rows.
+    usable : `~numpy.ndarray` of bool, shape (ny, nx), optional
+        Pixels to fit; the others get NaN.
+    group_dq : `~numpy.ndarray` of uint8, shape of the data, optional
+        Flags of groups (lower bits of `~miricigale.instrument.DQ`): of one that is not to be used
+        both differences are cut, of a jump that before it, and a saturated one ends its integration.
+    first_group, last_group : int, optional
+        Range of groups that take part (``last_group`` is not included).
+    jump_threshold : float or None, optional
+        A difference of groups is cut out if freeing it lowers chi squared by more than the
+        square of this; None for no jump detection.
+    neighbor_threshold : float or None, optional
+        Where a jump is more significant than this, the four neighbors are cut at the same
+        difference too. What leaked into it (0.05 of the jumps of its own four neighbors) does not count,
+        so that the neighbors of pixels beside a hit are not cut for the leak of that hit.
+    shower_threshold : float or None, optional
+        Around tracks of jumps of 300 sigma together, differences are cut where the excess over the groups beside,
+        smoothed over 4 pixels, is above so many sigma: showers. None for none.
+    n_frames : int, optional
+        Frames whose mean a group is. Then read noise is that of one frame, neighboring differences share photons,
+        a jump takes the differences beside it too, and a group whose last frame is saturated ends the ramp.
+    poisson_factor : float, optional
+        Variance of the photon noise of a pixel over that of independent electrons: below 1
+        where neighbors share charge (interpixel capacitance), by the sum of the squared
+        coupling kernel.
+    n_threads : int, optional
+        Number of threads; by default one for each processor. It changes nothing in the
+        result.
+    progress_bar : bool, optional
+        Whether a progress bar is shown.
+
+    Returns
+    -------
+    fit : `RampFit`
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two groups or an option is out of range.
+
+    Notes
+    -----
+    All integrations share one slope, so that they are combined with the optimal weights
+    and a jump is judged against all of them. A ramp of two differences cannot tell which
+    of them jumped: the higher one is cut. A single difference is never cut.
+
+    References
+    ----------
+    Brandt 2024a, PASP 136, 045004; 2024b, PASP 136, 045005; Hu & O'Connell 1996, J. Phys. A
+    29, 1511 (inverse of a tridiagonal Toeplitz matrix).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.reduction import DetectorMaps, fit_groups
+    >>> groups = np.zeros((1, 20, 4, 4), np.uint16)
+    >>> groups += np.arange(0, 200, 10, dtype=np.uint16)[:, None, None]
+    >>> groups[:, 12:, 2, 3] += 500  # a hit
+    >>> maps = DetectorMaps(gain=4.0, read_noise=6.0)
+    >>> fit = fit_groups(groups, maps, group_time=2.0)
+    >>> print(f"{fit.rate[2, 3]:.2f} DN/s, jump in group {fit.jumps['group'][0]}")
+    5.00 DN/s, jump in group 12
+    """
+    data = np.asarray(data)
+    check_that(data.ndim == 4, "data", "of four dimensions", f"shape {data.shape}")
+    _n_int, n_group, ny, nx = data.shape
+    last_group = n_group if last_group is None else last_group
+    if not 0 <= first_group <= last_group - 2 <= n_group - 2:
+        wanted = f"a range of at least two of the {n_group} groups"
+        raise argument_error("first_group, last_group", wanted, f"{first_group}, {last_group}")
+    for name, value in (("group_time", group_time), ("poisson_factor", poisson_factor)):
+        check_that(np.isfinite(value) and value > 0, name, "positive", value)
+    n_frames = check_count(n_frames, "n_frames")
+    jump = threshold(jump_threshold, "jump_threshold")
+    neighbor = threshold(neighbor_threshold, "neighbor_threshold")
+    shower = threshold(shower_threshold, "shower_threshold")
+    usable = np.ones((ny, nx), bool) if usable is None else np.ascontiguousarray(usable, bool)
+    check_that(usable.shape == (ny, nx), "usable", f"of shape {(ny, nx)}", usable.shape)
+
+    gain = _map(maps.gain, "gain", usable, above=0.0, infinite=True)
+    read_noise = _map(maps.read_noise, "read_noise", usable, least=0.0)
+    slow_noise = _map(maps.slow_noise, "slow_noise", usable, least=0.0)
+    bias = _map(maps.bias, "bias", usable)
+    saturation = _map(maps.saturation, "saturation", usable, infinite=True)
+    coef = np.stack([_map(plane, "linearity", usable) for plane in maps.linearity])
+    drift = _drift(drift, data.shape)
+    if bias.size == 1:
+        # one sum for all pixels
+        drift, bias = bias[0, 0] + drift, np.zeros((1, 1))
+    reset = _groups(maps.reset, "reset", data.shape)
+    dark = _groups(maps.dark, "dark", data.shape, least=last_group)
+    if group_dq is None:
+        group_dq = np.zeros((1, 0, 1, 1), np.uint8)
+    elif np.shape(group_dq) != data.shape or np.asarray(group_dq).dtype != np.uint8:
+        got = f"{np.asarray(group_dq).dtype}, shape {np.shape(group_dq)}"
+        raise argument_error("group_dq", f"uint8, of shape {data.shape}", got)
+    group_dq = _plain(group_dq)
+
+    data = _plain(data)
+    variance = read_variance(read_noise, n_frames, rounded=data.dtype.kind in "iu")
+    out = tuple(np.full((ny, nx), np.nan, np.float32) for _ in range(3))
+    out += tuple(np.zeros((ny, nx), kind) for kind in (np.int16, np.int16, np.int64))
+    rise = (n_frames - 1) / (2 * n_frames)
+    ramp = (data, (drift, bias, reset), (coef, saturation, dark, rise))
+    # a trace of read noise keeps the closed forms finite
+    shared = shared_photons(n_frames)
+    noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise), shared)
+    fit = (first_group, last_group, noise, 1 / group_time, jump)
+
+    def fit_part(part):
+        ys, xs, start, cuts = part
+        events = fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out)
+        return events[np.lexsort(events.T[3::-1])]
+
+    def fit_rows(rows):
+        ys, xs = np.nonzero(usable[rows])
+        none = np.zeros(len(ys) + 1, np.int64)
+        # a copy, as all others are contiguous: for another layout the kernel would be compiled again
+        return fit_part((ys + rows.start, xs.copy(), none, none[:0]))
+
+    with threads(n_threads) as executor:
+        options = {"executor": executor, "progress_bar": progress_bar, "desc": "slopes"}
+        events = np.concatenate(parallel_map(fit_rows, chunks(ny, _ROWS), **options))
+        n_diff = last_group - first_group - 1
+        showers = np.zeros((4, 0), np.int64)
+        if np.isfinite(shower):
+            showers = find_showers(
+                data, events, usable, shower, first_group=first_group, last_group=last_group
+            )
+        parts = list(_again(events, neighbor, usable, n_diff, showers))
+        parallel_map(fit_part, parts, executor=executor)
+
+    return fit_result(*out, events, first_group)
+
+
+def _plain(array):
+    """One type of array for the compiled kernels, also of arrays that own no memory."""
+    array = np.ascontiguousarray(array).view()
+    array.flags.writeable = False
+    return array
+
+
+def _map(values, name, usable, *, above=-np.inf, least=-np.inf, infinite=False):
+    """One value (1, 1), or one for each pixel, that is in range wherever it is used."""
+    values = np.array(values, float, ndmin=2, order="C")
+    if values.shape not in ((1, 1), usable.shape):
+        raise argument_error(name, f"one number or of shape {usable.shape}", values.shape)
+    good = (values > above) & (values >= least) & (np.isfinite(values) | infinite)
+    bad = ~good if values.size == 1 else ~good & usable
+    wanted = "positive" if above == 0 else "at least 0" if least == 0 else "finite"
+    got = values[0, 0] if values.size == 1 else f"{np.count_nonzero(bad)} pixels with others"
+    check_that(not bad.any(), name, wanted, got)
+    # the value of pixels that are not used must not stop the others beside them
+    return np.where(good, values, 1.0)
+
+
+def _drift(values, shape):
+    """Drift of the read-out as (n_int, n_group, rows, channels)."""
+    values = np.asarray(values, float)
+    if values.ndim <= 2:
+        values = np.broadcast_to(values, shape[:2])[:, :, None, None]
+    fits = values.ndim == 4 and values.shape[:2] == shape[:2] and values.shape[2] in (1, shape[2])
+    if not fits or values.shape[3] not in (1, 4) or not np.isfinite(values).all():
+        wanted = f"finite, of shape {shape[:2]} or {(*shape[:2], '1 or ' + str(shape[2]), 4)}"
+        raise argument_error("drift", wanted, f"shape {values.shape}")
+    return np.array(values, order="C")
+
+
+def _groups(values, name, shape, *, least=0):
+    """Maps of groups and integrations, float32; what is not finite there is taken as zero."""
+    if values is None:
+        return _plain(np.zeros((1, 0, 1, 1), np.float32))
+    values = np.asarray(values, np.float32)
+    if values.ndim != 4 or values.shape[2:] != shape[2:] or values.shape[1] < least:
+        wanted = f"of shape (n, {least} or more, {shape[2]}, {shape[3]})"
+        raise argument_error(name, wanted, f"shape {values.shape}")
+    if not np.isfinite(values).all():
+        values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
+    return _plain(values)
+
+
+def fit_result(rate, var_poisson, var_read, n_used, n_jump, flags, events, first_group):
+    """Make a `RampFit` of what the kernels give; jumps are counted from ``first_group``."""
+    flags[np.isnan(rate)] |= int(DQ.NO_SLOPE | DQ.DO_NOT_USE)
+    jumps = np.empty(len(events), _JUMP_TYPE)
+    for i, name in enumerate(("y", "x", "integration", "group", "significance")):
+        jumps[name] = events[:, i]
+    jumps["group"] += first_group + 1
+    return RampFit(rate, var_poisson, var_read, n_used, n_jump, flags, jumps)
+
+
+def threshold(value, name):
+    """Return a threshold as a float, infinite for None."""
+    check_positive(value, name, optional=True)
+    return np.inf if value is None else float(value)
+
+
+def _again(events, threshold, usable, n_diff, showers):
+    """
+    Yield the pixels that are fitted once more, and where they are to be cut.
+
+    They lie beside large jumps or in showers. Each part is the argument of
+    one call of the kernel: rows, columns, start of each pixel's cuts, and the cuts. Pixels keep the cuts
+    that they found themselves.
+    """
+    ny, nx = usable.shape
+    large = events[own_charge(events, nx, n_diff) >= threshold].astype(np.int64)
+    cut = large[:, 2] * n_diff + large[:, 3]
+    pixels = [showers[0] * nx + showers[1]]
+    cuts = [showers[2] * n_diff + showers[3]]
+    for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        y, x = large[:, 0] + dy, large[:, 1] + dx
+        inside = (y >= 0) & (y < ny) & (x >= 0) & (x < nx)
+        inside[inside] = usable[y[inside], x[inside]]
+        pixels.append(y[inside] * nx + x[inside])
+        cuts.append(cut[inside])
+    pixels, cuts = np.concatenate(pixels), np.concatenate(cuts)
+    own = events[:, :4].astype(np.int64)
+    own_pixels = own[:, 0] * nx + own[:, 1]
+    again = np.isin(own_pixels, pixels)
+    pixels = np.concatenate([pixels, own_pixels[again]])
+    cuts = np.concatenate([cuts, own[again, 2] * n_diff + own[again, 3]])
+    order = np.lexsort((cuts, pixels))
+    pixels, cuts = pixels[order], cuts[order]
+    unique = np.unique(pixels)
+    start = np.append(np.searchsorted(pixels, unique), len(pixels))
+    for part in chunks(len(unique), _PIXELS):
+        first, last = start[part.start], start[part.stop]
+        y, x = np.divmod(unique[part], nx)
+        yield y, x, start[part.start : part.stop + 1] - first, cuts[first:last]

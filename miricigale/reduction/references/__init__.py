@@ -1,0 +1,1 @@
+"""Detector constants and reference files, and calibration with them."""

@@ -1,0 +1,1 @@
+"""The sky's level and structure: background, masks, flats, stripes."""

@@ -1,0 +1,246 @@
+"""The source browser: pages that show the sources of a truth one by one, linked from the report."""
+
+import astropy.units as u
+import numpy as np
+from matplotlib.colors import to_hex
+
+from miricigale import fitting, photometry, sed
+from miricigale.evaluation import OUTLIER, AssociationFlags
+from miricigale.filters import Filter
+from miricigale.pages.browser import rounded, source_pages
+from miricigale.plotting.cutouts import Cutouts
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU, WAVE, ab_magnitude
+from miricigale.workflow.engine.stage import stage
+from miricigale.workflow.labels import SET_COLORS, SET_LABELS, band_label
+from miricigale.workflow.page.numbers import StudyTables
+from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
+from miricigale.workflow.stages.exposures import KERNEL
+from miricigale.workflow.stages.grids import of_patch, shown_patch, study_patches
+from miricigale.workflow.stages.images import measured_mosaic
+from miricigale.workflow.stages.inputs import existing_bands, sed_resources, sources_memory
+from miricigale.workflow.stages.sample import SampleFlags
+from miricigale.workflow.truths import truth_names
+
+#: Cells of the spectra, evenly spaced in the logarithm of wavelength.
+N_WAVE = 240
+#: Parameters whose posteriors are drawn.
+DRAWN = ("redshift", "frac_agn")
+#: What the table of sources has of each: AGN are selected by the median.
+_VALUES = {"redshift": "mean", "frac_agn": "p50"}
+#: The flags that the page explains, by what it calls them.
+FLAGS = {
+    "selection": SampleFlags,
+    "condition": ConditionFlags,
+    "fit": fitting.FitFlags,
+    "photometry": photometry.ForcedFlags,
+    "association": AssociationFlags,
+}
+
+
+@stage(
+    "sources",
+    "source browser",
+    version=2,
+    needs=("truth", "mosaics", "highres", "photometry", "matches", "fits"),
+    sections=("run.name", "catalog", *KERNEL, "photometry", "fit", "report"),
+    resources=sed_resources,
+    units=truth_names,
+    # the prior of the patch that is shown is of no truth
+    reads=lambda config, unit: [unit, f"{unit}/{shown_patch(config)}"],
+    plan=lambda config, _: list(truth_names(config)),
+    memory=sources_memory,
+)
+def make_sources(context, name):
+    """Stage 14, in addition: the page of a truth, and what it shows of its sources."""
+    config, tables = context.config, _Sources(context, name)
+    suffix, _ = measured_mosaic(config)
+    # pictures are of one patch where there are more
+    patch = shown_patch(config)
+    paths = [of_patch(f"mosaic_{{}}{suffix}", patch)]
+    paths += [f"{of_patch('photometry/{}', patch)}_{kind}" for kind in ("model", "residual")]
+    bands = {
+        band: [context.image(f"{name}/{path.format(band)}.fits") for path in paths]
+        for band in study_patches(config)[patch].bands
+    }
+    cutouts = Cutouts(context.image(f"{of_patch('f160w', patch)}.fits"), bands)
+    sky = tables.truth["sky"]
+    imaged = cutouts.on_image(sky)
+    shown = tables.first_of(imaged, config.report.pictures)
+    # those of a file are near to each other in the page, and those without pictures come last
+    order = np.argsort(~shown, kind="stable")
+    facts = {
+        "truth": name,
+        "truths": context.plan,
+        "outlier": OUTLIER,
+        "prior": band_label(tables.prior),
+        "cutouts": cutouts.describe(),
+        "flags": {kind: flags.meanings() for kind, flags in FLAGS.items()},
+        **tables.describe(),
+        "table": tables.columns(order),
+    }
+    source_pages(
+        context.save,
+        "report",
+        (f"sources-{name}", f"sources/{name}"),
+        f"{config.run.name}: sources of {name}",
+        facts,
+        order,
+        shown,
+        lambda row: tables.entry(row) | {"imaged": bool(imaged[row])},
+        lambda rows: cutouts.sheet(sky[rows]),
+    )
+
+
+class _Sources(StudyTables):
+    """What the page shows of a truth: photometry, spectra, posteriors, parameters and flags of its sources."""
+
+    def __init__(self, context, name):
+        super().__init__(context, name)
+        config, truth = context.config, self.truth
+        self.model, self.prior = sed.SEDModel.yang2021(), config.highres.filter
+        self.miri = tuple(config.exposures.filters)
+        existing = (band for band in existing_bands(config) if band not in self.miri)
+        self.bands = (*existing, *self.miri)
+        self.pivots = np.array([Filter.from_name(band).pivot.value for band in self.bands])
+        self.edges = np.geomspace(0.7 * self.pivots.min(), 1.4 * self.pivots.max(), N_WAVE + 1)
+        self.sampled = np.asarray(self.matched["selection"]) == 0
+        # with and without MIRI: the sets in the table and the figure of the spectrum
+        both = [unit for unit in ("all", "none") if unit in self.results]
+        self.compared = both or list(self.results)[:2]
+        # all sets are fitted with the same model
+        fitted = next(iter(self.results.values())).first
+        known = [name for name in fitted.parameters if name in truth.colnames]
+        self.units = {name: fitted.unit(name) for name in known}
+        # columns without a unit are in that of the parameter
+        values = (u.Quantity(truth[k], unit, dtype=float) for k, unit in self.units.items())
+        self.parameters = np.transpose([one.value for one in values])
+        self.true = np.transpose([truth[band].to_value(FNU) for band in self.bands])
+        pairs = zip(*map(self._measured, self.bands), strict=True)
+        self.flux, self.error = map(np.transpose, pairs)
+
+    def _measured(self, band):
+        """Fluxes of all sources in a band and their errors; mock fluxes are of the sample, and of all sets."""
+        if band in self.miri:
+            return [self.matched[key].to_value(FNU) for key in (band, error_column(band))]
+        results = next(iter(self.results.values()))
+        at = results.first.filters.index(band)
+        return [self.of_sources(results.of(name)[:, at]) for name in ("flux", "flux_err")]
+
+    def of_sources(self, values):
+        """Values of the rows of the fits as values of the sources, NaN without a fit."""
+        out = np.full(len(self.truth), np.nan)
+        out[self.sampled] = values
+        return out
+
+    def first_of(self, rows, n):
+        """Which of some rows (bool) are shown if at most ``n`` can be: fitted ones, then the brightest."""
+        bright = np.nan_to_num(self.truth[self.prior].value, nan=-np.inf)
+        order = np.lexsort((-bright, ~self.sampled, ~rows))
+        first = np.zeros(len(rows), bool)
+        first[order[:n]] = True
+        return first & rows
+
+    def columns(self, order):
+        """Columns of the table of all sources, in the order of the files."""
+        truth, matched = self.truth, self.matched
+        columns = {
+            "id": truth["id"],
+            "mag": ab_magnitude(truth[self.prior]),
+            "ra": truth["sky"].ra.deg,
+            "dec": truth["sky"].dec.deg,
+            "redshift": truth["redshift"],
+            "frac_agn": truth["frac_agn"],
+        }
+        digits = {"mag": 5, "ra": 9, "dec": 9}
+        for unit in self.compared:
+            fits = self.fits[unit]
+            for parameter in DRAWN:
+                value = fits[f"{parameter}_{_VALUES[parameter]}"]
+                columns[f"{parameter}_{unit}"] = self.of_sources(value)
+            columns[f"chi2_{unit}"] = self.of_sources(fits["reduced_chi2"])
+        for band in self.miri:
+            flux, error = self._measured(band)
+            none = np.full(len(flux), np.nan)
+            columns[f"sn_{band}"] = np.divide(flux, error, out=none, where=error > 0)
+            digits[f"sn_{band}"] = 3
+        columns |= {key: matched[key] for key in ("n_detected", "selection", "association")}
+        columns["condition"] = any_condition(matched, self.miri)
+        for unit, fits in self.fits.items():
+            columns[f"fit_{unit}"] = np.nan_to_num(self.of_sources(fits["flags"])).astype(int)
+        return {
+            key: rounded(np.asarray(values)[order], digits.get(key, 4))
+            for key, values in columns.items()
+        }
+
+    def describe(self):
+        """What all sources have in common."""
+        return {
+            "sets": [
+                {"name": unit, "label": SET_LABELS[unit], "color": to_hex(SET_COLORS[unit])}
+                for unit in self.results
+            ],
+            "compared": self.compared,
+            "bands": [
+                {"name": name, "label": band_label(name), "wave": wave, "miri": name in self.miri}
+                for name, wave in zip(self.bands, rounded(self.pivots), strict=True)
+            ],
+            "wave": rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
+            "pdf_edges": {
+                unit: {key: rounded(found.first.distribution(key)[0].value) for key in DRAWN}
+                for unit, found in self.results.items()
+            },
+            "parameters": [{"name": key, "unit": str(unit)} for key, unit in self.units.items()],
+        }
+
+    def entry(self, row):
+        """What belongs to the source in a row of the truth."""
+        entry = {
+            "id": self.truth["id"][row].item(),
+            "true": rounded(self.true[row]),
+            "flux": rounded(self.flux[row]),
+            "error": rounded(self.error[row], 3),
+            "flags": [int(self.matched[f"{band}_flags"][row]) for band in self.miri],
+            "conditions": [int(self.matched[f"{band}_condition"][row]) for band in self.miri],
+            "parameters": rounded(self.parameters[row]),
+        }
+        if self.sampled[row]:
+            entry["fits"] = {unit: self._fit(unit, entry["id"]) for unit in self.results}
+        return entry
+
+    def _fit(self, unit, key):
+        """Chi2, posteriors and moments of a source, and the spectrum of its best model."""
+        one = self.results[unit].loc[key]
+        if not one.fitted:
+            return None
+        fit = {
+            "chi2": rounded(one.chi2),
+            "n_bands": int(one.n_bands),
+            "moments": [
+                [rounded(moment(name).to_value(own)) for moment in (one.mean, one.std)]
+                for name, own in self.units.items()
+            ],
+            "pdf": {name: _weights(one.pdf[name]) for name in DRAWN},
+        }
+        if unit in self.compared:
+            best = one.best_sed(self.model)
+            means = _cell_means(best.wave.to_value(WAVE), best.fnu.to_value(FNU), self.edges)
+            # thousandths of log10
+            fit["spectrum"] = [round(1000 * np.log10(x)) if x > 0 else None for x in means]
+        return fit
+
+
+def _weights(pdf):
+    """Posterior weights in thousandths: index of the first cell that is not empty, and the weights."""
+    weights = np.round(1000 * pdf).astype(int)
+    filled = np.flatnonzero(weights)
+    if filled.size == 0:
+        return [0, []]
+    return [int(filled[0]), weights[filled[0] : filled[-1] + 1].tolist()]
+
+
+def _cell_means(x, y, edges):
+    """Means of a function, given by points that straight lines join, between edges."""
+    steps = 0.5 * (y[1:] + y[:-1]) * np.diff(x)
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.diff(np.interp(edges, x, total)) / np.diff(edges)
