@@ -39,6 +39,16 @@ READOUT = {
     "SLOWR1": {"FULL": 23.890},
 }
 
+# Frames of FASTR1 that are averaged on board to one group, by readout pattern (JWST user documentation, MIRI
+# detector readout)
+AVERAGED = {
+    "FASTGRPAVG": 4,
+    "FASTGRPAVG8": 8,
+    "FASTGRPAVG16": 16,
+    "FASTGRPAVG32": 32,
+    "FASTGRPAVG64": 64,
+}
+
 # In-flight figures of the detector (JWST user documentation, MIRI detector performance);
 # interpixel capacitance: JWST-STScI-002925, as in stpsf 2.2 `constants.py`; cosmic rays: solar
 # minimum 4.9e-8 /um2/s times 1.7 (MiriTE's constants); bias and non-linearity are smooth
@@ -207,6 +217,9 @@ def imager(wave, level):
         lines.append(f"[readout.{pattern}]")
         lines += [f"{subarray} = {time}" for subarray, time in times.items()]
         lines.append("")
+    lines += ["# Frames of FASTR1 that are averaged on board to one group", "[averaged]"]
+    lines += [f"{pattern} = {n_frames}" for pattern, n_frames in AVERAGED.items()]
+    lines.append("")
     lines += [
         "[zodi]     # sum of dilution * B_nu(temperature): low background, in K",
         f"dilution = {[d for d, _ in ZODI]}",

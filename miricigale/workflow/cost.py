@@ -137,7 +137,7 @@ class _Size:
             "fits": truths * self.n_sets * 4_500 * self.n_imaged,
             "experiments": truths * len(config.fit.experiments) * 4_500 * self.n_imaged,
             "sources": truths * (600 * n + (6_000 + 4_100 * bands) * self.pictured),
-            "report": 13_000_000,
+            "report": 10_000_000,
         }
 
     def seconds(self):
