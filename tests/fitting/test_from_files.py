@@ -75,8 +75,9 @@ def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
         assert text in page
     assert "Examples" in page
     assert page.count("<img") == 3
-    # the mass formed that went in
-    assert_allclose(table["mass_best"].to_value(u.Msun), 1e10, rtol=0.02)
+    # the mass formed that went in, within the errors of the fluxes and of the models between the nodes
+    assert_allclose(table["mass_best"].to_value(u.Msun), 1e10, rtol=0.1)
+    assert np.all(table["chi2_best"] < 0.05 * len(BANDS))
     err = command(capsys, *argv, "--chunk-rows", "3", status=2).err
     assert "holds results of another fit: chunk_rows differ" in err
     assert "give another folder, or --no-resume to replace them" in err
@@ -129,7 +130,7 @@ def test_the_workers_of_a_scheduler_give_the_table_of_this_process(catalog, tmp_
 
 @pytest.mark.slow
 def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, caplog):
-    """Of models of the survey grid without noise the best fit has all that went in."""
+    """Of models of the survey grid without noise the best fit is near what went in, which errors and priors allow."""
     model, axes = SEDModel.survey(), SEDModel.survey_axes()
     nodes = {name: np.full(2, values[len(values) // 2]) for name, values in axes.items()}
     nodes["redshift"] = axes["redshift"][[len(axes["redshift"]) // 5, len(axes["redshift"]) // 2]]
@@ -154,8 +155,10 @@ def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, cap
         assert text in caplog.text
     found = QTable.read(tmp_path / "out" / "table.fits")
     for name in ("redshift", "frac_agn", "ebv"):
-        assert_allclose(found[f"{name}_best"].value, nodes[name], rtol=1e-6)
-    assert_allclose(found["mass_best"].to_value(u.Msun), 1e10, rtol=0.02)
+        width = (found[f"{name}_p84"] - found[f"{name}_p16"]).value
+        assert np.all(np.abs(found[f"{name}_best"].value - nodes[name]) < 2 * width)
+    assert_allclose(np.log10(found["mass_best"].to_value(u.Msun)), 10, atol=0.1)
+    assert np.all(found["chi2_best"] < 0.1 * len(bands))
     caplog.clear()
     options = ["--model-error", "0.1"]
     assert main(fit(tmp_path / "cat.fits", *options, out="other", axes="survey")) == 0
@@ -323,8 +326,9 @@ def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, t
     options = {"axes": "yang2021-quick", "redshift": "z_spec", "ebv": 0.3}
     results = fit_catalog(tmp_path / "cat.fits", tmp_path / "out", **options)
     found = results.to_table(["mass_best", "chi2_best"])
-    assert_allclose(found["mass_best"].to_value(u.Msun), 1e10, rtol=0.03)
-    assert np.all(found["chi2_best"] < 0.1)
+    # without it 0.12 dex low
+    assert_allclose(np.log10(found["mass_best"].to_value(u.Msun)), 10, atol=0.03)
+    assert np.all(found["chi2_best"] < 0.3)
 
 
 @pytest.mark.slow

@@ -176,7 +176,7 @@ def test_known_redshifts_between_nodes_leave_older_galaxies_out():
     results = fitter.fit(table, redshift="z")
     assert np.isfinite(results.chi2).all()
     assert results.percentile("age", 0.999).value.max() <= universe[1]
-    assert results.best["age"].value[0] == 2.0
+    assert 2.0 <= results.best["age"].value[0] <= universe[1]
 
 
 @pytest.mark.parametrize("excess", [[2.0], [1.0, 3.0]])
