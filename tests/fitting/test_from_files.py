@@ -130,7 +130,7 @@ def test_the_workers_of_a_scheduler_give_the_table_of_this_process(catalog, tmp_
 
 @pytest.mark.slow
 def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, caplog):
-    """Of models of the survey grid without noise the best fit is near what went in, which errors and priors allow."""
+    """Of models of the survey grid without noise the best fit is near what went in."""
     model, axes = SEDModel.survey(), SEDModel.survey_axes()
     nodes = {name: np.full(2, values[len(values) // 2]) for name, values in axes.items()}
     nodes["redshift"] = axes["redshift"][[len(axes["redshift"]) // 5, len(axes["redshift"]) // 2]]

@@ -184,7 +184,7 @@ def test_slopes_of_each_integration_on_demand(tmp_path):
 @pytest.mark.filterwarnings("ignore:slopes without references")
 def test_two_versions_of_an_observed_exposure_count_once(tmp_path):
     """Two deliveries of the archive have other data; simulations with other seeds have the same keywords."""
-    exposure = exposure_of(n_groups=6, subarray="SUB64")
+    exposure = exposure_of(n_groups=10, subarray="SUB64")
     detector = Detector.miri_imager()
     names = {}
     for seed in (1, 2):

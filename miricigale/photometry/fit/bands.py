@@ -7,6 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 
 from miricigale.photometry.detection.catalogs import joined_sky
+from miricigale.photometry.fit.exposure_kernels import are_exposures
 from miricigale.photometry.fit.forced import ForcedPhotometer
 from miricigale.photometry.fit.result_table import new_ids
 from miricigale.photometry.fit.results import band_column
@@ -104,7 +105,7 @@ def measure_prior(images, photometers, highres, segmentation, catalog):
     """
     opened = {}
     for name, image in images.items():
-        if isinstance(image, (list, tuple)):
+        if are_exposures(image):
             opened[name] = [as_mosaic(one) for one in image]
         else:
             opened[name] = own_pixels(as_mosaic(image))

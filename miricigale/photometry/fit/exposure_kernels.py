@@ -5,6 +5,7 @@ import functools
 
 import astropy.units as u
 import numpy as np
+from astropy.io import fits
 
 from miricigale.instrument import ImageFacts, aperture, subarrays
 from miricigale.instrument.sky_axes import grid_angle
@@ -25,6 +26,11 @@ from miricigale.utils.units import ANGLE
 
 #: Difference of rolls (deg) below which exposures share their kernels.
 _SAME_ROLL = 0.05
+
+
+def are_exposures(image):
+    """Whether an image stands for several exposures: a list of them, and no list of the HDUs of one file."""
+    return isinstance(image, (list, tuple)) and not isinstance(image, fits.HDUList)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -12,7 +12,7 @@ from photutils.segmentation import SegmentationImage
 from miricigale.instrument import epoch_of
 from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.detection.prior_catalog import detected_prior, read_catalog, read_prior
-from miricigale.photometry.fit.exposure_kernels import ExposureKernels
+from miricigale.photometry.fit.exposure_kernels import ExposureKernels, are_exposures
 from miricigale.photometry.fit.fit_loop import fit_image
 from miricigale.photometry.fit.result_table import CatalogRows, package
 from miricigale.photometry.fit.stars import with_stars
@@ -319,7 +319,7 @@ class ForcedPhotometer(Interactive):
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
-        if isinstance(image, (list, tuple)):
+        if are_exposures(image):
             from miricigale.photometry.fit.exposure_photometry import measure_exposures
 
             prior = (highres, segmentation, catalog)
