@@ -32,7 +32,7 @@ def disk_use(config):
     >>> from miricigale.workflow import disk_use, load_config
     >>> use = disk_use(load_config("goodss", quick=True))
     >>> print(f"{sum(use.values()) / 1e6:.0f} MB")
-    273 MB
+    270 MB
     """
     return {name: int(n_bytes) for name, n_bytes in _Size(config).disk().items()}
 
