@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -27,6 +28,12 @@ def pytest_configure(config):
     config.own_folder = Path(tempfile.mkdtemp(prefix="miricigale-tests-"))
     conf.data_folder = str(config.own_folder / "data")
     conf.cache_folder = str(config.own_folder / "cache")
+    # workers would compile the same kernels at the same time, each for itself, and processes that a test compares
+    # would have some of either: once before them is less work, and all have the same
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        command = [sys.executable, "-m", "miricigale", "compile"]
+        # elsewhere, so that it is the package under test, and not the folder of its source
+        subprocess.run(command, cwd=config.own_folder, check=True)
 
 
 def pytest_unconfigure(config):
