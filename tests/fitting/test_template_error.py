@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.grids import draw_photometry, make_grid, node_fitter, photometry_table
+from miricigale import ErrorModel, SEDModel
 from miricigale.filters import FilterSet
 from miricigale.fitting import (
     BayesFitter,
@@ -127,6 +128,26 @@ def test_errors_of_models_and_of_bands_are_each_counted_once():
     assert fit.chi2.sum() / (5 * n) == pytest.approx(1.0, abs=5 * np.sqrt(2 / (5 * n)))
     text, other = "'model_error' must be a dict with keys among", {"nircam.f444w": 0.1}
     refuses(text, measure_template_error, fit, model_error=other)
+
+
+@pytest.mark.parametrize("interpolate", [0, 600])
+def test_errors_of_zero_points_know_what_models_take_up(interpolate):
+    """Factors of photometry without any are 1 within their errors, though models follow the fluxes."""
+    bands = ["acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2", "miri.f770w"]
+    model = SEDModel.yang2021(agn=False)
+    n = 40
+    truth = {"redshift": np.full(n, 0.5), "age": np.linspace(1, 5, n), "mass": np.full(n, 1e10)}
+    errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0), fractional=0.05)
+    axes = {"redshift": [0.5], "age": [1.0, 2.0, 3.0, 4.0, 5.0], "ebv": [0.1, 0.3, 0.5]}
+    settings = GridSettings(interpolate=interpolate)
+    fitter = BayesFitter(model, bands, axes=axes, model_error=0.0, settings=settings)
+    pulls = []
+    for seed in range(3):
+        photometry = errors.perturb(model.fluxes(truth, bands), seed=seed)
+        points = calibrate_zero_points(fitter.fit(photometry, redshift=np.full(n, 0.5)))
+        pulls.append(np.log(points["factor"]) / points["factor_err"])
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.3
+    assert np.abs(pulls).max() < 3
 
 
 def test_zero_points_are_found_and_applied(residuals):

@@ -33,28 +33,27 @@ class GridSettings:
         redshift is multiplied by that log-normal distribution of their rate over the last 100 Myr, at the mass
         that fits best without AGN, and keeps its sum.
     mass_function : callable, optional
-        A function of stellar mass (a `~astropy.units.Quantity`) and redshift, which broadcast, to a density
-        for each dex of mass and comoving volume, with any factor, such as `MassFunction`. Times the comoving
-        volume it multiplies the priors of galaxies and redshifts, at the mass that fits best without AGN (to 0.01
-        dex). Priors of redshift (``priors``, ``redshift_prior``) multiply it too: leave them flat, or
-        volume counts twice.
+        A function of stellar mass (a `~astropy.units.Quantity`) and redshift, which broadcast, to a density for
+        each dex of mass and comoving volume, with any factor, such as `MassFunction`. Times the comoving volume it
+        multiplies the priors of galaxies and redshifts, at the mass of each model between nodes, and at the one
+        that fits best without AGN on nodes alone (to 0.01 dex). Priors of redshift (``priors``,
+        ``redshift_prior``) multiply it too: leave them flat, or volume counts twice.
     interpolate : int, optional
         Effective number of models between the nodes for each object, with fluxes interpolated from the nodes
-        around, by adaptive importance sampling (Cornuet et al. 2012); posteriors and percentiles are theirs.
-        16 times as many models are evaluated at most (at least 16,384); objects for which that is not enough are
-        flagged ``NOT_CONVERGED``. Percentiles scatter by some 1.5 half-widths over the root of it. Known redshifts
-        are then those of the catalog, in chi2, the evidence and the best model too. 0: the nodes alone, as with
-        ``compat="cigale"`` and for templates.
+        around, by adaptive importance sampling (Cornuet et al. 2012); posteriors and percentiles are theirs. 80
+        times as many models are evaluated at most (at least 16,384); objects for which that is not enough are
+        flagged ``NOT_CONVERGED``. Percentiles scatter by some 1.5 half-widths over the root of it. Chi2, best
+        models and evidences are those of these models too, at known redshifts at those of the catalog. 0: the
+        nodes alone, as with ``compat="cigale"`` and for templates.
     finer : `~miricigale.sed.SEDModel`, optional
         With ``interpolate``: the model that made the grid, of which a finer grid is made, between whose nodes
         fluxes are good to 0.5 % along each axis. Not needed where a model is fitted. Without it fluxes are
         interpolated from the grid's own nodes, and intervals are too narrow where its cells are wide.
-
     agn_error : float, optional
         With ``interpolate``: error of the light of AGN as a part of it. In each band it counts by the share that
-        the AGN has of a model, of the measured flux, beside all other errors; best models and evidences are
-        without it, and so are grids of templates, which have no AGN. The shapes of tori are known less well than
-        those of galaxies: 0.3 where AGN outshine them.
+        the AGN has of a model, of the measured flux, beside all other errors, in the choice of the best model and
+        in evidences too; ``chi2`` is without it, and so are grids of templates, which have no AGN. The shapes of
+        tori are known less well than those of galaxies: 0.3 where AGN outshine them.
 
     Raises
     ------

@@ -276,7 +276,10 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
     -------
     zero_points : `~astropy.table.QTable`
         A row for each band that was fitted: ``band``, ``n`` sources, ``factor``, one over the median of
-        flux over best model, and ``factor_err``, from their scatter.
+        flux over best model, and ``factor_err``, from their scatter. Best models follow the fluxes: the scatter is
+        divided by 1 - s^2 / sigma^2, with sigma the error of a flux and s the standard deviation of its model, the
+        leverage of linear regression (Cook & Weisberg 1982, chapter 2). It is infinite for a band of which the
+        others say nothing.
 
     Raises
     ------
@@ -304,10 +307,10 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
     >>> print(points)
        band     n  factor factor_err
     ---------- --- ------ ----------
-     acs.f814w  40   1.12        0.0
-    wfc3.f160w  40    1.0        0.0
-      irac.ch1  40    1.2       0.01
-    miri.f770w  40   1.07        0.0
+     acs.f814w  40   1.12       0.03
+    wfc3.f160w  40    1.0       0.01
+      irac.ch1  40    1.2       0.02
+    miri.f770w  40   1.07        inf
     """
     flux, _, model, good = _residuals(results)
     if longest is not None:
@@ -328,7 +331,9 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
         middle = np.median(ratio)
         factor[i] = np.exp(middle)
         # standard error of a median
-        scatter[i] = np.sqrt(np.pi / (2.0 * n[i])) * np.median(np.abs(ratio - middle)) / _MEDIAN
+        of_best = np.sqrt(np.pi / (2.0 * n[i])) * np.median(np.abs(ratio - middle)) / _MEDIAN
+        free = _free_part(results, columns[i], some)
+        scatter[i] = of_best / free if free > 0 else np.inf
     factor[known] /= factor[bands.index(reference)]
     columns = {
         "band": np.array(bands),
@@ -337,6 +342,12 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
         "factor_err": factor * scatter,
     }
     return described_columns(columns, _COLUMNS, {"reference": reference})
+
+
+def _free_part(results, column, rows):
+    """Median part of the residuals of a band that models do not take up, as they follow its own fluxes."""
+    taken_up = np.square(results.model_flux_std[rows, column] / results.sigma[rows, column])
+    return 1.0 - np.median(taken_up)
 
 
 def apply_zero_points(photometry, zero_points):
