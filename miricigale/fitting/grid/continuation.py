@@ -4,145 +4,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import log_ndtr, ndtri
-from scipy.stats import qmc
+from scipy.special import log_ndtr
 
 from miricigale.fitting import _core
-from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.grid.adaptive import AdaptiveSampler, places_to_values, redshift_peaks
 from miricigale.fitting.grid.grid import GridEngine
 from miricigale.fitting.grid.interpolation import InterpolatedModels, grid_models
+from miricigale.fitting.grid.labels import LabelTable, log_weights
 from miricigale.fitting.posterior.priors import GridAxis
-from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, draws_summary, node_shares
-from miricigale.fitting.results.results import FitResults
 from miricigale.utils.units import Frozen
-
-
-def between_results(fit, data, posteriors, pairs):
-    """
-    Results of objects that all have a posterior between the nodes.
-
-    Parameters
-    ----------
-    fit : `~miricigale.fitting.grid.grid_fit.GridFit`
-        The fit.
-    data : `~miricigale.fitting.data.likelihood.Photometry`
-        Photometry of n objects.
-    posteriors : list of `~miricigale.fitting.grid.continuation.BetweenPosterior`
-        Their posteriors.
-    pairs : tuple of tuple of str
-        Parameters whose joint posteriors are asked for.
-
-    Returns
-    -------
-    results : `~miricigale.fitting.FitResults`
-    """
-    axes = fit.priors.axes
-    n = len(posteriors)
-    # of a grid without AGN it has one fraction
-    fractions = fit.grid.frac_agn.size
-    size = {name: axis.values.size for name, axis in axes.items()} | {"frac_agn": fractions}
-    arrays = {
-        "pdf": {name: np.empty((n, size[name])) for name in axes},
-        "pairs": {(x, y): np.empty((n, size[x], size[y])) for x, y in pairs},
-        "pdf_2d": np.empty((n, size["redshift"], fractions)),
-        "axis_moments": np.empty((n, len(axes), 2)),
-        "axis_quantiles": np.empty((n, len(axes), DERIVED_LEVELS.size)),
-    }
-    for i, posterior in enumerate(posteriors):
-        _put_parameters(arrays, i, posterior)
-    flags = np.array(data.flags)
-    converged = np.array([posterior.converged for posterior in posteriors], bool)
-    flags[~converged] |= int(FitFlags.NOT_CONVERGED)
-    node = np.array([posterior.best_node for posterior in posteriors]).reshape(n, -1)
-    log_errors = fit.log_errors(data)
-    data = fit.with_template_error(data, node[:, 0])
-    moments, quantiles = _derived_summaries(fit.engine.quantities, posteriors)
-    flux = np.array([posterior.flux for posterior in posteriors])
-    outlier = None
-    if fit.engine.mixture is not None:
-        wrong = np.array([posterior.wrong for posterior in posteriors])
-        used = np.isfinite(data.sigma) | data.limit
-        outlier = np.where(used, wrong, np.nan)
-    return FitResults(
-        **data.columns,
-        **arrays,
-        **fit.result_settings(),
-        flags=flags,
-        chi2=_column(posteriors, "chi2"),
-        log_evidence=_column(posteriors, "log_sum") - log_errors,
-        best_index=fit.between.index_of_nodes(node),
-        best_scale=_column(posteriors, "best_scale"),
-        best=_best(fit, posteriors),
-        moments=moments,
-        quantiles=quantiles,
-        model_flux=flux[:, 0],
-        model_flux_std=flux[:, 1],
-        best_flux=_column(posteriors, "best_flux"),
-        outlier=outlier,
-    )
-
-
-def with_axis_summaries(results):
-    """Results on nodes, not converged, with the moments and quantiles of parameters that others have."""
-    names = list(results.axes)
-    n = len(results)
-    moments = np.full((n, len(names), 2), np.nan)
-    quantiles = np.full((n, len(names), DERIVED_LEVELS.size), np.nan)
-    flags = np.array(results.flags)
-    fitted = np.isfinite(results.chi2)
-    flags[fitted] |= int(FitFlags.NOT_CONVERGED)
-    for i in np.flatnonzero(fitted):
-        single = results[i]
-        for j, name in enumerate(names):
-            moments[i, j] = single.mean(name).value, single.std(name).value
-            quantiles[i, j] = single.percentile(name, DERIVED_LEVELS).value
-    return replace(results, flags=flags, axis_moments=moments, axis_quantiles=quantiles)
-
-
-def _put_parameters(arrays, i, posterior):
-    """Put the posterior of the parameters in row ``i`` of arrays."""
-    node = posterior.node
-    weight = posterior.weight
-    for j, (name, table) in enumerate(arrays["pdf"].items()):
-        table[i] = node_shares((node[name],), table.shape[1:], weight)
-        moments, quantiles = draws_summary(posterior.values[name], weight=weight)
-        arrays["axis_moments"][i, j] = moments[:2]
-        arrays["axis_quantiles"][i, j] = quantiles
-    joint = arrays["pairs"] | {("redshift", "frac_agn"): arrays["pdf_2d"]}
-    for (x, y), table in joint.items():
-        table[i] = node_shares((node[x], node[y]), table.shape[1:], weight)
-
-
-def _derived_summaries(quantities, posteriors):
-    """Moments, (n, n_quantities, 3), and quantiles, (n, n_quantities, n_levels), of derived quantities."""
-    n = len(posteriors)
-    moments = np.full((n, len(quantities.names), 3), np.nan)
-    quantiles = np.full((n, len(quantities.names), DERIVED_LEVELS.size), np.nan)
-    for j, name in enumerate(quantities.names):
-        with_log = name not in quantities.intensive
-        for i, posterior in enumerate(posteriors):
-            if name in posterior.derived:
-                summary = draws_summary(
-                    posterior.derived[name], with_log=with_log, weight=posterior.weight
-                )
-                moments[i, j], quantiles[i, j] = summary
-    return moments, quantiles
-
-
-def _best(fit, posteriors):
-    """Parameters and derived quantities of the best models: dict of str to array."""
-    out = {}
-    for name in (*fit.priors.axes, *fit.engine.quantities.names):
-        values = [posterior.best.get(name, np.nan) for posterior in posteriors]
-        out[name] = np.array(values, float)
-    return out
-
-
-def _column(posteriors, name):
-    """An attribute of all posteriors as an array."""
-    return np.array([getattr(posterior, name) for posterior in posteriors])
-
 
 #: Draws of the posterior on nodes that sampling begins with.
 N_START = 256
@@ -205,7 +75,7 @@ class Continuation(Frozen):
             # none beyond the outermost
             low[i, :n], high[i, :n] = np.clip(axis.cells(), values[0], values[-1])
             if axis.kind in ("frac_agn", "agn"):
-                log_prior[i, :n] = _log(axis.weights)
+                log_prior[i, :n] = log_weights(axis.weights)
         galaxy = self._models["galaxy"]
         light = self.models.light
         return _core.Space(size, low, high, log_prior, galaxy.ravel(), galaxy.ndim, light)
@@ -296,7 +166,7 @@ class Continuation(Frozen):
     def _log_usable(self):
         """2 ln(prior) of the galaxies, shape (nz, nG)."""
         prior = self.engine.priors.galaxy
-        return np.where(self.engine.usable, 2.0 * _log(prior / prior.sum()), _core.NEVER)
+        return np.where(self.engine.usable, 2.0 * log_weights(prior / prior.sum()), _core.NEVER)
 
     @cached_property
     def _masses(self):
@@ -504,120 +374,3 @@ def _chi2(target, limits, z, flux):
         faint = limits.level - flux[limits.bands] * limits.inverse
         chi2 -= 2.0 * log_ndtr(faint).sum()
     return chi2
-
-
-@dataclass(frozen=True, eq=False)
-class LabelTable:
-    """
-    What posteriors between nodes tell apart: components that are absent or present, and values that are labels.
-
-    Parameters
-    ----------
-    kernel : `_core.Labels`
-        Ranges of cells and active axes of each.
-    of_range : `~numpy.ndarray` of int, shape (n_ranges_1, n_ranges_2, ...)
-        Label of each combination of the ranges of the axes; -1 where there is no prior weight.
-    range_of : list of `~numpy.ndarray` of int
-        Range of each cell, by axis.
-    """
-
-    kernel: tuple
-    of_range: np.ndarray
-    range_of: list
-
-    @classmethod
-    def of_axes(cls, axes, without_effect):
-        """Of `GridAxis`, and which have no effect where others are absent; see `Continuation`."""
-        n_axes = len(axes)
-        largest = max(axis.values.size for axis in axes)
-        ranges = [axis.ranges for axis in axes]
-        below, log_share = np.zeros((n_axes, largest + 1)), np.zeros((n_axes, largest))
-        for i, axis in enumerate(axes):
-            n = axis.values.size
-            # what is known of redshift comes with each object
-            weight = np.full(n, 1.0 / n) if axis.kind == "redshift" else axis.weights
-            below[i, 1 : n + 1] = np.cumsum(weight)
-            below[i, n + 1 :] = below[i, n]
-            log_share[i, :n] = _log(weight)
-        of_range = np.full([len(r) for r in ranges], -1)
-        known, rows = {}, []
-        for index in np.ndindex(of_range.shape):
-            absent = [axes[i].absent_at_zero and index[i] == 0 for i in range(n_axes)]
-            inert = without_effect[np.array(absent, bool)].any(axis=0)
-            cells = []
-            for i in range(n_axes):
-                cells.append((0, axes[i].values.size) if inert[i] else ranges[i][index[i]])
-            key = tuple(cells)
-            if key not in known:
-                first, count = np.array(cells).T
-                share = below[np.arange(n_axes), first + count] - below[np.arange(n_axes), first]
-                known[key] = len(rows) if np.all(share > 0) else -1
-                if known[key] >= 0:
-                    rows.append((first, count, inert | (count == 1)))
-            of_range[index] = known[key]
-        first, count, still = (np.array(column) for column in zip(*rows, strict=True))
-        kernel = _labels(first, count, still, below, log_share)
-        range_of = [np.repeat(np.arange(len(r)), [n for _, n in r]) for r in ranges]
-        return cls(kernel, of_range, range_of)
-
-    def without_first_axis(self):
-        """The same, but for the first axis, which has one cell."""
-        own = self.kernel
-        first, count = own.first.copy(), own.count.copy()
-        below, log_share = own.below.copy(), own.log_share.copy()
-        first[:, 0], count[:, 0] = 0, 1
-        below[0], log_share[0] = 1.0, 0.0
-        below[0, 0] = 0.0
-        still = np.ones(first.shape, bool)
-        for i, n in enumerate(own.n_active):
-            still[i, own.axes[i, :n]] = False
-        still[:, 0] = True
-        kernel = _labels(first, count, still, below, log_share)
-        return LabelTable(kernel, self.of_range, self.range_of)
-
-    def of_nodes(self, node):
-        """
-        Labels and scores of places anywhere in the cells of nodes.
-
-        Parameters
-        ----------
-        node : `~numpy.ndarray` of int, shape (n, n_axes)
-            Nodes of the axes.
-
-        Returns
-        -------
-        label : `~numpy.ndarray` of int, shape (n,)
-            Their labels.
-        score : `~numpy.ndarray`, shape (n, n_axes)
-            Quasi-random scores, the same for the same nodes; standard normal in axes without effect.
-        """
-        n, n_axes = node.shape
-        index = tuple(self.range_of[i][node[:, i]] for i in range(n_axes))
-        label, every = self.of_range[index], np.arange(n_axes)
-        uniform = qmc.Sobol(n_axes, seed=2).random(n)
-        own, below = self.kernel, self.kernel.below
-        first, count = own.first[label], own.count[label]
-        inside = (node >= first) & (node < first + count)
-        cell = np.where(inside, node, first)
-        start = below[every, first]
-        whole = below[every, first + count] - start
-        place = below[every, cell] + uniform * (below[every, cell + 1] - below[every, cell])
-        score = ndtri(np.clip((place - start) / whole, 1e-6, 1.0 - 1e-6))
-        active = np.zeros(own.first.shape, bool)
-        for i, k in enumerate(own.n_active):
-            active[i, own.axes[i, :k]] = True
-        return label, np.where(active[label], score, ndtri(np.clip(uniform, 1e-6, 1.0 - 1e-6)))
-
-
-def _labels(first, count, still, below, log_share):
-    """`_core.Labels` of ranges, of which some axes have no effect."""
-    axes, n_active = np.zeros(first.shape, np.int64), (~still).sum(axis=1)
-    for i, row in enumerate(~still):
-        axes[i, : n_active[i]] = np.flatnonzero(row)
-    first, count = first.astype(np.int64), count.astype(np.int64)
-    return _core.Labels(first, count, axes, n_active.astype(np.int64), below, log_share)
-
-
-def _log(weights):
-    """Logarithms of weights; of 0 a number that is none."""
-    return np.log(weights, where=weights > 0, out=np.full(np.shape(weights), _core.NEVER))

@@ -9,12 +9,8 @@ from miricigale.filters import FilterSet
 from miricigale.fitting.data.likelihood import FitFlags, filter_names
 from miricigale.fitting.data.settings import GridSettings
 from miricigale.fitting.data.template_error import TemplateError, grid_errors
-from miricigale.fitting.grid.continuation import (
-    N_START,
-    Continuation,
-    between_results,
-    with_axis_summaries,
-)
+from miricigale.fitting.grid.between_results import between_results, with_axis_summaries
+from miricigale.fitting.grid.continuation import N_START, Continuation
 from miricigale.fitting.grid.grid import GridEngine
 from miricigale.fitting.grid.interpolation import InterpolatedModels
 from miricigale.fitting.grid.mixture import BandMixture
