@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.grids import draw_photometry, node_fitter, other_fraction, photometry_table
-from miricigale.fitting import BayesFitter, FitResults
+from miricigale.fitting import BayesFitter, FitResults, GridSettings
 from miricigale.sed import SEDModel
 
 NAMES = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2"]
@@ -27,13 +27,15 @@ def test_the_best_spectrum_has_the_best_fluxes(fitter, tmp_path):
     from miricigale.filters import FilterSet
 
     table, _ = draw_photometry(fitter.grid, 4, noise=0.02)
-    results = fitter.fit(table)
     filters = FilterSet.from_names(NAMES)
-    for result in results:
-        sed = result.best_sed()
-        got = filters.synthetic_fluxes(sed).to_value("uJy")
-        # between nodes fluxes are interpolated, within 2 %
-        assert_allclose(got, results.best_flux[results.row(result.ids)], rtol=0.02)
+    # between nodes fluxes are interpolated
+    for interpolate, within in ((0, 1e-3), (600, 0.01)):
+        settings = GridSettings(interpolate=interpolate)
+        results = fitter.replace(settings=settings).fit(table)
+        for result in results:
+            sed = result.best_sed()
+            got = filters.synthetic_fluxes(sed).to_value("uJy")
+            assert_allclose(got, results.best_flux[results.row(result.ids)], rtol=within)
     results.write(tmp_path / "r.fits")
     again = FitResults.read(tmp_path / "r.fits")
     refuses("'model' must be an SEDModel", again[0].best_sed)
