@@ -16,6 +16,7 @@ from scipy.special import chdtri, ndtri
 from scipy.stats import qmc
 
 from miricigale.fitting import _core
+from miricigale.fitting.grid.labels import labels_of_ranges
 from miricigale.fitting.grid.moves import move_places, systematic
 from miricigale.fitting.grid.proposals import LEAST_WEIGHT, Places, fit_mixture
 from miricigale.utils.caching import cached
@@ -224,7 +225,7 @@ class AdaptiveSampler:
         self.borders = borders
         self.peaks = peaks
         self.wanted = wanted
-        self.members = _of_ranges(labels)
+        self.members = labels_of_ranges(labels)
         self.pursue = pursue
         self.scramble = scramble
         n_axes = len(space.size)
@@ -584,16 +585,6 @@ class AdaptiveSampler:
         move_places(evaluate, every[picked], active[label], score, known, place, self.scramble)
         uniform = self.points[1][: len(picked)]
         return self._placed(place, known, np.concatenate(weight), uniform, sample, converged=False)
-
-
-def _of_ranges(labels):
-    """Labels in which each component is absent, present, or a parameter has a value: list of arrays of int."""
-    out = []
-    for first, count in zip(labels.first.T, labels.count.T, strict=True):
-        kinds = np.unique(np.stack([first, count], axis=1), axis=0)
-        if len(kinds) > 1:
-            out += [np.flatnonzero((first == a) & (count == b)) for a, b in kinds]
-    return out
 
 
 def places_to_values(space, axis, place):

@@ -112,6 +112,30 @@ class LabelTable:
         return label, np.where(active[label], score, ndtri(np.clip(uniform, 1e-6, 1.0 - 1e-6)))
 
 
+def labels_of_ranges(labels):
+    """
+    Labels in which a component is absent or present, or a parameter has a value.
+
+    Parameters
+    ----------
+    labels : `~miricigale.fitting._core.Labels`
+        Labels.
+
+    Returns
+    -------
+    members : list of `~numpy.ndarray` of int
+        Labels of each range of each axis that has several.
+    """
+    members = []
+    for first, count in zip(labels.first.T, labels.count.T, strict=True):
+        ranges = np.unique(np.stack([first, count], axis=1), axis=0)
+        if len(ranges) < 2:
+            continue
+        for start, size in ranges:
+            members.append(np.flatnonzero((first == start) & (count == size)))
+    return members
+
+
 def _labels(first, count, still, below, log_share):
     """`_core.Labels` of ranges, of which some axes have no effect."""
     axes, n_active = np.zeros(first.shape, np.int64), (~still).sum(axis=1)
