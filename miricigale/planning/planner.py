@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, vstack
 
-from miricigale.instrument import frame_time
+from miricigale.instrument import frame_time, frames_per_group
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import band_plans, wall_clock
@@ -26,7 +26,7 @@ EXISTING = "existing bands"
 _SIZES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.2, 1.6])
 #: Field of the imager.
 _FIELD = 74 * 113 * u.arcsec**2
-#: Frames of the shortest exposure of a budget.
+#: Groups of the shortest exposure of a budget.
 _LEAST = 3
 
 
@@ -193,7 +193,8 @@ class Planner:
 
         times = np.array(exposures.by_band("time"))
         dithers = np.array(exposures.by_band("dithers"))
-        low = float(np.max(_LEAST * frame_time(exposures.readout).value * dithers / times))
+        group = frames_per_group(exposures.readout) * frame_time(exposures.readout).value
+        low = float(np.max(_LEAST * group * dithers / times))
         least = charged(low)
         if least > exposures.hours:
             names = ", ".join(name.removeprefix("miri.") for name in bands)

@@ -300,6 +300,12 @@ def test_a_budget_in_hours_is_what_is_charged():
     assert planner.share(()) == 1.0
     short = Planner(load_plan(overrides={"exposures": exposures | {"hours": 0.5}}))
     refuses("hours must be at least 0.8. for f770w", short.share, bands[:1], error=ConfigError)
+    # groups that are averages of 8 frames are longer, and so is the shortest exposure
+    averaged = Planner(load_plan(overrides={"exposures": exposures | {"readout": "FASTGRPAVG8"}}))
+    plans = averaged.band_plans(averaged.share(chosen))
+    charged = wall_clock([plans[band] for band in chosen], averaged.config.overheads).to_value(u.h)
+    assert 5.8 < charged <= 6.0
+    assert plans[chosen[0]].exposure.n_frames == 8
     with_depths = {"exposures": exposures | {"depth": 25.0}}
     refuses(
         "hours must be left out with depths", load_plan, overrides=with_depths, error=ConfigError
