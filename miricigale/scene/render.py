@@ -164,7 +164,7 @@ class Painter:
             Light in each pixel.
         in_image : `~numpy.ndarray`, shape (N,)
             Light of each source in the image; they add up to the image's sum.
-        landed_share : `~numpy.ndarray`, shape (N,)
+        drawn_share : `~numpy.ndarray`, shape (N,)
             Fraction of the profile within the isophote at which it was cut.
         """
         os_ = self._oversampling
@@ -173,7 +173,7 @@ class Painter:
         node_x = (np.asarray(x) + margin) * os_
         node_y = (np.asarray(y) + margin) * os_
         in_image = np.zeros(len(node_x))
-        landed_share = np.ones(len(node_x))
+        drawn_share = np.ones(len(node_x))
         extended = np.asarray(is_sersic) & (np.asarray(r_eff) * os_ >= _UNRESOLVED)
         points = ~extended
         points[list(images or {})] = False
@@ -186,7 +186,7 @@ class Painter:
             image = np.zeros(self.shape)
             # in the grid's precision: the same sum
             add_nodes(image, i, j, light.astype(np.float32), self._phases[0], margin=margin)
-            return image, in_image, landed_share
+            return image, in_image, drawn_share
         grid = np.zeros((land.low_y.size, land.low_x.size), dtype=np.float32)
         if np.any(extended):
             radius = r_eff[extended] * os_
@@ -206,7 +206,7 @@ class Painter:
             in_image[extended] = deposit_profiles(
                 grid, rows, tables, w_zone, w_smooth, w_cut, land, n_threads=self.n_threads
             )
-            landed_share[extended] = sersic_enclosed_fraction(cut / radius, index)
+            drawn_share[extended] = sersic_enclosed_fraction(cut / radius, index)
         for row, (dx, dy, share) in (images or {}).items():
             places = node_x[row] + dx * os_, node_y[row] + dy * os_
             in_image[row] = self._add_image(grid, *places, flux[row] * share, land)
@@ -216,7 +216,7 @@ class Painter:
         return (
             convolve(*arrays, *self._axes(), origin=self._origin, **options),
             in_image,
-            landed_share,
+            drawn_share,
         )
 
     @staticmethod

@@ -330,13 +330,13 @@ class Scene(Interactive):
         sources = {"is_sersic": is_sersic, "r_eff": radius, "axis_ratio": ratio, "theta": theta}
         sources |= {"x": x[rows], "y": y[rows], "n": catalog["sersic_index"][rows]}
         light = np.where(profile, galaxy[rows], agn[rows])
-        image, landed, total_flux = self._painter.paint(flux=light, images=images, **sources)
+        image, landed, drawn_share = self._painter.paint(flux=light, images=images, **sources)
         in_image = np.bincount(rows, weights=landed, minlength=len(catalog))
         # of all light, the points' included
         lost = np.zeros(len(catalog))
         profile_rows = rows[:n_profiles]
         total = np.where(flux[profile_rows] > 0, flux[profile_rows], 1.0)
-        lost[profile_rows] = (1 - total_flux[:n_profiles]) * galaxy[profile_rows] / total
+        lost[profile_rows] = (1 - drawn_share[:n_profiles]) * galaxy[profile_rows] / total
         flags[lost > 0.01] |= SceneFlags.CUT_PROFILE
         dim = in_image < 0.95 * flux * (1 - lost) * self._painter.enclosed_by_psf
         flags[inside & valid & dim] |= SceneFlags.NEAR_EDGE
