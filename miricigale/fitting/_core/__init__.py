@@ -1,13 +1,13 @@
 """
 Kernels of the grid fit: arrays in, arrays out.
 
-`sum_up` (`evaluate`) does one object. Models without AGN are evaluated one by one (`alone`). The
-pairs of galaxy and AGN model that can matter are listed by their bounds (`pairs`, down to those of
-`floors`), evaluated side by side (`lanes`, `single` in single precision, `limits` with upper
-limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into moments and quantiles.
- `weigh_masses` (`masses`) puts a prior of mass in, `find_models` (`mixture`) finds wrong bands.
-`interpolate_light` (`between`) and `evaluate_places` (`population`, `importance`) are of models between nodes.
-`structs` says what the kernels take, `rows` where it stands there, `workspace` makes it.
+`sum_up` (`evaluate`) does one object. Models without AGN are evaluated one by one. The pairs of galaxy and AGN
+model that can matter are listed by their bounds (`pairs`, down to those of `floors`), evaluated side by side
+(`batched_pairs`, `single` in single precision, `limits` with upper limits) and summed up (`sums`, `histogram`);
+`summarize` turns the sums into moments and quantiles. `weigh_masses` (`masses`) puts a prior of mass in,
+`find_models` (`mixture`) finds wrong bands. `interpolate_light` (`interpolation`) and `evaluate_places`
+(`population`, `importance`) are of models between nodes. `structs` says what the kernels take and where it stands
+there, `workspace` makes it.
 """
 
 from miricigale.fitting._core.evaluate import sum_up

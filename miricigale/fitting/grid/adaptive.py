@@ -199,7 +199,7 @@ class AdaptiveSampler:
     ----------
     space, labels : `~miricigale.fitting._core.Space`, `~miricigale.fitting._core.Labels`
         What places are in.
-    work : `~miricigale.fitting._core.Work`
+    work : `~miricigale.fitting._core.interpolation.Work`
         Scratch of the models.
     one : `~miricigale.fitting._core.Object`
         The object.

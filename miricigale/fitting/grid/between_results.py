@@ -17,7 +17,7 @@ def between_results(fit, data, posteriors, pairs):
     ----------
     fit : `~miricigale.fitting.grid.grid_fit.GridFit`
         The fit.
-    data : `~miricigale.fitting.data.likelihood.Photometry`
+    data : `~miricigale.fitting.data.likelihood.FitData`
         Photometry of n objects.
     posteriors : list of `~miricigale.fitting.grid.continuation.BetweenPosterior`
         Their posteriors.

@@ -163,7 +163,7 @@ class Tangents:
 
         Parameters
         ----------
-        target : `~miricigale.fitting._core.Target`
+        target : `~miricigale.fitting._core.structs.Target`
             Its data with the stated errors.
         log_prior : `~numpy.ndarray`, shape (nz,)
             2 ln(prior) of the redshifts.
@@ -174,7 +174,7 @@ class Tangents:
 
         Returns
         -------
-        target : `~miricigale.fitting._core.Target`
+        target : `~miricigale.fitting._core.structs.Target`
             The data with the tangents' errors.
         wrong : `~numpy.ndarray`, shape (nz, nb)
             How likely each band is wrong for the models at which they touch.

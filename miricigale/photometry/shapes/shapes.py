@@ -64,7 +64,7 @@ class Shape:
     flux: float  # Total light.
     parameters: (
         np.ndarray
-    )  # (6,): As for `~miricigale.photometry.shapes.shape_models.Waves.profiles`.
+    )  # (6,): As for `~miricigale.photometry.shapes.shape_models.ShapeModels.profiles`.
     point: float  # Probability that the source is a point.
     covariance: np.ndarray  # (7, 7): Of ln flux and the parameters.
     #: Nodes, (k, 6), and ln of the likelihood of a point, as `Population.odds` takes them.
