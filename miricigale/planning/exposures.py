@@ -220,9 +220,9 @@ def _time_to(depth, filter, n_dithers, config):
     return 10 ** brentq(excess, low, 7.0, xtol=2e-3) * u.s
 
 
-def band_plans(config, *, share=1.0):
+def band_plans(config, *, share=1.0, bands=None):
     """
-    The exposures of all bands of a configuration.
+    The exposures of bands of a configuration.
 
     Parameters
     ----------
@@ -230,6 +230,8 @@ def band_plans(config, *, share=1.0):
         The configuration.
     share : float, optional
         Factor on all times.
+    bands : iterable of str, optional
+        MIRI bands of the configuration; all by default.
 
     Returns
     -------
@@ -238,6 +240,8 @@ def band_plans(config, *, share=1.0):
     options, plans = config.exposures, {}
     values = options.by_band("depth" if options.depth else "time")
     for name, value, dithers in zip(options.bands, values, options.by_band("dithers"), strict=True):
+        if bands is not None and name not in bands:
+            continue
         time = _time_to(value, name, dithers, config) if options.depth else value * u.s
         plans[name] = _band_plan(name, share * time, dithers, config)
     return plans

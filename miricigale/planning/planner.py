@@ -156,9 +156,9 @@ class Planner:
         smallest = min(len(config.set_bands(name)) for name in config.exposures.sets)
         return max(1, min(config.fit.min_detected, smallest))
 
-    def band_plans(self, share=1.0):
-        """The exposures of all bands, each time multiplied by ``share``: dict of `BandPlan`."""
-        return band_plans(self.config, share=share)
+    def band_plans(self, share=1.0, bands=None):
+        """The exposures of bands (all by default), each time multiplied by ``share``: dict of `BandPlan`."""
+        return band_plans(self.config, share=share, bands=bands)
 
     def share(self, bands, pointings=None):
         """
@@ -187,12 +187,14 @@ class Planner:
         pointings = exposures.pointings if pointings is None else pointings
 
         def charged(share):
-            plans = self.band_plans(share)
+            plans = self.band_plans(share, bands)
             chosen = [plans[name] for name in bands]
             return wall_clock(chosen, self.config.overheads, pointings=pointings).to_value(u.h)
 
-        times = np.array(exposures.by_band("time"))
-        dithers = np.array(exposures.by_band("dithers"))
+        # other bands may be too short to be split into dithers
+        rows = [exposures.bands.index(name) for name in bands]
+        times = np.array(exposures.by_band("time"))[rows]
+        dithers = np.array(exposures.by_band("dithers"))[rows]
         group = frames_per_group(exposures.readout) * frame_time(exposures.readout).value
         low = float(np.max(_LEAST * group * dithers / times))
         least = charged(low)
@@ -301,7 +303,7 @@ class Planner:
         bands = config.exposures.bands if bands is None else tuple(bands)
         wanted = f"some of {list(config.exposures.bands)}"
         check_that(set(bands) <= set(config.exposures.bands), "bands", wanted, list(bands))
-        known = self.band_plans(share)
+        known = self.band_plans(share, bands)
         plans = {band: known[band] for band in bands}
         photometry = self.photometry(plans.values(), measured)
         every = [*config.fit.bands, *bands]

@@ -306,6 +306,13 @@ def test_a_budget_in_hours_is_what_is_charged():
     charged = wall_clock([plans[band] for band in chosen], averaged.config.overheads).to_value(u.h)
     assert 5.8 < charged <= 6.0
     assert plans[chosen[0]].exposure.n_frames == 8
+    # what a set costs is its own: the shortest exposures of other bands do not count
+    unequal = {"time": [100, 1000, 10000], "hours": 1}
+    alone = Planner(load_plan(overrides={"exposures": exposures | unequal}))
+    plans = alone.band_plans(alone.share(bands[2:]), bands[2:])
+    assert list(plans) == bands[2:]
+    charged = wall_clock(plans.values(), alone.config.overheads).to_value(u.h)
+    assert 0.95 < charged <= 1.0
     with_depths = {"exposures": exposures | {"depth": 25.0}}
     refuses(
         "hours must be left out with depths", load_plan, overrides=with_depths, error=ConfigError
