@@ -30,6 +30,8 @@ CIGALE_MODULES = {
     "yang20": "xray",
     "redshifting": "meiksin2006",
 }
+#: Options of components that are those of CIGALE's modules.
+_CIGALE_OPTIONS = {"dustatt_calzleit": {"ebv_scaling": "cigale"}}
 
 
 def named_component(name, **defaults):
@@ -39,7 +41,7 @@ def named_component(name, **defaults):
     Parameters
     ----------
     name : str
-        One of ``COMPONENTS.names()`` or of `CIGALE_MODULES`.
+        One of ``COMPONENTS.names()`` or of `CIGALE_MODULES`, whose conventions its component then has.
     **defaults
         As for the component.
 
@@ -48,7 +50,8 @@ def named_component(name, **defaults):
     KeyError
         If there is no component of the name.
     """
-    return COMPONENTS.get(CIGALE_MODULES.get(name, name))(**defaults)
+    options = _CIGALE_OPTIONS.get(name, {}) | defaults
+    return COMPONENTS.get(CIGALE_MODULES.get(name, name))(**options)
 
 
 def register(cls):

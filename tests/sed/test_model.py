@@ -180,6 +180,9 @@ def test_components_by_their_names_and_those_of_cigale():
     own = SEDModel(["delayed", "bc03", "calzetti", DraineLi2007()])
     theirs = SEDModel(["sfhdelayed", "bc03", "dustatt_calzleit", "dl2007"])
     assert [c.name for c in own.components] == [c.name for c in theirs.components]
+    # as the files of CIGALE are read
+    assert theirs.component("attenuation").ebv_scaling == "cigale"
+    assert own.component("attenuation").ebv_scaling == "exact"
     assert set(CIGALE_MODULES.values()) <= set(COMPONENTS.names())
     # the setup of CIGALE's files knows them all
     assert set(CIGALE_MODULES) <= set(_MODULES)
