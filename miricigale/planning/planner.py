@@ -13,7 +13,7 @@ from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import band_plans, wall_clock
 from miricigale.planning.sample import make_sample
 from miricigale.utils.exceptions import config_error
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.workflow.stages.fits import existing_errors, study_fitter
@@ -178,10 +178,14 @@ class Planner:
 
         Raises
         ------
+        KeyError
+            If the plan has no such band.
         `~miricigale.utils.exceptions.ConfigError`
             If the shortest exposures take longer.
         """
-        exposures, bands = self.config.exposures, tuple(bands)
+        exposures = self.config.exposures
+        bands = tuple(bands)
+        check_names(bands, "band of the plan", exposures.bands)
         if not exposures.hours or not bands:
             return 1.0
         pointings = exposures.pointings if pointings is None else pointings

@@ -300,6 +300,7 @@ def test_a_budget_in_hours_is_what_is_charged():
     assert planner.share(()) == 1.0
     short = Planner(load_plan(overrides={"exposures": exposures | {"hours": 0.5}}))
     refuses("hours must be at least 0.8. for f770w", short.share, bands[:1], error=ConfigError)
+    refuses("no band of the plan 'miri.f560w'", short.share, ["miri.f560w"], error=KeyError)
     # groups that are averages of 8 frames are longer, and so is the shortest exposure
     averaged = Planner(load_plan(overrides={"exposures": exposures | {"readout": "FASTGRPAVG8"}}))
     plans = averaged.band_plans(averaged.share(chosen))
