@@ -3,7 +3,8 @@
 import numpy as np
 
 from miricigale.fitting.data.likelihood import FitFlags
-from miricigale.fitting.results.table_columns import LEVELS, ODDS
+from miricigale.fitting.results.percentile_columns import LEVELS
+from miricigale.fitting.results.table_columns import ODDS
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that

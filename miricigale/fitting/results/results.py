@@ -18,8 +18,9 @@ from miricigale.fitting.posterior.posterior import (
 )
 from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.fitting.results import drawing, histories
+from miricigale.fitting.results.percentile_columns import LEVELS
 from miricigale.fitting.results.sample_flags import worst_bands
-from miricigale.fitting.results.table_columns import FIELDS, LEVELS, ODDS, OUTLIER, TEXTS
+from miricigale.fitting.results.table_columns import FIELDS, ODDS, OUTLIER, TEXTS
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names

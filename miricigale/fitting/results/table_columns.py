@@ -1,9 +1,7 @@
-"""What columns of tables of results hold, and their levels."""
+"""What columns of tables of results hold."""
 
 from miricigale.utils.package_tables import declared
 
-#: Levels of the percentiles in the table.
-LEVELS = (0.16, 0.5, 0.84)
 #: Error of a redshift over 1 + z beyond which it is called an outlier.
 OUTLIER = 0.15
 #: What the column of the odds of redshifts is.
