@@ -183,11 +183,11 @@ def inject_ramp(ramp, sources, reducer, rng, n_threads=None):
     Notes
     -----
     Surface brightness becomes DN/s by the inverse of the calibration and electrons by the gain; each group
-    collects a Poisson number of them, of which neighbors share a part (interpixel capacitance). Counts are made
-    linear, the charge is added, and the inverse of the linearity brings them back. They are rounded at random,
-    up or down in proportion, so that light of less than 1 DN is not lost; that adds at most 1/4 DN^2 to the
-    variance of a group. Groups that reach saturation stay there. Persistence, and a brighter-fatter effect, are
-    not drawn.
+    collects a Poisson number of them, of which neighbors share a part (interpixel capacitance); groups that are
+    averaged on board (FASTGRPAVG) have the mean of their frames. Counts are made linear, the charge is added, and
+    the inverse of the linearity brings them back. They are rounded at random, up or down in proportion, so that
+    light of less than 1 DN is not lost; that adds at most 1/4 DN^2 to the variance of a group. Groups that reach
+    saturation stay there. Persistence, and a brighter-fatter effect, are not drawn.
     """
     exposure = ramp.exposure
     maps = maps_of(reducer, ramp)
@@ -210,7 +210,7 @@ def inject_ramp(ramp, sources, reducer, rng, n_threads=None):
     y, x = np.nonzero(reached & ~blind)
     data = ramp.data.copy()
     for k in range(ramp.shape[0]):
-        electrons = _collected(mean, lit, y, x, kernel, n_group, rng)
+        electrons = _collected(mean, lit, y, x, kernel, n_group, exposure.n_frames, rng)
         added = electrons / gain[y, x][:, None]
         data[k][:, y, x] = _with_charge(data[k][:, y, x].T, added, maps, y, x, k, rng).T
     return data
@@ -231,10 +231,11 @@ def _rate(light, ramp, reducer, maps):
     return np.where(np.isfinite(rate) & (brightness > 0), rate, 0.0)
 
 
-def _collected(mean, lit, y, x, kernel, n_group, rng):
-    """Electrons of each group that pixels hold since the reset, shape (n, n_group)."""
+def _collected(mean, lit, y, x, kernel, n_group, n_frames, rng):
+    """Electrons of each group, the mean of its frames, that pixels hold since the reset, shape (n, n_group)."""
     row, column = np.nonzero(lit)
-    drawn = rng.poisson(mean[lit][:, None], (len(row), n_group)).cumsum(axis=1)
+    by_frame = rng.poisson(mean[lit][:, None] / n_frames, (len(row), n_group * n_frames))
+    drawn = by_frame.cumsum(axis=1).reshape(len(row), n_group, n_frames).mean(axis=2)
     place = np.full(np.add(lit.shape, 2), -1)
     place[y + 1, x + 1] = np.arange(len(y))
     held = np.zeros((len(y), n_group))

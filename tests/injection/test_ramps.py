@@ -81,6 +81,20 @@ def test_injected_flux_is_conserved_through_a_ramp(exposure, linear):
     assert_allclose(np.sum((gained * area)[seen]), np.sum((light * area)[seen]), rtol=1e-3)
 
 
+def test_groups_that_are_averaged_on_board_hold_the_mean_of_their_frames():
+    averaged = Exposure(
+        "F770W", n_groups=6, subarray="SUB64", readout="FASTGRPAVG8", pointing="53 -27"
+    )
+    ramp = ramp_of(averaged, Nonlinearity(linear=True))
+    properties = Reducer().detector.replace(nonlinearity=(0.0, 1.0))
+    reducer = Reducer(properties=properties, references="simulated")
+    data = inject_ramp(ramp, stars(averaged, [(30.0, 30.0)], 300.0), reducer, Photons(1))
+    gained = (data.astype(float) - ramp.data)[0].sum(axis=(1, 2))
+    step = np.diff(gained).mean()
+    # frames 1 to 8 of a group hold 1/8 to 8/8 of its charge
+    assert_allclose(gained / step, np.arange(6) + 4.5 / 8, atol=0.05)
+
+
 def test_injected_light_has_its_photon_noise(exposure):
     """The electrons of the core of a bright star vary as Poisson numbers, in each group."""
     ramp = ramp_of(exposure)
