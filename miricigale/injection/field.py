@@ -140,7 +140,7 @@ class PriorField:
         former : `~astropy.table.QTable`, optional
             ``sky`` and ``flux`` of what is detected on the prior without them.
         image_file : `~miricigale.photometry.MosaicFile`, optional
-            An image that shows the sources already; labels_found is the light on the prior alone then.
+            An image that shows the sources already; light is drawn on the prior alone then.
 
         Returns
         -------
@@ -226,9 +226,9 @@ def joined_segments(segments, detected, places):
     Returns
     -------
     segments : int `~numpy.ndarray`, shape (ny, nx)
-        A copy with new labels; pixels of other sources stay labels_found.
+        A copy with new labels; pixels of other sources keep theirs.
     labels : int `~numpy.ndarray`, shape (n,)
-        Those of the sources; 0 without a segment, or on that of another source.
+        Those of the sources; 0 without a segment, or on that of another source, injected or not.
     """
     segments = segments.copy()
     first = int(segments.max()) + 1
@@ -236,8 +236,11 @@ def joined_segments(segments, detected, places):
     labels_found, _ = nearest_values(detected, places)
     labels = np.zeros(len(places), int)
     for k in np.flatnonzero((present == 0) & (labels_found > 0)):
-        labels[k] = first + k
-        segments[(detected == labels_found[k]) & (segments == 0)] = labels[k]
+        own = (detected == labels_found[k]) & (segments == 0)
+        # of two sources in one segment the first has it
+        if own.any():
+            labels[k] = first + k
+            segments[own] = labels[k]
     return segments, labels
 
 

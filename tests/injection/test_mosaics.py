@@ -249,6 +249,10 @@ def test_segments_of_others_stay_theirs():
     assert_array_equal(labels, [2, 0, 0])
     assert np.count_nonzero(both == 2) == 12
     assert_array_equal(both[:, :3], 1)
+    # of two sources in one segment the second has none
+    both, labels = joined_segments(segments, own, np.array([[4.0, 4.0], [5.0, 4.0]]))
+    assert_array_equal(labels, [2, 0])
+    assert set(np.unique(both)) == {0, 1, 2}
 
 
 def test_magnitudes_follow_the_counts():
