@@ -5,6 +5,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy.ndimage import find_objects
 
+from miricigale.filters.photometry_table import as_photometry
 from miricigale.photometry import SourceTemplates
 from miricigale.photometry.detection.cutouts import own_segments
 from miricigale.photometry.images.arrays import image_arrays, pixel_scale
@@ -19,6 +20,9 @@ from miricigale.utils.units import ANGLE, FNU, ab_magnitude
 
 #: Columns of a shape.
 SHAPE = ("half_light_radius", "sersic_index", "axis_ratio", "position_angle")
+
+#: What an own catalog is called in messages.
+_NAME = "catalog of sources"
 
 #: Columns of which one is a position.
 _POSITIONS = ("sky", "ra", "alpha_j2000", "raj2000", "x")
@@ -180,9 +184,10 @@ def read_sources(catalog, band, prior_band, wcs):
     Raises
     ------
     ValueError
-        If there are no rows, or a flux is not positive, or a shape is incomplete or out of range.
+        If there are no rows, or a flux is not positive, or one in the prior's band is negative, or a profile has
+        another name than ``point`` and ``sersic``, or a shape is incomplete or out of range.
     """
-    table = as_sources(catalog, band, "catalog of sources")
+    table = as_sources(catalog, band, _NAME)
     check_that(len(table), "catalog", "a table with rows", "none")
     require_columns(table, [band], "catalog", units={band: FNU})
     flux = plain_floats(table[band], band, "catalog") * table[band].unit.to(FNU)
@@ -200,7 +205,11 @@ def read_sources(catalog, band, prior_band, wcs):
         shapes[name] = values
     extended = shapes["half_light_radius"] > 0
     if "profile" in table.colnames:
-        extended = np.asarray(table["profile"]).astype(str) == "sersic"
+        profile = np.asarray(table["profile"]).astype(str)
+        unknown = sorted(set(profile.tolist()) - {"point", "sersic"})
+        wanted = "a table with 'point' and 'sersic' in 'profile'"
+        check_that(not unknown, "catalog", wanted, unknown)
+        extended = profile == "sersic"
     _check_shapes(shapes, extended)
     rows["profile"] = np.where(extended, "sersic", "point")
     plain = {
@@ -213,12 +222,18 @@ def read_sources(catalog, band, prior_band, wcs):
         rows[name] = np.where(extended, shapes[name], plain[name]) * units.get(name, 1)
     rows["flux"] = flux * FNU
     prior_flux = np.full(len(table), np.nan)
-    if prior_band is not None and prior_band != band:
-        of_prior = as_sources(catalog, prior_band, "catalog of sources")
+    if prior_band == band:
+        prior_flux = flux
+    elif prior_band is not None:
+        # of two bands, so that 'flux' is not taken for that of the prior
+        of_prior = as_photometry(catalog, [band, prior_band], _NAME)
         if prior_band in of_prior.colnames:
             require_columns(of_prior, [prior_band], "catalog", units={prior_band: FNU})
             prior_flux = plain_floats(of_prior[prior_band], prior_band, "catalog")
             prior_flux = prior_flux * of_prior[prior_band].unit.to(FNU)
+            bad = (prior_flux < 0) | np.isinf(prior_flux)
+            wanted = "fluxes in the prior's filter that are finite and at least 0, or missing"
+            check_that(not bad.any(), "catalog", wanted, f"{np.count_nonzero(bad)} others")
     rows["prior_flux"] = prior_flux * FNU
     if {name.lower() for name in table.colnames} & set(_POSITIONS):
         rows["sky"] = as_positions(table, "catalog", wcs)

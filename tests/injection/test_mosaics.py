@@ -288,6 +288,22 @@ def test_own_sources_that_cannot_be_drawn_are_refused():
     table["sersic_index"], table["axis_ratio"] = [1.0, 1.0], [1.0, 0.5]
     table["position_angle"] = [0.0, 10.0] * u.deg
     assert list(read_sources(table, *args)["profile"]) == ["point", "sersic"]
+    table["profile"] = ["star", "sersic"]
+    refuses("'point' and 'sersic' in 'profile', got .'star'.", read_sources, table, *args)
+
+
+def test_fluxes_in_the_prior_are_those_that_name_its_filter():
+    wcs = north_up_wcs(CENTER, PIXEL * u.arcsec, (50, 50))
+    table = QTable({"flux": [1.0, 2.0] * u.uJy})
+    args = ("miri.f770w", "nircam.f444w", wcs)
+    assert np.isnan(read_sources(table, *args)["prior_flux"].value).all()
+    same = read_sources(table, "miri.f770w", "miri.f770w", wcs)
+    assert_array_equal(same["prior_flux"], same["flux"])
+    table["F770W"] = table["flux"]
+    table["F444W"] = [0.0, np.nan] * u.uJy
+    assert_array_equal(read_sources(table, *args)["prior_flux"].value, [0.0, np.nan])
+    table["F444W"] = [-1.0, 1.0] * u.uJy
+    refuses("at least 0, or missing, got 1 others", read_sources, table, *args)
 
 
 @pytest.mark.parametrize("plateau", [1.0, 0.8])
