@@ -21,14 +21,15 @@ class Injection(Interactive, InjectionSettings):
     catalog : table in any form or path-like, optional
         Sources of your own: fluxes or magnitudes in the image's filter (and in the prior's, or colors are drawn
         from the field), and for galaxies ``half_light_radius``, ``sersic_index``, ``axis_ratio`` and
-        ``position_angle``. They are injected in turn, at their positions if it has such and otherwise at random
-        places. By default sources are drawn: magnitudes that follow the field's counts down to 1 mag below its
-        5-sigma limit, with sizes and colors of its own sources of similar magnitude.
+        ``position_angle``. They are injected in turn, at their positions if it has such (those without data in
+        the image are left out) and otherwise at random places. By default sources are drawn: magnitudes that
+        follow the field's counts down to 1 mag below its 5-sigma limit, with sizes and colors of its own sources
+        of similar magnitude.
     n_trials : int, optional
         How often sources are injected and the field is measured.
     n_sources : int, optional
-        Sources in each trial; by default a fifth of those of the field, if there is room so that they stay 6
-        widths of the PSF apart. With 0 the user's own result is repeated.
+        Sources in each trial; by default a fifth of those of the field and 20 at least, if there is room so that
+        they stay 6 widths of the PSF apart. With 0 the user's own result is repeated.
     stars : float, optional
         Share of stars among drawn sources.
     threshold : float, optional

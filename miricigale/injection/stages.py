@@ -27,6 +27,7 @@ from miricigale.photometry import DetectionPreset, MosaicFile
 from miricigale.photometry.commands.file_inputs import Inputs
 from miricigale.psf import read_psf
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import file_place
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
@@ -169,7 +170,10 @@ def _states(config, unit):
     task = Task.of(config, config.run.seed)
     if task.inputs is not None:
         return file_states(task.inputs, task.files)
-    return {str(path): [os.stat(path).st_size, os.stat(path).st_mtime_ns] for path in task.files}
+    # paths may name an extension
+    paths = sorted({file_place(path)[0] for path in task.files})
+    states = {path: os.stat(path) for path in paths}
+    return {path: [one.st_size, one.st_mtime_ns] for path, one in states.items()}
 
 
 def _bytes(config, unit):

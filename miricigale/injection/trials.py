@@ -17,7 +17,7 @@ from miricigale.injection.population import (
 )
 from miricigale.instrument.image import Image
 from miricigale.photometry import ForcedFlags, detect_sources
-from miricigale.photometry.images.arrays import pixel_scale
+from miricigale.photometry.images.arrays import nearest_values, pixel_scale
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
@@ -120,7 +120,7 @@ def measure_base(field, injection):
     fwhm = result.psf_fwhm.to_value(ANGLE)
     good_pixels = field.usable(image, pixels.prior)
     room = np.count_nonzero(good_pixels) * pixel_scale(image.wcs) ** 2 / (APART * fwhm) ** 2
-    n_injected = int(min(room / _ROOM, max(_FEWEST, _SHARE * n)))
+    n_injected = max(1, int(min(room / _ROOM, max(_FEWEST, _SHARE * n))))
     former = shapes
     if field.has_prior:
         former = QTable({"sky": catalog["sky"]})
@@ -196,7 +196,7 @@ def injected_sources(injection, catalog, base, usable, wcs, number):
     wcs : `~astropy.wcs.WCS`
         Of the image.
     number : int
-        Of the trial, from 0.
+        Of the trial, from 1.
 
     Returns
     -------
@@ -209,10 +209,11 @@ def injected_sources(injection, catalog, base, usable, wcs, number):
         return QTable({"row": np.zeros(0, int)})
     rows = np.full(n, -1)
     if catalog is not None:
+        on_image = _rows_on_image(catalog, usable, wcs)
         # all in turn, then from the beginning
-        rows = (number * n + np.arange(n)) % len(catalog)
+        rows = on_image[((number - 1) * n + np.arange(n)) % len(on_image)]
         # a source is injected once at a time
-        rows = rows[: len(catalog)]
+        rows = rows[: len(on_image)]
         sources = QTable(catalog[rows], copy=True)
         _fill_prior_fluxes(sources, base, rng)
     else:
@@ -232,6 +233,17 @@ def injected_sources(injection, catalog, base, usable, wcs, number):
         sources = sources[: len(xy)]
         sources["sky"] = wcs.pixel_to_world(*xy.T).icrs
     return sources
+
+
+def _rows_on_image(catalog, usable, wcs):
+    """Rows of an own catalog that are injected: those on usable pixels, or all where positions are drawn."""
+    if "sky" not in catalog.colnames:
+        return np.arange(len(catalog))
+    xy = np.stack(wcs.world_to_pixel(catalog["sky"]), axis=-1)
+    has_data, _ = nearest_values(usable, xy)
+    rows = np.flatnonzero(has_data)
+    check_that(len(rows), "catalog", "one with sources on the image", "positions elsewhere alone")
+    return rows
 
 
 def _fill_prior_fluxes(sources, base, rng):

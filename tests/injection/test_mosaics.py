@@ -76,7 +76,7 @@ def image_of(folder, name="image"):
 
 @pytest.fixture(scope="module")
 def result(folder):
-    own = points(np.random.default_rng(3), -1.6, 0.6, 360)
+    own = points(np.random.default_rng(3), -1.6, 0.6, 360)[45:]
     injection = Injection(own, n_trials=6, n_sources=45, preset=PRESET)
     return injection.run(image_of(folder), folder=folder / "run")
 
@@ -166,7 +166,7 @@ def test_completeness_of_detection_is_that_of_simulated_fields(result, folder, t
 def test_a_finished_run_stands_and_workers_change_nothing(result, folder, tmp_path):
     from concurrent.futures import ThreadPoolExecutor
 
-    own = points(np.random.default_rng(3), -1.6, 0.6, 360)
+    own = points(np.random.default_rng(3), -1.6, 0.6, 360)[45:]
     injection = Injection(own, n_trials=1, n_sources=45, preset=PRESET)
     with ThreadPoolExecutor(2) as executor:
         again = injection.run(
@@ -326,6 +326,31 @@ def test_sources_without_room_are_refused(folder, tmp_path):
     injection = Injection(own, n_trials=1, n_sources=500, preset=PRESET)
     with pytest.raises(ValueError, match=r"'n_sources' must be at most \d+, which have room"):
         injection.run(image_of(folder), folder=tmp_path / "full")
+
+
+def test_own_sources_are_injected_in_turn_where_the_image_has_data(folder, tmp_path):
+    own = points(np.random.default_rng(3), -1.6, 0.6, 6)
+    own["sky"] = places([0.0, 60.0, -4.0, 4.0, 4.0, -60.0], [0.0, 0.0, 4.0, 4.0, -4.0, 0.0])
+    injection = Injection(own, n_trials=2, n_sources=3, preset=PRESET)
+    # an extension may be named
+    image = image_of(folder, "part")
+    image = image.replace(path=f"{image.path}[SCI]")
+    found = injection.run(image, folder=tmp_path / "run").sources
+    assert_array_equal(found["row"], [0, 2, 3, 4, 0, 2])
+    assert np.isfinite(found["flux"]).all()
+    injection = injection.replace(catalog=own[[1, 5]])
+    with pytest.raises(ValueError, match="one with sources on the image"):
+        injection.run(image, folder=tmp_path / "elsewhere")
+
+
+def test_a_small_image_gets_a_source(tmp_path):
+    rng = np.random.default_rng(3)
+    write(tmp_path / "small.fits", places([0.0]), [2.0], rng, side=54)
+    psf_of(LO).write(tmp_path / "psf.fits")
+    image = MosaicFile(tmp_path / "small.fits", filter="irac.ch4", psf=tmp_path / "psf.fits")
+    own = points(rng, -1.6, 0.6, 3)
+    result = Injection(own, n_trials=1, preset=PRESET).run(image, folder=tmp_path / "run")
+    assert len(result.sources) == 1
 
 
 def test_light_on_repeated_pixels_is_repeated(tmp_path):
