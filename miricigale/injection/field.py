@@ -255,7 +255,7 @@ class ImageField:
     preset : str or `~miricigale.photometry.DetectionPreset`
         How its own sources are detected.
     options : dict
-        Of `~miricigale.photometry.ForcedPhotometer`.
+        Of `~miricigale.photometry.ForcedPhotometer`, with the defaults of files for those that are not given.
     n_threads : int, optional
         Threads; they change nothing.
     """
@@ -265,7 +265,7 @@ class ImageField:
 
     def __init__(self, file, preset, options, n_threads=None):
         self.file, self.preset, self.n_threads = file, preset, n_threads
-        self.options = {"background_order": 0, **options}
+        self.options = {"background_order": 0, "second_pass": None, **options}
         self.band = file.header.filter
 
     @functools.cached_property
@@ -276,6 +276,13 @@ class ImageField:
             wanted = f"given, for there is no model PSF for {self.file.path}"
             raise argument_error("psf", wanted, None)
         return psf
+
+    @functools.cached_property
+    def photometer(self):
+        """What measures the image, `~miricigale.photometry.ForcedPhotometer`."""
+        return ForcedPhotometer(
+            psf=self.psf, template="sersic", n_threads=self.n_threads, **self.options
+        )
 
     def psfs(self, result):
         """The PSF of the image, and None."""
@@ -299,10 +306,7 @@ class ImageField:
             segments = segmentation.data
             former = self._shapes(image, segments, catalog)
         catalog = with_shapes(former, sources)
-        photometer = ForcedPhotometer(
-            psf=self.psf, template="sersic", n_threads=self.n_threads, **self.options
-        )
-        result = photometer.measure(image, catalog=catalog)
+        result = self.photometer.measure(image, catalog=catalog)
         rows = np.arange(len(catalog) - n, len(catalog))
         measured = Measured(result.to_table(self.band), result, image, rows)
         return measured, Pixels(None, [], {self.band: image}), segments, former

@@ -108,7 +108,8 @@ class Injection(Interactive, InjectionSettings):
         **options
             With a prior, all others of `~miricigale.photometry.measure_files` that are not files to be written:
             ``segmentation``, ``catalog``, ``kernel``, ``max_shift`` and so on. Without, those of
-            `~miricigale.photometry.ForcedPhotometer`.
+            `~miricigale.photometry.ForcedPhotometer`; ``background_order`` is 0 and ``second_pass`` None by
+            default, as with a prior.
 
         Returns
         -------

@@ -380,7 +380,7 @@ def run_injection(
     )
     # faults of the user's are refused here rather than in a trial
     field = Task.of(config, injection.seed).field(n_threads)
-    _ = field.photometers if inputs is not None else field.psf
+    _ = field.photometers if inputs is not None else field.photometer
     Task.of(config, injection.seed).sources(field, file.header.wcs)
     runner = StudyRunner(
         config, folder, injection_stages, executor=executor, redo=redo, progress_bar=progress_bar

@@ -12,7 +12,7 @@ from helpers.errors import refuses
 from helpers.mosaics import CENTER, FINE, HI, LO, lattice, places, render
 from miricigale.cli import main
 from miricigale.injection import CompletenessCurve, Injection
-from miricigale.injection.field import joined_segments, recovered_rows
+from miricigale.injection.field import ImageField, joined_segments, recovered_rows
 from miricigale.injection.light import light_on_file, light_on_image, psf_on_pixels
 from miricigale.injection.population import counts_slope, draw_magnitudes, draw_places, read_sources
 from miricigale.instrument import north_up_wcs, pixel_area_map
@@ -351,6 +351,15 @@ def test_a_small_image_gets_a_source(tmp_path):
     own = points(rng, -1.6, 0.6, 3)
     result = Injection(own, n_trials=1, preset=PRESET).run(image, folder=tmp_path / "run")
     assert len(result.sources) == 1
+
+
+def test_options_without_a_prior_are_those_of_files_and_refused_at_once(folder, tmp_path):
+    photometer = ImageField(image_of(folder), PRESET, {}).photometer
+    assert photometer.background_order == 0
+    assert photometer.second_pass is None
+    with pytest.raises(ValueError, match="'background_order' must be an integer"):
+        Injection(n_trials=1).run(image_of(folder), folder=tmp_path / "run", background_order=-3)
+    assert not (tmp_path / "run").exists()
 
 
 def test_light_on_repeated_pixels_is_repeated(tmp_path):
