@@ -1,5 +1,7 @@
 """The command that injects sources."""
 
+import math
+
 from miricigale.cli.catalogs import images_of
 from miricigale.cli.exposures import reducer_of
 from miricigale.cli.options import TYPES, chosen, declarations, workers
@@ -51,7 +53,7 @@ def inject(args):
             result = injection.run(image, highres, **options)
     for question in ("detection", "forced"):
         curve = result.curve(question) if len(result.sources) else None
-        if curve is not None:
+        if curve is not None and math.isfinite(curve.limit):
             print(f"50 % limit, {question}: {curve.limit:.2f} ± {curve.limit_err:.2f} AB")
     made = "page: index.html" if len(result.sources) else "photometry: photometry.fits"
     print(f"{len(result.sources)} sources; {made} in {args.output}/")

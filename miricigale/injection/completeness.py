@@ -35,7 +35,7 @@ class CompletenessCurve:
         Magnitude of half the plateau, and rms width of the fall as a fraction of the flux there.
     limit, limit_err : float
         Magnitude at which half of the sources are recovered, and its error; NaN if the plateau is below one
-        half.
+        half, or the magnitude is not within those of the sources.
     n : int
         Number of sources.
 
@@ -101,6 +101,9 @@ class CompletenessCurve:
         best = minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-6})
         best = minimize(loss, best.x, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-8})
         limit = _limit(best.x)
+        # beyond the sources the priors alone say where the curve falls
+        if not magnitude.min() <= limit <= magnitude.max():
+            limit = np.nan
         limit_err = np.nan
         if np.isfinite(limit):
             limit_err = _limit_error(loss, best.x)

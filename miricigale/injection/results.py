@@ -81,7 +81,7 @@ class InjectionResult(Interactive):
         facts = {"injected sources": len(self.sources)}
         for question in QUESTIONS:
             curve = self.curve(question)
-            if curve is not None:
+            if curve is not None and np.isfinite(curve.limit):
                 facts[f"50 % limit, {question}"] = f"{curve.limit:.2f} AB"
         return facts
 
@@ -99,7 +99,8 @@ class InjectionResult(Interactive):
         Returns
         -------
         curve : `CompletenessCurve` or None
-            Its ``limit`` is the magnitude of half completeness; None with too few sources.
+            Its ``limit`` is the magnitude of half completeness, NaN where the sources do not bracket it; None
+            with too few sources.
 
         Raises
         ------
@@ -136,11 +137,12 @@ class InjectionResult(Interactive):
         table : `~astropy.table.QTable`
             A row for each bin, with ``n`` sources. ``detected`` and ``recovered``, each with ``_low`` and
             ``_high`` (68 % Wilson intervals), are shares of those in the bin; by anything but magnitude of
-            those brighter than the limit of all, and ``limit_detection`` and ``limit_forced``, with ``_err``,
-            are the magnitudes of half completeness in the bin. ``bias`` is the median of measured over true
-            flux less 1 of sources above 5 sigma. ``pull_median``, ``pull_mad`` (1.4826 times the median
-            absolute deviation) and ``pull_rms`` are those of (measured - true flux) / error, of ``n_measured``
-            sources, and ``factor`` that within which 68.27 % of them are.
+            those brighter than the limit of all (of all in the bin, where there is no limit), and
+            ``limit_detection`` and ``limit_forced``, with ``_err``, are the magnitudes of half completeness in
+            the bin. ``bias`` is the median of measured over true flux less 1 of sources above 5 sigma.
+            ``pull_median``, ``pull_mad`` (1.4826 times the median absolute deviation) and ``pull_rms`` are those
+            of (measured - true flux) / error, of ``n_measured`` sources, and ``factor`` that within which 68.27 %
+            of them are.
 
         Raises
         ------

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 from helpers.errors import refuses
 from helpers.mosaics import CENTER, FINE, HI, LO, lattice, places, render
 from miricigale.cli import main
-from miricigale.injection import CompletenessCurve, Injection
+from miricigale.injection import CompletenessCurve, Injection, InjectionResult
 from miricigale.injection.field import ImageField, joined_segments, recovered_rows
 from miricigale.injection.light import light_on_file, light_on_image, psf_on_pixels
 from miricigale.injection.population import counts_slope, draw_magnitudes, draw_places, read_sources
@@ -319,6 +319,18 @@ def test_curves_find_limit_and_plateau(plateau):
     assert_allclose(curve.plateau, plateau, atol=0.02)
     assert_allclose(curve(fine), exact, atol=0.03)
     assert CompletenessCurve.fit(magnitude, np.ones(6000, bool)) is None
+
+
+def test_sources_that_do_not_bracket_it_have_no_limit():
+    rng = np.random.default_rng(0)
+    magnitude = rng.uniform(20, 22, 200)
+    # all are bright, and others hide a few
+    shown = rng.uniform(size=200) > 0.06
+    curve = CompletenessCurve.fit(magnitude, shown)
+    assert np.isnan([curve.limit, curve.limit_err]).all()
+    assert_allclose(curve.plateau, np.mean(shown), atol=0.03)
+    sources = QTable({"magnitude": magnitude, "detected": shown, "recovered": shown})
+    assert "limit" not in InjectionResult(sources, None, None, None)._repr_html_()
 
 
 def test_sources_without_room_are_refused(folder, tmp_path):
