@@ -75,8 +75,7 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     ----------
     value : `~astropy.units.Quantity`
         Anything `~astropy.units.Quantity` accepts, masked or not (`miricigale.utils.missing_values.mask_of`); a
-        bare
-        number is refused unless ``unit`` is dimensionless.
+        bare number is refused unless ``unit`` is dimensionless.
     unit : `~astropy.units.Unit`
         The unit wanted.
     name : str
