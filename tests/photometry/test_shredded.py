@@ -113,6 +113,18 @@ def test_errors_are_those_of_the_degeneracy(tools, scene):
     assert pieces.sum() < np.trace(pieces)
 
 
+def test_pieces_on_exposures_are_those_on_one_image(tools, scene):
+    """What is not known of a galaxy is the same for all of its pieces there too."""
+    errors = ErrorSettings(correlated_noise=False)
+    photometer = ForcedPhotometer(tools.kernel, background_order=0, errors=errors, n_threads=1)
+    one = photometer.measure(scene.image, templates=scene.pieces)
+    joint = photometer.measure([scene.image], templates=scene.pieces)
+    assert_allclose(joint.flux, one.flux, rtol=1e-6)
+    assert_allclose(joint.flux_err_template, one.flux_err_template, rtol=1e-6)
+    assert_allclose(joint.covariance.toarray(), one.covariance.toarray(), rtol=1e-6, atol=1e-9)
+    assert_array_equal(joint.flags, one.flags)
+
+
 def test_galaxies_side_by_side_stay_what_they_are(tools):
     """Two galaxies whose segments touch have peaks of their own."""
     sky = tools.places([-0.4, 0.4], [0.0, 0.1])

@@ -12,9 +12,9 @@ from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.photometry.images.fields import legendre_terms
 from miricigale.photometry.shapes.shapes import not_fitted
 from miricigale.photometry.templates.free_templates import (
-    LEAST,
     FreeTemplates,
     change_basis,
+    find_changes,
     joined_matrix,
 )
 from miricigale.photometry.templates.normal_equations import (
@@ -24,8 +24,6 @@ from miricigale.photometry.templates.normal_equations import (
     sandwich_matrix,
     stated_correlation,
 )
-from miricigale.photometry.templates.template_changes import TemplateChanges
-from miricigale.utils.parallel import parallel_map
 from miricigale.utils.units import ANGLE
 
 #: Largest share of a template's power that is its own noise and is taken off (as for one image).
@@ -289,8 +287,7 @@ class ExposureFit:
         those
         after them are points. See `~miricigale.photometry.templates.free_templates.free_templates`.
         """
-        size_scatter = self.settings.errors.size_scatter
-        if self.fit is None or size_scatter is None:
+        if self.fit is None or self.settings.errors.size_scatter is None:
             return
         shapes = not_fitted(len(self.xy))
         shapes[: len(fitted)] = fitted
@@ -298,12 +295,15 @@ class ExposureFit:
         shapes["covariance"][:, 1:3] = 0.0
         shapes["covariance"][:, :, 1:3] = 0.0
         shapes = shapes[self.rows]
-        changes, noise = self._changes(shapes, size_scatter)
+        cutouts = self.cutouts()
+        parts = [cutouts[source] for source in self.rows]
+        executor = self.parts[0].bank.executor
+        owner, changes, scale, noise = find_changes(self, shapes, parts, executor)
         if not (changes or noise.any()):
             return
-        owner = np.array([row for row, _ in changes], int)
-        fixed = np.array([change.fixed for _, change in changes], bool)
-        light = np.array([change.light for _, change in changes])
+        sources = self.rows[owner]
+        fixed = np.array([change.fixed for change in changes], bool)
+        light = np.array([change.light for change in changes])
         n = len(self.rows)
         n_changes = len(changes)
         basis = change_basis(n, owner, light, fixed)
@@ -313,7 +313,7 @@ class ExposureFit:
         borders = []
         banks = []
         for k, part in enumerate(self.parts):
-            bank, numbers = self._change_bank(part, changes)
+            bank, numbers = self._change_bank(part, sources, changes)
             banks.append((bank, numbers))
             data = part.arrays.whitened(part.arrays.flux)
             columns = part.sky_columns(self.order)
@@ -328,7 +328,7 @@ class ExposureFit:
             borders.append(border)
         border = basis.T @ np.concatenate([self.fit.border, np.sum(borders, axis=0)])
         owner = owner[~fixed]
-        prior = np.concatenate([np.zeros(n), self.fit.flux[owner] ** -2.0])
+        prior = np.concatenate([np.zeros(n), scale[owner] ** -2.0])
         matrix = joined_matrix(self.fit.matrix, cross, squares, basis)
         solution = LinearFit(
             (matrix + scipy.sparse.diags_array(prior)).tocsr(),
@@ -337,40 +337,17 @@ class ExposureFit:
             self.fit.corner,
             self.fit.corner_rhs,
         )
-        places = self.xy[self.rows[[row for row, _ in changes]]].reshape(-1, 2)
+        places = self.xy[sources]
         self.free = JointChanges(solution, banks, n, basis, owner, prior, noise, places)
         self.flux[self.rows] = self.free.flux
 
-    def _changes(self, shapes, size_scatter):
-        """Changes of templates with the number of their row, and the variance of ln flux of each row."""
-        kernel = self.settings.mean_kernel
-        fit = self.fit
-        finder = TemplateChanges(kernel.source, kernel.target, size_scatter)
-        snr = np.abs(fit.flux) * np.sqrt(fit.matrix.diagonal())
-        wanted = np.isfinite(shapes["parameters"][:, 0]) & (snr > LEAST) & (fit.flux > 0)
-        wanted = np.flatnonzero(wanted)
-        light = self.cutouts()
-
-        def find(row):
-            return finder.of(light[self.rows[row]], shapes[row], LEAST / snr[row])
-
-        results = parallel_map(find, wanted, executor=self.parts[0].bank.executor)
-        noise = np.zeros(len(self.rows))
-        noise[wanted] = [variance for _, variance in results]
-        changes = [
-            (row, change)
-            for row, (row_changes, _) in zip(wanted, results, strict=True)
-            for change in row_changes
-        ]
-        return changes, noise
-
-    def _change_bank(self, part, changes):
-        """The changes as an exposure shows them, and the number of each row of that bank."""
+    def _change_bank(self, part, sources, changes):
+        """The changes of some sources as an exposure shows them, and the number of each row of that bank."""
         place = np.full(len(self.xy), -1)
         place[part.source] = np.arange(len(part.source))
-        local = place[self.rows[[row for row, _ in changes]]]
+        local = place[sources]
         shown = np.flatnonzero(local >= 0)
-        bank = part.bank.at_resolution(local[shown], [changes[j][1].cutout for j in shown])
+        bank = part.bank.at_resolution(local[shown], [changes[j].cutout for j in shown])
         return bank, shown[bank.order]
 
     def _cross(self, part, bank, place, correlation):

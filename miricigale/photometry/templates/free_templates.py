@@ -131,33 +131,7 @@ def free_templates(fit, fitted):
     flux of the plain fit is taken.
     """
     plain, bank, rows = fit.fit, fit.bank, fit.rows
-    kernel, size_scatter = fit.settings.mean_kernel, fit.settings.errors.size_scatter
-    changes = TemplateChanges(kernel.source, kernel.target, size_scatter)
-    snr = np.abs(plain.flux) * np.sqrt(plain.matrix.diagonal())
-    known = np.isfinite(fitted["parameters"][:, 0]) & (fitted["galaxy"] == 0)
-    wanted = np.flatnonzero(known & (snr > LEAST) & (plain.flux > 0))
-    parts = bank.parts(rows)
-
-    def find(k):
-        return changes.of(parts[k], fitted[k], LEAST / snr[k])
-
-    found = parallel_map(find, wanted, executor=bank.executor)
-    owner = [k for k, (some, _) in zip(wanted, found, strict=True) for _ in some]
-    every = [one for some, _ in found for one in some]
-    noise = np.zeros(len(rows))
-    noise[wanted] = [one for _, one in found]
-    scale = np.abs(plain.flux)
-    galaxies = divided_galaxies(fitted, plain.flux)
-    for galaxy in galaxies:
-        noise[galaxy.rows] = [changes.pixel_noise(parts[k]) for k in galaxy.rows]
-        largest = galaxy.largest
-        least = LEAST / galaxy.signal(plain.matrix)
-        # the whole galaxy changes, which its largest piece stands for
-        scale[largest] = galaxy.flux
-        for change in changes.of(parts[largest].whole, fitted[largest], least)[0]:
-            owner.append(largest)
-            every.append(galaxy.of_largest(change))
-    owner = np.array(owner, int)
+    owner, every, scale, noise = find_changes(fit, fitted, bank.parts(rows), bank.executor)
     if not (len(owner) or noise.any()):
         return None
     other = bank.at_resolution(bank.order[rows[owner]], [one.cutout for one in every])
@@ -180,6 +154,61 @@ def free_templates(fit, fitted):
         plain.corner_rhs,
     )
     return FreeTemplates(free, other, len(rows), basis, owner, prior, noise)
+
+
+def find_changes(fit, fitted, parts, executor):
+    """
+    Find how the templates of a fit can change, as far as they are not known.
+
+    Parameters
+    ----------
+    fit : object
+        With ``fit``, the `LinearFit` of n templates as they are, and ``settings``.
+    fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.shapes.FITTED`, shape (n,)
+        What is known of each.
+    parts : list of `~miricigale.photometry.detection.cutouts.Cutout` or None
+        The light of each, None for points.
+    executor : `concurrent.futures.Executor` or None
+        Threads to work with.
+
+    Returns
+    -------
+    owner : int `~numpy.ndarray`, shape (k,)
+        The template of each change. Changes of a divided galaxy are those of its largest piece.
+    changes : list of `~miricigale.photometry.templates.template_changes.Change`
+        The k changes.
+    scale : `~numpy.ndarray`, shape (n,)
+        Flux (uJy) of which one standard deviation of a change is a part: that of the whole galaxy for its largest
+        piece.
+    noise : `~numpy.ndarray`, shape (n,)
+        Variance of ln flux by noise in templates that are images.
+    """
+    plain = fit.fit
+    kernel = fit.settings.mean_kernel
+    finder = TemplateChanges(kernel.source, kernel.target, fit.settings.errors.size_scatter)
+    snr = np.abs(plain.flux) * np.sqrt(plain.matrix.diagonal())
+    known = np.isfinite(fitted["parameters"][:, 0]) & (fitted["galaxy"] == 0)
+    wanted = np.flatnonzero(known & (snr > LEAST) & (plain.flux > 0))
+
+    def find(k):
+        return finder.of(parts[k], fitted[k], LEAST / snr[k])
+
+    found = parallel_map(find, wanted, executor=executor)
+    owner = [k for k, (some, _) in zip(wanted, found, strict=True) for _ in some]
+    changes = [one for some, _ in found for one in some]
+    noise = np.zeros(len(parts))
+    noise[wanted] = [one for _, one in found]
+    scale = np.abs(plain.flux)
+    for galaxy in divided_galaxies(fitted, plain.flux):
+        noise[galaxy.rows] = [finder.pixel_noise(parts[k]) for k in galaxy.rows]
+        largest = galaxy.largest
+        least = LEAST / galaxy.signal(plain.matrix)
+        # the whole galaxy changes, which its largest piece stands for
+        scale[largest] = galaxy.flux
+        for change in finder.of(parts[largest].whole, fitted[largest], least)[0]:
+            owner.append(largest)
+            changes.append(galaxy.of_largest(change))
+    return np.array(owner, int), changes, scale, noise
 
 
 def change_basis(n, owner, light, fixed):
