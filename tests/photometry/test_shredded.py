@@ -125,6 +125,23 @@ def test_pieces_on_exposures_are_those_on_one_image(tools, scene):
     assert_array_equal(joint.flags, one.flags)
 
 
+def test_pieces_without_the_largest_stay_what_they_are(tools, scene):
+    """The template of the whole is kept with its largest piece: without it a point would be put in its place."""
+    image = scene.image.copy()
+    rows, columns = np.indices(image.shape)
+    x, y = image.wcs.world_to_pixel(scene.pieces.sky[0])
+    image.mask = (np.abs(rows - y) < 12) & (np.abs(columns - x) < 9)
+    results = []
+    for scatter in (None, 0.1):
+        errors = ErrorSettings(correlated_noise=False, size_scatter=scatter)
+        photometer = ForcedPhotometer(tools.kernel, errors=errors, n_threads=1)
+        results.append(photometer.measure(image, templates=scene.pieces))
+    fixed, free = results
+    assert_array_equal(np.isnan(free.flux[:5]), [True, True, False, False, False])
+    assert_allclose(free.flux[2:5], fixed.flux[2:5], rtol=0.01)
+    assert np.all(free.flux_err[2:5] > fixed.flux_err[2:5])
+
+
 def test_galaxies_side_by_side_stay_what_they_are(tools):
     """Two galaxies whose segments touch have peaks of their own."""
     sky = tools.places([-0.4, 0.4], [0.0, 0.1])

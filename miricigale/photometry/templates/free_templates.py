@@ -174,7 +174,8 @@ def find_changes(fit, fitted, parts, executor):
     Returns
     -------
     owner : int `~numpy.ndarray`, shape (k,)
-        The template of each change. Changes of a divided galaxy are those of its largest piece.
+        The template of each change. Changes of a divided galaxy are those of its largest piece; if that is not
+        fitted there are none.
     changes : list of `~miricigale.photometry.templates.template_changes.Change`
         The k changes.
     scale : `~numpy.ndarray`, shape (n,)
@@ -202,10 +203,14 @@ def find_changes(fit, fitted, parts, executor):
     for galaxy in divided_galaxies(fitted, plain.flux):
         noise[galaxy.rows] = [finder.pixel_noise(parts[k]) for k in galaxy.rows]
         largest = galaxy.largest
+        whole = parts[largest].whole
+        if whole is None and not galaxy.has_largest:
+            # the template of the whole is that of a piece that is not fitted
+            continue
         least = LEAST / galaxy.signal(plain.matrix)
         # the whole galaxy changes, which its largest piece stands for
         scale[largest] = galaxy.flux
-        for change in finder.of(parts[largest].whole, fitted[largest], least)[0]:
+        for change in finder.of(whole, fitted[largest], least)[0]:
             owner.append(largest)
             changes.append(galaxy.of_largest(change))
     return np.array(owner, int), changes, scale, noise

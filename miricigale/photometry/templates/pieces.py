@@ -12,11 +12,17 @@ class Galaxy:
     rows: np.ndarray  # (k,): Its pieces among the fitted rows.
     shares: np.ndarray  # (k,): Their parts of the light on the high-resolution image, of unit sum.
     flux: float  # Sum of their fluxes in a fit without a prior.
+    lost: float  # Part of the light on the high-resolution image that is that of pieces that are not fitted.
 
     @property
     def largest(self):
         """The row of the largest piece."""
         return int(self.rows[np.argmax(self.shares)])
+
+    @property
+    def has_largest(self):
+        """Whether no piece that is not fitted can be larger than the largest of these."""
+        return self.lost < self.shares.max() * (1.0 - self.lost)
 
     def of_largest(self, change):
         """
@@ -54,5 +60,6 @@ def divided_galaxies(fitted, flux):
         rows = np.flatnonzero((number == galaxy) & (share > 0))
         total = flux[rows].sum()
         if len(rows) > 1 and total > 0:
-            galaxies.append(Galaxy(rows, share[rows] / share[rows].sum(), float(total)))
+            known = float(share[rows].sum())
+            galaxies.append(Galaxy(rows, share[rows] / known, float(total), 1.0 - known))
     return galaxies
