@@ -190,6 +190,17 @@ def test_offsets_of_exposures_are_found_and_fitted(dithers):
     warned(match, close.measure, images, templates=dithers.templates)
 
 
+def test_the_offset_that_is_warned_of_is_one_that_was_measured(dithers):
+    """An exposure without light has none."""
+    noise = np.random.default_rng(4).normal(0, 50.0, SHAPE)
+    images = [moved(dithers.images[0], 0.0, -0.05), exposure(noise, dithers.wcss[1], 50.0)]
+    images[0].mask = dithers.images[0].mask
+    photometer = ForcedPhotometer(dithers.kernels)
+    match = "1 exposures lie up to 0.05. arcsec from"
+    result = warned(match, photometer.measure, images, templates=dithers.templates)
+    assert_array_equal(np.isnan(result.exposures.table["offset_err"]), [False, True])
+
+
 def test_a_source_that_the_catalog_lacks_is_fitted_with_it(dithers):
     known = dithers.templates[np.arange(8) != 3]
     photometer = ForcedPhotometer(dithers.kernels, second_pass=True)
@@ -255,6 +266,8 @@ def test_what_does_not_fit_is_refused(dithers):
     match = "'image' must be 2 exposures, one for each kernel"
     refuses(match, photometer.measure, dithers.images[0], templates=templates)
     refuses("'image' must be at least one", photometer.measure, [], templates=templates)
+    match = "'templates' must be SourceTemplates, got list"
+    refuses(match, photometer.measure, dithers.images, templates=[1], error=TypeError)
     bare = MatchingKernel(np.ones((3, 3)) / 9, pixel_scale=0.06 * u.arcsec)
     refuses("'kernel' must be kernels with their PSFs", ForcedPhotometer, [bare])
     other = [one.copy() for one in dithers.images]

@@ -414,7 +414,7 @@ def _warn_of_offsets(fit, offsets):
     far = (offset > _OFFSET * fit.scale) & (offset > 3 * offsets[1])
     if far.any() and np.count_nonzero(snr > _BRIGHT) >= _FEWEST_BRIGHT:
         msg = (
-            f"{np.count_nonzero(far)} exposures lie up to {offset.max():.3f} arcsec from their templates: "
+            f"{np.count_nonzero(far)} exposures lie up to {offset[far].max():.3f} arcsec from their templates: "
             "'max_shift' fits that"
         )
         warn(msg, PhotometryWarning)

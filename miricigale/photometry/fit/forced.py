@@ -319,6 +319,9 @@ class ForcedPhotometer(Interactive):
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
+        if templates is not None and not isinstance(templates, SourceTemplates):
+            msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
+            raise TypeError(msg)
         if are_exposures(image):
             from miricigale.photometry.fit.exposure_photometry import measure_exposures
 
@@ -338,9 +341,6 @@ class ForcedPhotometer(Interactive):
             sources = dataclasses.replace(sources, sky=catalog["sky"])
         elif any(given):
             raise argument_error("templates", "given alone with the image", "a catalog too")
-        elif not isinstance(templates, SourceTemplates):
-            msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
-            raise TypeError(msg)
         else:
             sources = templates
         if self.psf_stars is not False and not self.bare:
