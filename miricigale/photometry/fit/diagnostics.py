@@ -43,11 +43,13 @@ def diagnose(fit, xy):
     correlation = None
     if fit.settings.errors.correlated_noise and len(fit.rows):
         correlation = _correlation(fit, residual, model)
-    chi2, left, core, rim = _statistics(fit, residual).T
+    # the image is its model and the residual
+    chi2, left, core, below, rim = _statistics(
+        fit, residual, residual + fit.arrays.usable * model
+    ).T
     with np.errstate(divide="ignore", invalid="ignore"):
         left = left / (fit.total * core)
-        # the image is its model and the residual
-        seen = _statistics(fit, residual + fit.arrays.usable * model)[:, 1] / core
+        seen = below / core
     out = np.ones(len(chi2), bool)
     out[fit.rows] = False
     out |= ~fit.main
@@ -79,23 +81,30 @@ def _correlation(fit, residual, model):
     return correlation if correlation.any() else None
 
 
-def _statistics(fit, residual):
-    """Chi2, light left and light of each template's core (see the kernel), its part on the rim, shape (n, 4)."""
-    out = np.full((len(fit.bank.order), 3), np.nan)
-    rim_light = np.zeros(len(out))
-    if not len(fit.rows):
-        return np.column_stack([out, rim_light])
-    rim = rim_pixels(fit.arrays.usable)
-    for block in fit.bank.blocks():
+def _statistics(fit, residual, light):
+    """
+    What the images show where each template is, shape (n, 5).
 
-        def measure(part, block=block):
-            rows = slice(block.first + part.start, block.first + part.stop)
-            values, boxes, starts = block.some(part)
-            residual_statistics(values, boxes, starts, residual, fit.inverse_sigma, out[rows])
-            rim_light[rows] = _light_on(rim, values, boxes, starts)
+    Chi2, residual and light of each template's core (see the kernel), the image's light below it, and the part of
+    the template that is on the rim.
+    """
+    n = len(fit.bank.order)
+    out = np.full((2, n, 3), np.nan)
+    rim_light = np.zeros(n)
+    if len(fit.rows):
+        rim = rim_pixels(fit.arrays.usable)
+        for block in fit.bank.blocks():
 
-        fit.bank.map(measure, block.parts())
-    return np.column_stack([out, rim_light / fit.bank.full_light()])
+            def measure(part, block=block):
+                rows = slice(block.first + part.start, block.first + part.stop)
+                stamps = block.some(part)
+                for image, found in zip((residual, light), out, strict=True):
+                    residual_statistics(*stamps, image, fit.inverse_sigma, found[rows])
+                rim_light[rows] = _light_on(rim, *stamps)
+
+            fit.bank.map(measure, block.parts())
+    below = out[1, :, 1]
+    return np.column_stack([out[0], below, rim_light / fit.bank.full_light()])
 
 
 def rim_pixels(usable):
