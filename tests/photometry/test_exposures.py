@@ -201,6 +201,18 @@ def test_the_offset_that_is_warned_of_is_one_that_was_measured(dithers):
     assert_array_equal(np.isnan(result.exposures.table["offset_err"]), [False, True])
 
 
+def test_fluxes_that_exposures_cannot_hold_are_flagged(dithers):
+    images = []
+    for image, stamps in zip(dithers.images, dithers.stamps, strict=True):
+        hole = image.copy()
+        hole.data -= 2 * dithers.flux[5] * stamps[5]
+        images.append(hole)
+    result = ForcedPhotometer(dithers.kernels).measure(images, templates=dithers.templates)
+    assert result.flux.value[5] < -5 * result.flux_err.value[5]
+    flagged = result.flags & ForcedFlags.CANCELING > 0
+    assert_array_equal(flagged, np.arange(8) == 5)
+
+
 def test_a_source_that_the_catalog_lacks_is_fitted_with_it(dithers):
     known = dithers.templates[np.arange(8) != 3]
     photometer = ForcedPhotometer(dithers.kernels, second_pass=True)

@@ -12,6 +12,7 @@ from miricigale.instrument import pixel_area_map
 from miricigale.instrument.image import Image
 from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.detection.residual_sources import residual_peaks, unexplained_neighbors
+from miricigale.photometry.fit.diagnostics import canceling
 from miricigale.photometry.fit.exposure_fit import gaussian_width
 from miricigale.photometry.fit.result_table import new_source_table
 from miricigale.photometry.fit.results import ForcedPhotometryResult, crowded
@@ -159,7 +160,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     n_all = n + len(new_xy)
     place = np.concatenate([catalog.near, np.arange(n, n_all)])
     models, residuals, inverse = _images(fit)
-    chi2, residual_fraction, poor, checks = _compared(fit, models, residuals)
+    chi2, residual_fraction, seen, poor, checks = _compared(fit, models, residuals)
     terms, common, blending = _covariances(fit)
     joint = scipy.sparse.csr_array((n_all, n_all))
     errors = {name: np.full(n_all, np.nan) for name in ("", "_noise", "_template", "_psf")}
@@ -177,6 +178,8 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     xy = np.concatenate([catalog.xy, new_xy])
     peaks, _ = _peaks(fit, plane, xy, models, residuals, inverse)
     flags, coverage = _flags(fit, place, n_all, flux, blending, poor)
+    is_canceling = canceling(flux, errors[""], _spread_over(seen, place, n_all))
+    flags[is_canceling] |= int(ForcedFlags.CANCELING)
     flags[:n] |= catalog.flags
     flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
     has_neighbor = unexplained_neighbors(peaks, xy, flux)
@@ -243,19 +246,26 @@ def _spread_over(values, place, n):
 
 
 def _compared(fit, models, residuals):
-    """Chi-square of each source, light left, whether that is poor; noise and correlation of each exposure."""
+    """
+    Chi-square of each source, light left, flux with all light of its core, whether chi-square is poor.
+
+    Then noise and correlation of each exposure.
+    """
     n = len(fit.xy)
-    square, weight, light_left, core = np.zeros((4, n))
+    square, weight, light_left, below, core = np.zeros((5, n))
     checks = []
     for part, model, residual in zip(fit.parts, models, residuals, strict=True):
         area = part.arrays.areas()
         source = part.row_source
         row_light = np.zeros(len(part.source))
-        statistics = np.full((len(part.source), 3), np.nan)
+        statistics, light_statistics = np.full((2, len(part.source), 3), np.nan)
         residual_flux = np.asarray(residual * area, np.float32)
+        # an exposure is its model and the residual
+        light = residual_flux + part.arrays.usable * np.asarray(model * area, np.float32)
         for block in part.bank.blocks():
             rows = slice(block.first, block.last)
-            residual_statistics(*block.stamps, residual_flux, part.inverse_sigma, statistics[rows])
+            for image, found in ((residual_flux, statistics), (light, light_statistics)):
+                residual_statistics(*block.stamps, image, part.inverse_sigma, found[rows])
             for row, (first, last) in enumerate(
                 zip(block.start[:-1], block.start[1:], strict=True)
             ):
@@ -264,6 +274,7 @@ def _compared(fit, models, residuals):
         np.add.at(square, source[good], (row_light * statistics[:, 0])[good])
         np.add.at(weight, source[good], row_light[good])
         np.add.at(light_left, source[good], statistics[good, 1])
+        np.add.at(below, source[good], light_statistics[good, 1])
         np.add.at(core, source[good], statistics[good, 2])
         checks.append(
             _noise_check(
@@ -273,14 +284,16 @@ def _compared(fit, models, residuals):
     with np.errstate(divide="ignore", invalid="ignore"):
         chi2 = square / weight
         light_left = light_left / (fit.flux * core)
+        seen = below / core
     out = np.ones(n, bool)
     out[fit.rows] = False
     chi2[out] = np.nan
     light_left[out] = np.nan
+    seen[out] = np.nan
     poor = chi2 > POOR_CHI2
     if fit.free is not None:
         poor[fit.rows] |= fit.free.strain > POOR_STRAIN
-    return chi2, light_left, poor, checks
+    return chi2, light_left, seen, poor, checks
 
 
 def _noise_check(white, model, part):
