@@ -359,8 +359,7 @@ class _Joint:
         flux = np.full(len(self._catalog.id), np.nan)
         flux[self._catalog.near] = fit.flux
         xy = self._catalog.xy
-        peaks, usable = plane_peaks(fit, self._plane, xy)
-        negative, _ = plane_peaks(fit, self._plane, xy, sign=-1.0)
+        peaks, negative, usable = plane_peaks(fit, self._plane, xy)
         form = {"usable": usable} if decide else {}
         new = new_sources(peaks, xy, flux, **form)
         false = new_sources(negative, xy, flux, **form)

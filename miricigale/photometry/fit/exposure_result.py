@@ -99,14 +99,16 @@ class _PlaneFit:
     bank: object  # With the executor.
 
 
-def plane_peaks(fit, plane, xy, sign=1.0):
+def plane_peaks(fit, plane, xy):
     """
-    Peaks of the mean residual of all exposures in their common plane, and the plane's usable pixels.
+    Peaks of the mean residual of all exposures in their common plane, and of its negative, and the usable pixels.
 
-    ``xy``, (n, 2), are all known sources; with ``sign`` -1 the peaks of the negative.
+    ``xy``, (n, 2), are all known sources.
     """
-    models, residuals, sigmas = _images(fit)
-    return _peaks(fit, plane, xy, models, residuals, sigmas, sign)
+    images = _images(fit)
+    peaks, usable = _peaks(fit, plane, xy, *images)
+    negative, _ = _peaks(fit, plane, xy, *images, sign=-1.0)
+    return peaks, negative, usable
 
 
 def _images(fit):
