@@ -1,7 +1,11 @@
 """PSFs in FITS files: our own layout, and images that others made."""
 
+import dataclasses
+import os
+
 import astropy.units as u
 import numpy as np
+from astropy.io import fits
 
 from miricigale.instrument.header_wcs import header_wcs
 from miricigale.instrument.sky_axes import grid_angle
@@ -21,70 +25,221 @@ _LAYOUT = "psf-1"
 _STPSF_ORDER = ("OVERDIST", "DET_DIST", "OVERSAMP", "DET_SAMP")
 
 
-def read_planes(path, wanted, *, ext=None, plane=None):
+@dataclasses.dataclass(frozen=True)
+class PSFFile:
     """
-    Read the image of a PSF or kernel, or several planes of a cube.
+    Images of a PSF or kernel in any FITS file, with the pixel and the angle that its header states.
 
     Parameters
     ----------
-    path : path-like
-        The file, or ``file.fits[EXTENSION]`` or ``file.fits[EXTENSION,PLANE]``.
-    wanted : str
-        What the file should be, for messages.
-    ext : int or str, optional
-        The extension, if the path names none. By default the first with an image; of STPSF's files that with
-        distortion and the detector's effects.
-    plane : int or "mean", optional
-        Of a cube: one plane, or all.
-
-    Returns
-    -------
+    path : str
+        The file, for messages.
     planes : `~numpy.ndarray`, shape (n, ny, nx)
+        One image, or those of a cube.
     header : `~astropy.io.fits.Header`
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If there is no such extension, or it is no image (of a cube with ``plane``).
-
-    Warns
-    -----
-    `~miricigale.utils.exceptions.PSFWarning`
-        If several extensions hold images and none was named: which is taken.
+        That of the image; PA_APER, PIXELSCL and PIXSCALE may come from the primary header.
+    cell : float or None
+        Side of a cell in arcsec; None if it is not stated.
+    turn : float or None
+        Position angle of +y in degrees; None if it is not stated.
     """
-    name, own_ext, own_plane = file_place(path)
-    ext = own_ext if own_ext is not None else ext
-    plane = own_plane if own_plane is not None else plane
-    with open_fits(name, wanted=wanted, output_verify="silentfix") as hdus:
-        if ext is None:
-            ext = _best_extension(hdus, name)
-        try:
-            hdu = hdus[ext]
-        except (KeyError, IndexError):
-            known = [hdu.name for hdu in hdus]
-            raise data_error(path, f"has no such extension, only {known}") from None
-        data = hdu.data if hdu.is_image else None
-        shape = getattr(data, "shape", None)
-        if shape is not None and len(shape) == 3 and shape[0] == 1 and plane is None:
-            data = data[0]
-            shape = data.shape
-        if shape is None or len(shape) != (2 if plane is None else 3):
-            kind = "an image" if plane is None else "a cube"
-            hint = "; say FILE[EXTENSION,PLANE] or FILE[EXTENSION,mean] of a cube"
-            raise data_error(path, f"must be {kind} with {wanted}, got the shape {shape}{hint}")
-        if isinstance(plane, int) and not 0 <= plane < shape[0]:
-            raise data_error(path, f"is a cube with the planes 0 to {shape[0] - 1}")
-        if plane is None:
-            chosen = data[None]
-        elif plane == "mean":
-            chosen = data
-        else:
-            chosen = data[plane][None]
-        header = hdu.header.copy()
-        for key in ("PA_APER", "PIXELSCL", "PIXSCALE"):
-            if key not in header and key in hdus[0].header:
-                header[key] = hdus[0].header[key]
-        return np.array(chosen, dtype=float), header
+
+    path: str
+    planes: np.ndarray
+    header: fits.Header
+    cell: float | None
+    turn: float | None
+
+    @classmethod
+    def open(cls, path, wanted="a PSF", *, ext=None, plane=None):
+        """
+        Read the image of a PSF or kernel, or several planes of a cube.
+
+        Parameters
+        ----------
+        path : path-like
+            The file, or ``file.fits[EXTENSION]`` or ``file.fits[EXTENSION,PLANE]``.
+        wanted : str, optional
+            What the file should be, for messages.
+        ext : int or str, optional
+            The extension, if the path names none. By default the first with an image; of STPSF's files that
+            with distortion and the detector's effects.
+        plane : int or "mean", optional
+            Of a cube: one plane, or all.
+
+        Returns
+        -------
+        psf_file : `PSFFile`
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If there is no such extension, or it is no image (of a cube with ``plane``).
+        ValueError
+            If the image is mirrored.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.PSFWarning`
+            If several extensions hold images and none was named: which is taken.
+        """
+        name, path_extension, path_plane = file_place(path)
+        if path_extension is not None:
+            ext = path_extension
+        if path_plane is not None:
+            plane = path_plane
+        with open_fits(name, wanted=wanted, output_verify="silentfix") as hdus:
+            if ext is None:
+                ext = _best_extension(hdus, name)
+            try:
+                hdu = hdus[ext]
+            except (KeyError, IndexError):
+                names = [hdu.name for hdu in hdus]
+                raise data_error(path, f"has no such extension, only {names}") from None
+            planes = _planes(hdu, path, wanted, plane)
+            header = hdu.header.copy()
+            for key in ("PA_APER", "PIXELSCL", "PIXSCALE"):
+                if key not in header and key in hdus[0].header:
+                    header[key] = hdus[0].header[key]
+        cell, turn = header_grid(header)
+        return cls(os.fspath(path), planes, header, cell, turn)
+
+    @property
+    def on_detector(self):
+        """Whether the axes are those of the detector, as in the files of STPSF and WebbPSF (bool)."""
+        return {"OVERSAMP", "PIXELSCL"} <= set(self.header)
+
+    def pixel_scale(self, stated, *, oversampling=1, argument="pixel_scale"):
+        """
+        Side of a pixel: that of the header, with which a stated one must agree.
+
+        Parameters
+        ----------
+        stated : `~astropy.units.Quantity` or None
+            What the user says.
+        oversampling : int, optional
+            Cells along a side of a pixel.
+        argument : str, optional
+            The name of ``stated``, for messages.
+
+        Returns
+        -------
+        pixel_scale : `~astropy.units.Quantity` or None
+            None if neither the user nor the header states it.
+
+        Raises
+        ------
+        ValueError
+            If the two differ by more than 2 %.
+        """
+        in_header = None if self.cell is None else self.cell * oversampling
+        if stated is None:
+            return None if in_header is None else in_header * ANGLE
+        scale = float(to_array(stated, ANGLE, argument))
+        if in_header is not None and abs(scale / in_header - 1) > 0.02:
+            wanted = f"{in_header:.4g} arcsec, as the header of {self.path} says"
+            if oversampling > 1:
+                wanted += f" with {oversampling} cells along a pixel"
+            raise argument_error(argument, wanted, stated)
+        return scale * ANGLE
+
+    def angle(self, stated, *, argument="angle"):
+        """
+        Position angle of +y: that of the header, with which a stated one must agree.
+
+        Parameters
+        ----------
+        stated : `~astropy.units.Quantity` or None
+            What the user says.
+        argument : str, optional
+            The name of ``stated``, for messages.
+
+        Returns
+        -------
+        angle : `~astropy.units.Quantity` or None
+            None if neither the user nor the header states it.
+
+        Raises
+        ------
+        ValueError
+            If the two differ by more than 0.5 degrees.
+        """
+        if stated is None:
+            return None if self.turn is None else self.turn * u.deg
+        angle = float(to_array(stated, u.deg, argument, finite=True))
+        if self.turn is not None and abs((angle - self.turn + 180) % 360 - 180) > 0.5:
+            wanted = f"{self.turn:.4g} deg, as the header of {self.path} says"
+            raise argument_error(argument, wanted, stated)
+        return angle * u.deg
+
+    def make_psf(self, **options):
+        """
+        Make the PSF: the mean of the planes, each with its core in the same place.
+
+        Parameters
+        ----------
+        **options
+            Those of `~miricigale.psf.make_psf`. The center is found in the core unless ``origin`` says where it
+            is.
+
+        Returns
+        -------
+        psf : `InstrumentPSF`
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If a plane holds no light, or pixels that are not finite.
+        """
+        for data in self.planes:
+            if not np.all(np.isfinite(data)) or not data.max() > 0 or not data.sum() > 0:
+                msg = "is no PSF: it has no light, or pixels that are not finite"
+                raise data_error(self.path, msg)
+        options["meta"] = {"file": self.path, **options.get("meta", {})}
+        if len(self.planes) == 1:
+            data = self.planes[0]
+            options.setdefault("origin", core_position(data))
+            return make_psf(data, **options)
+        if "origin" in options:
+            return make_psf(self.planes.mean(axis=0), **options)
+        centers = np.array([core_position(data) for data in self.planes])
+        middle = centers.mean(axis=0)
+        planes = [
+            _shifted(data, middle - center)
+            for data, center in zip(self.planes, centers, strict=True)
+        ]
+        return make_psf(np.mean(planes, axis=0), origin=tuple(middle), **options)
+
+
+def _planes(hdu, path, wanted, plane):
+    """The image of an extension, or the planes of its cube, shape (n, ny, nx)."""
+    data = hdu.data if hdu.is_image else None
+    shape = getattr(data, "shape", None)
+    if shape is not None and len(shape) == 3 and shape[0] == 1 and plane is None:
+        data = data[0]
+        shape = data.shape
+    n_axes = 2 if plane is None else 3
+    if shape is None or len(shape) != n_axes:
+        kind = "an image" if plane is None else "a cube"
+        hint = "; say FILE[EXTENSION,PLANE] or FILE[EXTENSION,mean] of a cube"
+        raise data_error(path, f"must be {kind} with {wanted}, got the shape {shape}{hint}")
+    if isinstance(plane, int) and not 0 <= plane < shape[0]:
+        raise data_error(path, f"is a cube with the planes 0 to {shape[0] - 1}")
+    if plane is None:
+        planes = data[None]
+    elif plane == "mean":
+        planes = data
+    else:
+        planes = data[plane][None]
+    return np.array(planes, dtype=float)
+
+
+def _shifted(data, offset):
+    """An image moved by x, y in cells; 0 comes in at its edges."""
+    if np.hypot(*offset) < 1e-6:
+        return data
+    y, x = np.indices(data.shape)
+    return _core.interpolate(data, x - offset[0], y - offset[1])
 
 
 def _best_extension(hdus, name):
@@ -136,11 +291,6 @@ def core_position(data):
     return float((core * x).sum() / core.sum()), float((core * y).sum() / core.sum())
 
 
-def is_stpsf(header):
-    """Whether a header is one of STPSF or WebbPSF: the axes are those of the detector."""
-    return {"OVERSAMP", "PIXELSCL"} <= set(header)
-
-
 def header_grid(header):
     """
     Side of a pixel (arcsec) and position angle of +y (deg) that the header of a PSF or kernel states.
@@ -169,28 +319,6 @@ def header_grid(header):
         if isinstance(header.get(key), (int, float)) and header[key] > 0:
             return float(header[key]), None
     return None, None
-
-
-def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
-    """
-    An image of any FITS file, its header, pixel (a quantity), position angle (deg or None) and oversampling.
-
-    Parameters and errors are those of `read_psf`; ``wanted`` describes the expected content for messages.
-    """
-    planes, header = read_planes(path, wanted, ext=ext, plane=plane)
-    data = planes.mean(axis=0)
-    if oversampling is None:
-        oversampling = int(header.get("OVERSAMP", 1))
-    cell, angle = header_grid(header)
-    if pixel_scale is None:
-        if cell is None:
-            raise argument_error("pixel_scale", "given where the header does not state it", None)
-        pixel_scale = cell * oversampling * ANGLE
-    elif cell is not None:
-        mine = float(to_array(pixel_scale, ANGLE, "pixel_scale")) / oversampling
-        stated = f"{cell * oversampling:.4g} arcsec by the header and 'oversampling'"
-        check_that(abs(mine / cell - 1) <= 0.02, "pixel_scale", stated, pixel_scale)
-    return data, header, pixel_scale, angle, oversampling
 
 
 def read_psf(
@@ -236,7 +364,8 @@ def read_psf(
     `~miricigale.utils.exceptions.DataError`
         If the file is missing or no FITS, or there is no 2D image there.
     ValueError
-        If scale or angle are unknown or not the header's.
+        If scale or angle are unknown or not the header's, or something is stated of a file that
+        `InstrumentPSF.write` made.
 
     Warns
     -----
@@ -249,29 +378,29 @@ def read_psf(
     >>> psf = read_psf("f770w_psf.fits", ext=1, enclosed=0.95)  # doctest: +SKIP
     """
     if split_extension(path)[1] is None and is_written(path):
+        stated = {"frame": frame, "ext": ext, "plane": plane, "pixel_scale": pixel_scale}
+        stated |= {"oversampling": oversampling, "angle": angle, **options}
+        for name, value in stated.items():
+            wanted = f"left out: {path} is a file of InstrumentPSF.write, which has it"
+            check_that(value is None, name, wanted, value)
         return _read_psf(path)
-    data, header, pixel_scale, turn, oversampling = fits_image(
-        path, ext, plane, pixel_scale, wanted="a PSF", oversampling=oversampling
-    )
+    psf_file = PSFFile.open(path, ext=ext, plane=plane)
+    header = psf_file.header
+    if oversampling is None:
+        oversampling = int(header.get("OVERSAMP", 1))
+    pixel_scale = psf_file.pixel_scale(pixel_scale, oversampling=oversampling)
+    if pixel_scale is None:
+        raise argument_error("pixel_scale", "given where the header does not state it", None)
     if frame is None:
-        # as STPSF and WebbPSF write them
-        frame = "detector" if is_stpsf(header) else "sky"
+        frame = "detector" if psf_file.on_detector else "sky"
     if frame == "detector" and isinstance(header.get("PA_APER"), (int, float)):
         options.setdefault("pa_aper", float(header["PA_APER"]) * u.deg)
-    if frame == "sky" and turn is not None:
-        given = turn if angle is None else float(to_array(angle, u.deg, "angle", finite=True))
-        if abs((given - turn + 180) % 360 - 180) > 0.5:
-            raise argument_error("angle", f"the header's, {turn:.4g} deg", angle)
-        angle = given * u.deg
-    if np.all(np.isfinite(data)) and data.max() > 0:
-        options.setdefault("origin", core_position(data))
-    return make_psf(
-        data,
-        pixel_scale=pixel_scale,
-        frame=frame,
-        oversampling=oversampling,
-        angle=0.0 * u.deg if angle is None else angle,
-        **{**options, "meta": {"file": str(path), **options.get("meta", {})}},
+    if frame == "sky":
+        angle = psf_file.angle(angle)
+    if angle is None:
+        angle = 0.0 * u.deg
+    return psf_file.make_psf(
+        pixel_scale=pixel_scale, frame=frame, oversampling=oversampling, angle=angle, **options
     )
 
 

@@ -46,7 +46,9 @@ def as_kernel(given, argument="kernel"):
     if isinstance(given, (MatchingKernel, KernelField)):
         return given
     if isinstance(given, (str, os.PathLike)):
-        return MatchingKernel.read(given)
+        from miricigale.psf.kernel_io import read_kernel
+
+        return read_kernel(given)
     if isinstance(given, NDData) and given.wcs is not None:
         scale = np.sqrt(np.prod(proj_plane_pixel_scales(given.wcs.celestial))) * u.deg
         return MatchingKernel.from_array(np.asarray(given.data), pixel_scale=scale)

@@ -65,7 +65,19 @@ class MatchingKernel(Interactive):
     """
 
     io_module: ClassVar[str] = "miricigale.psf.kernel_io"
-    read, write = read_write("a kernel and its PSFs")
+    read, write = read_write(
+        "a kernel and its PSFs",
+        """ext : int or str, optional
+        Extension of a kernel that others made; ``file.fits[EXTENSION]`` names it as well.
+    plane : int or "mean", optional
+        Plane of a cube of kernels, or the mean of all.
+    pixel_scale : `~astropy.units.Quantity`, optional
+        Pixel of the image that the kernel is for. Needed where the header does not state it; one that it
+        states must be the same.
+    source : `~photutils.psf.ImagePSF` or `~numpy.ndarray`, optional
+        The sharp PSF, for a file without PSFs (see `from_array`).
+    """,
+    )
 
     array: np.ndarray
     pixel_scale: u.Quantity

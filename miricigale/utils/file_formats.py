@@ -7,6 +7,7 @@ from inspect import cleandoc
 from astropy.io import registry
 from astropy.io.registry import UnifiedReadWrite, UnifiedReadWriteMethod
 
+from miricigale.utils.files import split_extension
 from miricigale.utils.table_files import write_table
 
 _SUFFIXES = {"fits": (".fits", ".fit", ".fits.gz"), "ascii.ecsv": (".ecsv",)}
@@ -27,7 +28,7 @@ class _Method(UnifiedReadWrite):
         stated_format = kwargs.pop("format", None)
         if stated_format is not None:
             return stated_format
-        path = os.fspath(path)
+        path = split_extension(path)[0]
         formats_found = registry.identify_format(self.method, self._cls, path, None, [path], kwargs)
         if len(formats_found) == 1:
             return formats_found[0]

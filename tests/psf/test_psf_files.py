@@ -8,8 +8,8 @@ from astropy.io import fits
 from helpers.errors import refuses
 from miricigale.photometry import MosaicFile
 from miricigale.photometry.commands.kernel_files import image_psf
-from miricigale.psf import MatchingKernel, read_psf
-from miricigale.psf.files import core_position, header_grid, read_planes
+from miricigale.psf import MatchingKernel, make_psf, read_psf
+from miricigale.psf.files import PSFFile, core_position, header_grid
 from miricigale.utils.exceptions import DataError, PSFWarning
 
 CELL = 0.05
@@ -53,6 +53,26 @@ def test_class_and_command_find_the_core_of_a_psf_off_center(mosaic, tmp_path):
     y, x = np.indices(kernel.array.shape) - kernel.array.shape[0] // 2
     shift = [(kernel.array * axis).sum() * CELL for axis in (x, y)]
     np.testing.assert_allclose(shift, 0, atol=0.002)
+
+
+def test_planes_of_a_cube_are_averaged_with_their_cores_in_one_place(mosaic, tmp_path):
+    path = tmp_path / "dithers.fits"
+    cube = np.stack([gaussian(dx=1.2, dy=-0.4), gaussian(dx=-0.8, dy=0.6)])
+    fits.PrimaryHDU(cube, fits.Header({"PIXSCALE": CELL})).writeto(path)
+    place = f"{path}[0,mean]"
+    for psf in (read_psf(place), image_psf(MosaicFile(mosaic, psf=place, filter="irac.ch1"))):
+        assert psf.fwhm.to_value(u.arcsec) == pytest.approx(FWHM, rel=0.01)
+        np.testing.assert_allclose(psf.origin, (40.2, 40.1), atol=0.02)
+        np.testing.assert_allclose(psf.data, gaussian(dx=0.2, dy=0.1), atol=1e-3 * psf.data.max())
+
+
+def test_statements_about_a_psf_of_our_own_are_refused(mosaic, tmp_path):
+    """Its file has the pixel and the angle."""
+    path = tmp_path / "own.fits"
+    make_psf(gaussian(), pixel_scale=CELL * u.arcsec).write(path)
+    refuses("'pixel_scale' must be left out", read_psf, path, pixel_scale=CELL * u.arcsec)
+    file = MosaicFile(mosaic, psf=path, psf_scale=CELL * u.arcsec, filter="irac.ch1")
+    refuses("'psf_scale' must be left out", image_psf, file)
 
 
 def stpsf_file(path, names):
@@ -103,7 +123,7 @@ def test_planes_of_a_cube_are_named(tmp_path):
     assert read_psf(f"{path}[0,1]").fwhm.to_value(u.arcsec) == pytest.approx(0.4, rel=0.02)
     mean = read_psf(f"{path}[0,mean]")
     np.testing.assert_allclose(mean.data, cube.mean(axis=0), atol=1e-12)
-    assert read_planes(f"{path}[0,mean]", "a PSF")[0].shape == cube.shape
+    assert PSFFile.open(f"{path}[0,mean]").planes.shape == cube.shape
     # a cube of one plane is an image
     fits.PrimaryHDU(cube[:1], fits.Header({"PIXSCALE": CELL})).writeto(tmp_path / "single.fits")
     assert read_psf(tmp_path / "single.fits").fwhm.to_value(u.arcsec) == pytest.approx(

@@ -22,7 +22,7 @@ from miricigale.psf import (
     psf_grid,
     read_psf,
 )
-from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 SCALE = 0.04 * u.arcsec
 SKY = {"pixel_scale": SCALE, "frame": "sky"}
@@ -188,9 +188,9 @@ def test_scale_and_angle_come_from_the_header(tmp_path):
     psf = read_psf(path, frame="sky")
     assert psf.pixel_scale.value == pytest.approx(0.04)
     assert psf.angle.value == pytest.approx(30)
-    with pytest.raises(ValueError, match=r"'pixel_scale' must be 0\.04 arcsec by the header"):
+    with pytest.raises(ValueError, match=r"'pixel_scale' must be 0\.04 arcsec, as the header"):
         read_psf(path, frame="sky", pixel_scale=0.06 * u.arcsec)
-    refuses(r"'angle' must be the header's, 30 deg", read_psf, path, frame="sky", angle=0 * u.deg)
+    refuses(r"'angle' must be 30 deg, as the header", read_psf, path, frame="sky", angle=0 * u.deg)
     mirrored = tan_wcs((1, 1), 0.04, pa=30.0, parity=1).to_header()
     fits.writeto(path, gaussian_image(51, HI), mirrored, overwrite=True)
     refuses("'path' must be a file with east to the left", read_psf, path, frame="sky")
@@ -248,7 +248,24 @@ def test_ready_kernels_are_taken(tmp_path):
     assert_allclose(read.array, array / array.sum())
     assert read.pixel_scale.value == 0.04
     other = {"ext": 0, "plane": 1, "pixel_scale": 0.06 * u.arcsec}
-    refuses(r"'pixel_scale' must be 0\.04 arcsec by the header", MatchingKernel.read, path, **other)
+    match = r"kernel for pixels of 0\.04 arcsec, .* 0\.06 arcsec \('pixel_scale'\)"
+    refuses(match, MatchingKernel.read, path, error=DataError, **other)
+    # the plane alone is enough, and brackets name both
+    for kernel in (MatchingKernel.read(path, plane=1), MatchingKernel.read(f"{path}[0,1]")):
+        assert_allclose(kernel.array, read.array)
+    # the pixel of our own files must agree, too
+    read.write(tmp_path / "own.fits")
+    own = tmp_path / "own.fits"
+    other = {"pixel_scale": 0.06 * u.arcsec}
+    refuses(match, MatchingKernel.read, own, error=DataError, **other)
+    sharp = gaussian_image(41, HI)
+    completed = MatchingKernel.read(own, source=sharp)
+    assert_allclose(completed.source, sharp / sharp.sum())
+    assert_allclose(completed.array, read.array)
+    assert_allclose(completed.target, fftconvolve(completed.source, read.array, mode="same"))
+    # a file without a pixel asks for it
+    fits.writeto(path, array, overwrite=True)
+    refuses("'pixel_scale' must be given: the header of", MatchingKernel.read, path)
 
 
 def test_kernels_of_regions_blend():

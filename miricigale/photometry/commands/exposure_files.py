@@ -9,10 +9,9 @@ from miricigale.photometry.commands.file_inputs import (
     Inputs,
     Measurement,
     Pixels,
-    file_kernel,
     short_band,
 )
-from miricigale.photometry.commands.kernel_files import image_psf
+from miricigale.photometry.commands.kernel_files import image_psf, matching_kernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error
 
 
@@ -131,7 +130,7 @@ class ExposureInputs(Inputs):
             return ExposureKernels.from_images(headers, self.highres.header, sharp)
         kernels = []
         for k, file in zip(rows, files, strict=True):
-            kernels.append(file_kernel(file, self.highres, self.kernels[k]))
+            kernels.append(matching_kernel(file, self.highres, self.kernels[k]))
         return ExposureKernels(kernels)
 
     def measure(self, pixels, photometers, segments, sources):

@@ -7,7 +7,6 @@ import os
 
 import astropy.units as u
 import numpy as np
-from astropy.io import fits
 from astropy.nddata import StdDevUncertainty
 
 from miricigale.filters import Filter
@@ -21,9 +20,6 @@ from miricigale.photometry.images.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import file_place
 from miricigale.utils.units import SURFACE_BRIGHTNESS
-
-#: What the file of a `~miricigale.psf.KernelField` states as its format.
-FIELD = "kernel-field-1"
 
 #: Bytes of a process without images, for each pixel of the prior (or of an image of the detection) and of an
 #: image that is measured, and of some thousand sources where they are dense: largest memory, as it was measured.
@@ -164,7 +160,7 @@ class Inputs:
         options = self.fit_options(n_threads)
         found = {}
         for band, one, own in zip(self.bands, self.images, self.kernels, strict=True):
-            kernel = file_kernel(one, self.highres, own)
+            kernel = matching_kernel(one, self.highres, own)
             stars = self.psf_stars if own is None else False
             found[band] = ForcedPhotometer(kernel, psf_stars=stars, **options)
         return found
@@ -262,15 +258,6 @@ def _blank(shape, wcs):
     noise = StdDevUncertainty(np.ones(shape, np.float32))
     data = np.zeros(shape, np.float32)
     return Image(data, unit=SURFACE_BRIGHTNESS, wcs=wcs, mask=mask, uncertainty=noise)
-
-
-def file_kernel(image, highres, path):
-    """The kernel between two images; that of a file may be of several places."""
-    from miricigale.psf import KernelField
-
-    if path is not None and fits.getheader(file_place(path)[0]).get("FORMAT") == FIELD:
-        return KernelField.read(path)
-    return matching_kernel(image, highres, path)
 
 
 def _check_images(image, highres):
