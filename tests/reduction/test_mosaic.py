@@ -225,6 +225,54 @@ def test_outliers_are_masked_and_stars_are_not():
     assert reject_outliers(images[:2], images[0].wcs) == images[:2]
 
 
+def dithers_with_faint_light(*, star_first=False):
+    """Four dithers of stars, with a cloud in the second, an afterglow in the third: images, cloud, place."""
+    rng = np.random.default_rng(21)
+    sky = small_wcs().pixel_to_world(*rng.uniform(25, 125, (2, 25)))
+    peaks = 10 ** rng.uniform(1, 3, 25)
+    y, x = np.indices((150, 160))
+    cloud = 0.6 * np.exp(-((x - 80) ** 2 + (y - 70) ** 2) / (2 * 12**2))
+    images = []
+    for k, shift in enumerate(((0, 0), (8.4, 3.3), (-5.7, 6.1), (3.2, -7.6))):
+        wcs = small_wcs(*shift)
+        data = gaussians((150, 160), *wcs.world_to_pixel(sky), peaks, 0.95)
+        error = np.sqrt(1 + data / 50)
+        data = data + rng.normal(size=data.shape) * error
+        if k == 1:
+            data = data + cloud
+        if k == 2:
+            data = data + gaussians((150, 160), [40], [110], [3.0], 1.6)
+        if k == 0 and star_first:
+            data = data + gaussians((150, 160), [40], [110], [2000.0], 1.6)
+        image = make(data, wcs, error=error)
+        image.meta["day"] = 60310.0 + 0.01 * k
+        images.append(image)
+    return images, cloud, (110, 40)
+
+
+def test_light_too_faint_for_a_pixel_is_found_in_the_dither_that_has_it():
+    images, cloud, place = dithers_with_faint_light()
+    grid = mosaic_wcs([im.wcs for im in images], 0.11 * u.arcsec)
+    flagged = [(im.flags & DQ.OUTLIER) != 0 for im in reject_outliers(images, grid)]
+    # no pixel of the cloud is 5 sigma high, and its light is gone
+    assert cloud[flagged[1]].sum() > 0.8 * cloud.sum()
+    assert flagged[1][cloud < 0.01].mean() < 0.05
+    assert flagged[2][place]
+    assert flagged[2].sum() < 200
+    assert not flagged[0].any()
+    assert not flagged[3].any()
+
+
+def test_afterglow_is_told_by_the_bright_star_before_it():
+    for star_first in (False, True):
+        images, _, place = dithers_with_faint_light(star_first=star_first)
+        grid = mosaic_wcs([im.wcs for im in images], 0.11 * u.arcsec)
+        checked = reject_outliers(images, grid)
+        named = [(im.flags & DQ.PERSISTENCE) != 0 for im in checked]
+        assert named[2][place] == star_first
+        assert not any(flags.any() for flags in (named[0], named[1], named[3]))
+
+
 def test_of_two_images_none_loses_the_good_pixel():
     """Two values do not say which is the outlier: the median of two is halfway, and jwst masks both."""
     wcs = small_wcs()

@@ -2,10 +2,17 @@
 
 import numpy as np
 from drizzle.resample import Drizzle
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import label, map_coordinates
 
-from miricigale.instrument import DQ
-from miricigale.reduction.images.images import check_images, flag_pixels, plain_mask, sigma
+from miricigale.instrument import DQ, epoch_of
+from miricigale.reduction.images.images import (
+    check_images,
+    flag_pixels,
+    plain_flags,
+    plain_mask,
+    sigma,
+)
+from miricigale.reduction.mosaic.extended_outliers import extended_outliers
 from miricigale.reduction.mosaic.mosaic import add_image, extent_of, pixel_map, weight_map
 from miricigale.utils.options import check_positive
 from miricigale.utils.parallel import chunks
@@ -14,6 +21,12 @@ from miricigale.utils.parallel import chunks
 _ROWS = 256
 # steepest differences to its neighbors by which a pixel may differ from the other dithers
 _DERIVATIVE = 1.2
+# sigma of a pixel of an earlier exposure that may leave an afterglow
+_BRIGHT = 100.0
+# share of a place that is bright there, at least
+_STAR_SHARE = 0.1
+# differences to neighbors beyond so many times the median one are those of sources
+_NOISE_SLOPES = 2.0
 
 
 def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None):
@@ -27,7 +40,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     wcs : `~astropy.wcs.WCS`
         Grid on which they are compared; best with pixels of about the detector's size.
     threshold : float, optional
-        In sigma of the pixel (with the noise of the median).
+        In sigma of the pixel (with the noise of the median), and of the smoothed maps.
     weights, pixel_maps : list, optional
         As in `drizzle_images`.
 
@@ -35,7 +48,8 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     -------
     images : list of `~astropy.nddata.CCDData`
         With `DQ.OUTLIER` set and masked; ``meta["n_outliers"]`` counts them. Only
-        pixels that at least three images cover are judged.
+        pixels that at least three images cover are judged. `DQ.PERSISTENCE` is added where the
+        detector saw something bright in an earlier image.
 
     Notes
     -----
@@ -43,6 +57,10 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     each image (linearly), and compared there. Beyond the noise a pixel may differ by 1.2 times the
     steepest difference to its four neighbors in the median image: point sources are sampled
     differently in each dither.
+
+    What is left over is then smoothed on scales of 1.5, 6 and 16 pixels. Where one image is brighter than
+    the others by ``threshold`` sigma of a smoothed map, its pixels are outliers together, down to 2 sigma: the
+    afterglow of a star of an earlier dither, or a shower too faint for any single group or pixel.
 
     References
     ----------
@@ -79,21 +97,24 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     check_positive(threshold, "threshold")
     if len(images) < 3:
         return images
-    weights = [weight_map(im) for im in images] if weights is None else weights
+    if weights is None:
+        weights = [weight_map(im) for im in images]
     if pixel_maps is None:
         pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     median, count = _median_of(images, wcs, weights, pixel_maps)
     # where too few images overlap there is nothing to compare with
     judged = count >= 3
     share = np.where(judged, 1.5 / np.maximum(count, 1), 0.0).astype(np.float32)
-    inner, (before, after) = slice(1, -1), (slice(None, -2), slice(2, None))
-    around = np.pad(median, 1, constant_values=np.nan)
-    beside = [(before, inner), (after, inner), (inner, before), (inner, after)]
-    steep = np.fmax.reduce([np.abs(median - around[place]) for place in beside])
+    inner = slice(1, -1)
+    before = slice(None, -2)
+    after = slice(2, None)
+    padded = np.pad(median, 1, constant_values=np.nan)
+    shifts = [(before, inner), (after, inner), (inner, before), (inner, after)]
+    steep = np.fmax.reduce([np.abs(median - padded[place]) for place in shifts])
     median = np.where(judged, median, 0.0)
     ny, nx = median.shape
     # between four pixels of the grid that all can be compared with
-    between = judged[:-1, :-1] & judged[:-1, 1:] & judged[1:, :-1] & judged[1:, 1:]
+    all_judged = judged[:-1, :-1] & judged[:-1, 1:] & judged[1:, :-1] & judged[1:, 1:]
     out = []
     for im, (x, y) in zip(images, pixel_maps, strict=True):
         column, row = (np.floor(np.nan_to_num(v, nan=-1)).astype(int) for v in (x, y))
@@ -103,16 +124,49 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
         options = {"order": 1, "mode": "constant", "cval": 0.0}
         expected = map_coordinates(median, coords, **options)
         slope = map_coordinates(np.nan_to_num(steep), coords, **options)
-        known = inside & between[row, column]
+        inside_judged = inside & all_judged[row, column]
         # that of the median too, of as many images as there are at this place
         noise = sigma(im) * np.sqrt(1 + share[row, column])
         with np.errstate(invalid="ignore"):
             far = np.abs(im.data - expected) > threshold * noise + _DERIVATIVE * slope
-        outlier = far & known & ~plain_mask(im)
+        good = inside_judged & ~plain_mask(im)
+        outlier = far & good
+        difference = im.data - expected
+        # sampling of sources is allowed for, the noise of the median's slopes is none of theirs
+        noise_slope = np.median(slope[good]) if good.any() else 0.0
+        allowed = _DERIVATIVE * np.maximum(slope - _NOISE_SLOPES * noise_slope, 0.0)
+        excess = np.sign(difference) * np.maximum(np.abs(difference) - allowed, 0.0)
+        with np.errstate(invalid="ignore"):
+            extended = extended_outliers(excess / noise, good & ~outlier, threshold)
+        outlier |= extended
         flagged = flag_pixels(im, outlier, DQ.OUTLIER | DQ.DO_NOT_USE)
+        afterglow = _afterglow(extended, im, images)
+        if afterglow.any():
+            flagged = flag_pixels(flagged, afterglow, DQ.PERSISTENCE)
         flagged.meta["n_outliers"] = int(np.count_nonzero(outlier))
         out.append(flagged)
     return out
+
+
+def _afterglow(extended, image, images):
+    """Which of the places that one image has alone were bright on the detector in an image before it."""
+    epoch = epoch_of(image)
+    bright = np.zeros(extended.shape, bool)
+    if epoch is None or not extended.any():
+        return bright
+    for earlier in images:
+        earlier_epoch = epoch_of(earlier)
+        if earlier_epoch is None or earlier_epoch >= epoch or earlier.shape != image.shape:
+            continue
+        with np.errstate(invalid="ignore"):
+            bright |= earlier.data > _BRIGHT * sigma(earlier)
+        bright |= (plain_flags(earlier) & int(DQ.SATURATED)) != 0
+    labels, n_places = label(extended, np.ones((3, 3), bool))
+    size = np.bincount(labels.ravel(), minlength=n_places + 1)
+    n_bright = np.bincount(labels[bright & extended], minlength=n_places + 1)
+    # a shower may lie where a star was, too: an afterglow is as wide as the star
+    is_afterglow = n_bright > _STAR_SHARE * size
+    return is_afterglow[labels] & extended
 
 
 def _median_of(images, wcs, weights, pixel_maps):
@@ -134,16 +188,20 @@ def _median_of(images, wcs, weights, pixel_maps):
             moved = x - columns.start, y - rows.start
             add_image(sink, im, weight.astype(np.float32), moved, wcs)
             parts.append((rows, columns, sink.out_img))
-    median, count = np.full(shape, np.nan, np.float32), np.zeros(shape, np.int16)
+    median = np.full(shape, np.nan, np.float32)
+    count = np.zeros(shape, np.int16)
     for strip in chunks(shape[0], _ROWS):
-        here = [part for part in parts if part[0].start < strip.stop and part[0].stop > strip.start]
-        if not here:
+        overlapping = [
+            part for part in parts if part[0].start < strip.stop and part[0].stop > strip.start
+        ]
+        if not overlapping:
             continue
-        stack = np.full((len(here), strip.stop - strip.start, shape[1]), np.nan, np.float32)
-        for plane, (rows, columns, alone) in zip(stack, here, strict=True):
-            first, last = max(rows.start, strip.start), min(rows.stop, strip.stop)
-            own = slice(first - rows.start, last - rows.start)
-            plane[first - strip.start : last - strip.start, columns] = alone[own]
+        stack = np.full((len(overlapping), strip.stop - strip.start, shape[1]), np.nan, np.float32)
+        for plane, (rows, columns, plane_data) in zip(stack, overlapping, strict=True):
+            first = max(rows.start, strip.start)
+            last = min(rows.stop, strip.stop)
+            rows_of_part = slice(first - rows.start, last - rows.start)
+            plane[first - strip.start : last - strip.start, columns] = plane_data[rows_of_part]
         median[strip], count[strip] = nan_median(stack)
     return median, count
 
@@ -151,7 +209,8 @@ def _median_of(images, wcs, weights, pixel_maps):
 def nan_median(stack):
     """Median along the first axis of what is not NaN (NaN of nothing), and how many values it has."""
     # sorting puts NaN last
-    ordered, count = np.sort(stack, axis=0), np.isfinite(stack).sum(axis=0)
+    ordered = np.sort(stack, axis=0)
+    count = np.isfinite(stack).sum(axis=0)
     middle = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, stack.shape[0] - 1)
     low, high = (np.take_along_axis(ordered, i[None], axis=0)[0] for i in middle)
     return 0.5 * (low + high), count
