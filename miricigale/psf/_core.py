@@ -24,9 +24,11 @@ def polygon_coverage(vertices, n, step, rows):
         count = 0
         for i in range(m):
             k = (i + 1) % m
-            y1, y2 = vertices[i, 1], vertices[k, 1]
+            y1 = vertices[i, 1]
+            y2 = vertices[k, 1]
             if (y1 <= y) != (y2 <= y):
-                x1, x2 = vertices[i, 0], vertices[k, 0]
+                x1 = vertices[i, 0]
+                x2 = vertices[k, 0]
                 # in cells from the left edge of the grid
                 crossings[count] = (x1 + (y - y1) / (y2 - y1) * (x2 - x1)) / step + 0.5 * n
                 count += 1
@@ -34,18 +36,20 @@ def polygon_coverage(vertices, n, step, rows):
             continue
         # few, and numba takes seconds to compile a sort
         for i in range(1, count):
-            x, k = crossings[i], i
+            x = crossings[i]
+            k = i
             while k > 0 and crossings[k - 1] > x:
                 crossings[k] = crossings[k - 1]
                 k -= 1
             crossings[k] = x
         j = line // rows
         for pair in range(count // 2):
-            left = min(max(crossings[2 * pair], 0.0), float(n))
+            start = min(max(crossings[2 * pair], 0.0), float(n))
             right = min(max(crossings[2 * pair + 1], 0.0), float(n))
-            first, last = int(left), math.ceil(right)
+            first = int(start)
+            last = math.ceil(right)
             for i in range(first, last):
-                coverage[j, i] += (min(right, i + 1.0) - max(left, float(i))) / rows
+                coverage[j, i] += (min(right, i + 1.0) - max(start, float(i))) / rows
     return np.minimum(coverage, 1.0)
 
 
@@ -89,13 +93,15 @@ def wavefront(amplitude, segments, x, y, rms, segment_fraction, rng):
     """
     single = np.zeros_like(amplitude)
     for index in range(1, int(segments.max()) + 1):
-        here = segments == index
-        u, v = x[here] - x[here].mean(), y[here] - y[here].mean()
+        on_segment = segments == index
+        u = x[on_segment] - x[on_segment].mean()
+        v = y[on_segment] - y[on_segment].mean()
         r2 = u**2 + v**2
         radius = np.sqrt(r2.max())
         a = rng.normal(size=4) * (1.0, 0.5, 0.5, 0.6)
-        single[here] = a[0] + (a[1] * u + a[2] * v) / radius + a[3] * (r2 / radius**2 - 0.5)
-    r, t = np.hypot(x, y), np.arctan2(y, x)
+        single[on_segment] = a[0] + (a[1] * u + a[2] * v) / radius + a[3] * (r2 / radius**2 - 0.5)
+    r = np.hypot(x, y)
+    t = np.arctan2(y, x)
     low = np.zeros_like(amplitude)
     for term, weight in (
         (2 * r**2 - 1, 0.5),
@@ -120,7 +126,8 @@ def _phases(angles, frequencies, dtype):
     turns -= np.rint(turns)
     result = np.empty(turns.shape, dtype=dtype)
     turns = (2 * np.pi * turns).astype(result.real.dtype)
-    result.real, result.imag = np.cos(turns), -np.sin(turns)
+    result.real = np.cos(turns)
+    result.imag = -np.sin(turns)
     return result
 
 
@@ -161,10 +168,10 @@ def matrix_dft_intensity(
     """
     n = pupil.shape[0]
     position = (np.arange(n) - 0.5 * (n - 1)) * step
-    left = _phases(theta_y, position / wavelength, dtype)
-    same = theta_x is theta_y
-    right = left if same else _phases(theta_x, position / wavelength, dtype)
-    field = left @ pupil.astype(dtype) @ right.T
+    row_phases = _phases(theta_y, position / wavelength, dtype)
+    is_square = theta_x is theta_y
+    right = row_phases if is_square else _phases(theta_x, position / wavelength, dtype)
+    field = row_phases @ pupil.astype(dtype) @ right.T
     cell = (theta_x[1] - theta_x[0]) * (theta_y[1] - theta_y[0]) * (step / wavelength) ** 2
     scale = cell / (np.sum(np.abs(pupil) ** 2) if power is None else power)
     return (field.real.astype(float) ** 2 + field.imag.astype(float) ** 2) * scale
@@ -216,7 +223,8 @@ def _sorted_sums(image, x_center, y_center, radii):
             dx = i - x_center
             r = math.sqrt(dx * dx + dy * dy)
             # half a diagonal either way: circles below do not see it, those above see all
-            k, stop = 0, m
+            k = 0
+            stop = m
             while k < stop:
                 middle = (k + stop) // 2
                 if radii[middle] < r - 0.71:
@@ -242,7 +250,8 @@ def radial_sums(image, x_center, y_center, radii):
     pixels, to first order beyond (relative error of a smooth PSF's sum below 1e-3).
     Center and ``radii``, (m,), in any order, are in pixels.
     """
-    image, radii = np.ascontiguousarray(image, float), np.asarray(radii, float)
+    image = np.ascontiguousarray(image, float)
+    radii = np.asarray(radii, float)
     order = np.argsort(radii)
     sums = np.empty(radii.size)
     sums[order] = _sorted_sums(image, float(x_center), float(y_center), radii[order])
@@ -256,7 +265,8 @@ def core_moments(data):
     Those of a Gaussian are its own. All of the core counts: noise in one pixel or a pattern
     of resampling changes them little, and distant wings do not enter. NaN where they do not settle.
     """
-    columns, rows = np.arange(data.shape[1]), np.arange(data.shape[0])
+    columns = np.arange(data.shape[1])
+    rows = np.arange(data.shape[0])
     y, x = (float(v) for v in np.unravel_index(np.argmax(data), data.shape))
     sigma = 2.0
     for _ in range(300):
@@ -265,10 +275,13 @@ def core_moments(data):
         total = wy @ data @ wx
         if not total > 0:
             break
-        dx, dy = wy @ data @ (wx * (columns - x)) / total, (wy * (rows - y)) @ data @ wx / total
+        dx = wy @ data @ (wx * (columns - x)) / total
+        dy = (wy * (rows - y)) @ data @ wx / total
         squares = wy @ data @ (wx * (columns - x) ** 2) + (wy * (rows - y) ** 2) @ data @ wx
         # the window halves a Gaussian's offset and its variance, which is of two axes here
-        x, y, last = x + 2 * dx, y + 2 * dy, sigma
+        x = x + 2 * dx
+        y = y + 2 * dy
+        last = sigma
         variance = squares / total - dx**2 - dy**2
         if not 0 < variance < max(data.shape) ** 2:
             break
@@ -293,7 +306,8 @@ def cubic_splines(coefficients, y, x):
     """Cubic splines of shape (ny, nx, k) at positions in cells, shape (k, n), zero outside of the grid."""
     ny, nx, k = coefficients.shape
     values = np.zeros((y.size, k))
-    weights, nodes = np.empty((2, 4)), np.empty((2, 4), np.int64)
+    weights = np.empty((2, 4))
+    nodes = np.empty((2, 4), np.int64)
     for n in range(y.size):
         if not (0 <= y[n] <= ny - 1 and 0 <= x[n] <= nx - 1):
             continue
@@ -320,9 +334,9 @@ def half_maximum_width(data, x, y):
         rows = y + radii[:, None] * np.sin(angles)
         columns = x + radii[:, None] * np.cos(angles)
         profile = interpolate(data, columns, rows).mean(axis=1)
-        below = np.flatnonzero(profile < 0.5 * profile[0])
-        if below.size:
-            k = below[0]
+        faint = np.flatnonzero(profile < 0.5 * profile[0])
+        if faint.size:
+            k = faint[0]
             part = (profile[k - 1] - 0.5 * profile[0]) / (profile[k - 1] - profile[k])
             return 2 * (radii[k - 1] + part * 0.25)
     return float("nan")
@@ -338,8 +352,10 @@ def interpolate(data, x, y):
     from scipy.ndimage import map_coordinates
 
     ny, nx = data.shape
-    x0, x1 = max(0, int(np.floor(x.min())) - 12), min(nx, int(np.ceil(x.max())) + 13)
-    y0, y1 = max(0, int(np.floor(y.min())) - 12), min(ny, int(np.ceil(y.max())) + 13)
+    x0 = max(0, int(np.floor(x.min())) - 12)
+    x1 = min(nx, int(np.ceil(x.max())) + 13)
+    y0 = max(0, int(np.floor(y.min())) - 12)
+    y1 = min(ny, int(np.ceil(y.max())) + 13)
     if x1 <= x0 or y1 <= y0:
         return np.zeros(np.broadcast(x, y).shape)
     x, y = np.broadcast_arrays(x, y)

@@ -24,13 +24,18 @@ MODEL_FILTERS = (*MIRI_FILTERS, *NIRCAM_FILTERS, *WFC3_FILTERS)
 
 #: Factor in FWHM beyond which a PSF is not that of the filter; parts from which on a narrower and a
 #: wider one gets a warning (real mosaics are some percent wider than the models).
-_OTHER_WIDTH, _NARROWER, _WIDER = 1.5, 0.05, 0.15
+_OTHER_WIDTH = 1.5
+_NARROWER = 0.05
+_WIDER = 0.15
 #: How far a sum may be from the fraction of light that the model's grid holds to be taken for it, and
 #: the sum from which on a PSF counts as normalized on its own grid.
-_NEAR_SUM, _UNIT_SUM = 0.05, 0.995
+_NEAR_SUM = 0.05
+_UNIT_SUM = 0.995
 #: Least strength of the spikes in the detector's axes, in units of the model's, and by how much and how
 #: many standard deviations it must exceed that of spikes turned to the sky.
-_STRENGTH, _BETTER, _SIGNIFICANT = 0.4, 0.3, 5.0
+_STRENGTH = 0.4
+_BETTER = 0.3
+_SIGNIFICANT = 5.0
 
 
 def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampling="drizzle"):
@@ -83,8 +88,12 @@ def exposure_psf(filter, scale=None):
     """The model of a single exposure, in the detector's axes; WFC3/IR is drizzled to ``scale``."""
     filter = known_filter(filter, MODEL_FILTERS, "model PSF for the filter")
     if filter in WFC3_FILTERS:
-        return hst_psf(filter) if scale is None else hst_psf(filter, pixel_scale=scale)
-    return miri_psf(filter) if filter in MIRI_FILTERS else nircam_psf(filter)
+        if scale is None:
+            return hst_psf(filter)
+        return hst_psf(filter, pixel_scale=scale)
+    if filter in MIRI_FILTERS:
+        return miri_psf(filter)
+    return nircam_psf(filter)
 
 
 def checked_psf(
@@ -139,7 +148,10 @@ def checked_psf(
     ValueError: 'psf' must be a PSF of F1500W, about 0.521 arcsec wide (FWHM), got one of 1.2 arcsec...
     """
     psf = instrument_psf(psf, argument)
-    scale = psf.pixel_scale if pixel_scale is None else pixel_scale
+    if pixel_scale is None:
+        scale = psf.pixel_scale
+    else:
+        scale = pixel_scale
     angle = psf.angle
     form = {"pixel_scale": scale, "grid_angle": angle, "resampling": resampling}
     if psf.frame == "detector":
@@ -168,11 +180,14 @@ def checked_psf(
     got = f"one of {width:.3g} arcsec with pixels of {psf.cell:.4g} arcsec: is that its pixel?"
     check_that(1 / _OTHER_WIDTH < ratio < _OTHER_WIDTH, argument, wanted, got)
     if pa is not None and psf.frame == "sky" and filter not in WFC3_FILTERS:
-        other = filter_psf(filter, pa=angle, **form)
-        other = psf_image(other, **place)
-        _check_turn(psf, (x, y), (stamp, other), (width, filter, pa), argument)
+        unturned = filter_psf(filter, pa=angle, **form)
+        unturned = psf_image(unturned, **place)
+        _check_turn(psf, (x, y), (stamp, unturned), (width, filter, pa), argument)
     if not 1 - _NARROWER < ratio < 1 + _WIDER:
-        word = "wider" if ratio > 1 else "narrower"
+        if ratio > 1:
+            word = "wider"
+        else:
+            word = "narrower"
         msg = (
             f"'{argument}' is {abs(ratio - 1):.0%} {word} (FWHM {width:.3g} arcsec) than the model of "
             f"{filter}: does it hold the pixel, the drizzling and no more?"
@@ -181,27 +196,31 @@ def checked_psf(
     return _scaled(psf, float(stamp.sum()), filter, argument)
 
 
-def _check_turn(psf, center, stamps, about, argument):
+def _check_turn(psf, center, stamps, model_facts, argument):
     """Refuse a PSF whose spikes stand where those of the detector's axes are."""
-    width, filter_, pa = about
+    width, filter_, pa = model_facts
     y, x = np.indices(psf.data.shape)
     radius = np.hypot(x - center[0], y - center[1])
     ring = np.rint(radius).astype(int)
     # spikes are beyond the core, and in distant wings lost in the noise
-    where = (radius * psf.cell > width) & (radius * psf.cell < min(3.0, 0.95 * psf.half_width))
-    if np.count_nonzero(where) < 100:
+    in_ring = (radius * psf.cell > width) & (radius * psf.cell < min(3.0, 0.95 * psf.half_width))
+    if np.count_nonzero(in_ring) < 100:
         return
 
     def spikes(image):
-        count = np.maximum(np.bincount(ring[where]), 1)
-        mean = np.bincount(ring[where], image[where]) / count
+        count = np.maximum(np.bincount(ring[in_ring]), 1)
+        mean = np.bincount(ring[in_ring], image[in_ring]) / count
         # wings fall steeply: each ring has the same weight
-        return (image[where] - mean[ring[where]]) * radius[where]
+        return (image[in_ring] - mean[ring[in_ring]]) * radius[in_ring]
 
-    given, turned, plain = (spikes(one) for one in (psf.data, *stamps))
-    given = given * (stamps[0].sum() / psf.data.sum())
-    on_sky, on_detector = (float(given @ one) / float(one @ one) for one in (turned, plain))
-    noise = np.std(given - on_detector * plain) / math.sqrt(plain @ plain)
+    measured, sky_spikes, detector_spikes = (spikes(stamp) for stamp in (psf.data, *stamps))
+    measured = measured * (stamps[0].sum() / psf.data.sum())
+    on_sky, on_detector = (
+        float(measured @ stamp) / float(stamp @ stamp) for stamp in (sky_spikes, detector_spikes)
+    )
+    noise = np.std(measured - on_detector * detector_spikes) / math.sqrt(
+        detector_spikes @ detector_spikes
+    )
     _log.info(
         "'%s': spikes as strong as %.3g (turned) and %.3g (detector) +- %.2g times the model's",
         argument, on_sky, on_detector, noise,
@@ -220,14 +239,17 @@ def _scaled(psf, expected, filter_, argument):
     if psf.total_known:
         return psf
     held = psf.enclosed
-    taken = held if held < _UNIT_SUM and abs(held - expected) < _NEAR_SUM else expected
+    if held < _UNIT_SUM and abs(held - expected) < _NEAR_SUM:
+        enclosed = held
+    else:
+        enclosed = expected
     width = 2 * psf.half_width
     msg = (
-        f"'{argument}' sums to {held:.4g} and is taken to hold {taken:.3f} of the light on its "
+        f"'{argument}' sums to {held:.4g} and is taken to hold {enclosed:.3f} of the light on its "
         f"{width:.3g} arcsec, as the model of {filter_} does ({expected:.3f})"
     )
-    if abs(taken - held) > 0.01:
+    if abs(enclosed - held) > 0.01:
         warn(msg, PSFWarning)
     else:
         _log.info(msg)
-    return psf.replace(psf.data * (taken / held), total_known=True)
+    return psf.replace(psf.data * (enclosed / held), total_known=True)

@@ -74,8 +74,8 @@ def cruciform_fraction(filter_name, *, calibration="flight"):
     inner = jwst_constants()["cruciform_inner_radius"]
     outside = math.exp(-inner / _FOLDING)
     integral = 2 * _FOLDING * (0.5 * (1 - outside) + outside)
-    both = 2 * _amplitude(filter_name, calibration) * integral
-    return both / (1 + both)
+    arms = 2 * _amplitude(filter_name, calibration) * integral
+    return arms / (1 + arms)
 
 
 def halo_share(filter_name, *, calibration="flight"):
@@ -92,7 +92,9 @@ def halo_share(filter_name, *, calibration="flight"):
     share : float
         Zero for stpsf's calibration, and for filters of which no deep image has been compared.
     """
-    return _HALO.get(filter_name, 0.0) if calibration == "flight" else 0.0
+    if calibration == "flight":
+        return _HALO.get(filter_name, 0.0)
+    return 0.0
 
 
 def cruciform_shift(x, y):
@@ -111,14 +113,15 @@ def cruciform_shift(x, y):
 
 def _shifted(image, shift, axis):
     """Shift by a fraction of cells, linearly: sum and centroid are kept but for the edge."""
-    whole = math.floor(shift)
-    part = shift - whole
+    whole_cells = math.floor(shift)
+    part = shift - whole_cells
     result = np.zeros_like(image)
-    for step, weight in ((whole, 1 - part), (whole + 1, part)):
+    for step, weight in ((whole_cells, 1 - part), (whole_cells + 1, part)):
         n = image.shape[axis] - abs(step)
         if weight == 0 or n <= 0:
             continue
-        source, target = [slice(None)] * 2, [slice(None)] * 2
+        source = [slice(None)] * 2
+        target = [slice(None)] * 2
         source[axis] = slice(max(0, -step), max(0, -step) + n)
         target[axis] = slice(max(0, step), max(0, step) + n)
         result[tuple(target)] += weight * image[tuple(source)]
@@ -187,7 +190,10 @@ def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, 
     ``ipc`` are couplings along x, along y and diagonal, ``jitter`` is a standard deviation per axis in pixels,
     ``boxes`` are widths in pixels of further square boxes (drops, output pixels).
     """
-    widths = [*boxes, 1.0] if pixel else list(boxes)
+    if pixel:
+        widths = [*boxes, 1.0]
+    else:
+        widths = list(boxes)
     extent = sum(widths) + 5 * jitter + (1 if ipc is not None else 0)
     margin = math.ceil(extent * oversampling) + 1
     shape = [next_fast_len(size + 2 * margin, real=True) for size in image.shape]
@@ -200,9 +206,10 @@ def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, 
     if ipc is not None:
         # what its neighbors get of a pixel's charge the pixel loses
         along_x, along_y, diagonal = ipc
-        cx, cy = np.cos(2 * np.pi * px), np.cos(2 * np.pi * py)
-        left = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
-        transfer *= left + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
+        cx = np.cos(2 * np.pi * px)
+        cy = np.cos(2 * np.pi * py)
+        kept_charge = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
+        transfer *= kept_charge + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
     if jitter > 0:
         transfer *= np.exp(-2.0 * (math.pi * jitter) ** 2 * (px**2 + py**2))
     ny, nx = image.shape

@@ -143,7 +143,8 @@ def _gaussian_width(data, x, y, start):
     yy, xx = np.indices(data.shape)
     r = np.hypot(xx - x, yy - y)
     inside = r < 0.75 * start
-    r2, values = r[inside] ** 2, data[inside]
+    r2 = r[inside] ** 2
+    values = data[inside]
 
     def residual(p):
         return p[0] * np.exp(-4 * np.log(2) * r2 / p[1] ** 2) - values / values.max()

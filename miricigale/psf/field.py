@@ -99,7 +99,10 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", **options):
     >>> grid.data.shape
     (4, 55, 55)
     """
-    side = round(n_psfs**0.5) if n_psfs >= 4 else 0
+    if n_psfs >= 4:
+        side = round(n_psfs**0.5)
+    else:
+        side = 0
     check_that(side**2 == n_psfs, "n_psfs", "a square number of at least 4", n_psfs)
     part = aperture(subarray)
     ny, nx = part.shape
@@ -140,13 +143,15 @@ def grid_weights(grid, x, y):
     array([[0.5, 0.5, 0. , 0. ]])
     """
     x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
-    where = np.asarray(grid.grid_xypos, dtype=float)
-    if len(where) == 1:
+    positions = np.asarray(grid.grid_xypos, dtype=float)
+    if len(positions) == 1:
         return np.ones((x.size, 1))
     hats = []
-    for values, own in ((x, where[:, 0]), (y, where[:, 1])):
-        nodes = np.unique(own)
-        hats.append([np.interp(values, nodes, (nodes == node).astype(float)) for node in own])
+    for values, grid_nodes in ((x, positions[:, 0]), (y, positions[:, 1])):
+        nodes = np.unique(grid_nodes)
+        hats.append(
+            [np.interp(values, nodes, (nodes == node).astype(float)) for node in grid_nodes]
+        )
     return (np.array(hats[0]) * np.array(hats[1])).T
 
 
@@ -185,12 +190,12 @@ def psf_at(grid, x, y):
         msg = f"'grid' must be a PSFGrid (see miricigale.psf.from_photutils for others), got {got}"
         raise TypeError(msg)
     weights = grid_weights(grid, float(x), float(y))[0]
-    own = ("oversampling", "grid_xypos", "grid_shape")
+    grid_keys = ("oversampling", "grid_xypos", "grid_shape")
     return InstrumentPSF(
         np.tensordot(weights, np.asarray(grid.data), axes=1),
         pixel_scale=weights @ grid.pixel_scales,
         oversampling=int(grid.oversampling[0]),
         position=(x, y),
-        meta={key: value for key, value in grid.meta.items() if key not in own},
+        meta={key: value for key, value in grid.meta.items() if key not in grid_keys},
         **{name: getattr(grid, name) for name in SHARED},
     )

@@ -109,18 +109,18 @@ class PSFFile:
         """Whether the axes are those of the detector, as in the files of STPSF and WebbPSF (bool)."""
         return {"OVERSAMP", "PIXELSCL"} <= set(self.header)
 
-    def pixel_scale(self, stated, *, oversampling=1, argument="pixel_scale"):
+    def pixel_scale(self, user_scale, *, oversampling=1, argument="pixel_scale"):
         """
         Side of a pixel: that of the header, with which a stated one must agree.
 
         Parameters
         ----------
-        stated : `~astropy.units.Quantity` or None
+        user_scale : `~astropy.units.Quantity` or None
             What the user says.
         oversampling : int, optional
             Cells along a side of a pixel.
         argument : str, optional
-            The name of ``stated``, for messages.
+            The name of ``user_scale``, for messages.
 
         Returns
         -------
@@ -132,27 +132,32 @@ class PSFFile:
         ValueError
             If the two differ by more than 2 %.
         """
-        in_header = None if self.cell is None else self.cell * oversampling
-        if stated is None:
-            return None if in_header is None else in_header * ANGLE
-        scale = float(to_array(stated, ANGLE, argument))
+        if self.cell is None:
+            in_header = None
+        else:
+            in_header = self.cell * oversampling
+        if user_scale is None:
+            if in_header is None:
+                return None
+            return in_header * ANGLE
+        scale = float(to_array(user_scale, ANGLE, argument))
         if in_header is not None and abs(scale / in_header - 1) > 0.02:
             wanted = f"{in_header:.4g} arcsec, as the header of {self.path} says"
             if oversampling > 1:
                 wanted += f" with {oversampling} cells along a pixel"
-            raise argument_error(argument, wanted, stated)
+            raise argument_error(argument, wanted, user_scale)
         return scale * ANGLE
 
-    def angle(self, stated, *, argument="angle"):
+    def angle(self, user_angle, *, argument="angle"):
         """
         Position angle of +y: that of the header, with which a stated one must agree.
 
         Parameters
         ----------
-        stated : `~astropy.units.Quantity` or None
+        user_angle : `~astropy.units.Quantity` or None
             What the user says.
         argument : str, optional
-            The name of ``stated``, for messages.
+            The name of ``user_angle``, for messages.
 
         Returns
         -------
@@ -164,12 +169,14 @@ class PSFFile:
         ValueError
             If the two differ by more than 0.5 degrees.
         """
-        if stated is None:
-            return None if self.turn is None else self.turn * u.deg
-        angle = float(to_array(stated, u.deg, argument, finite=True))
+        if user_angle is None:
+            if self.turn is None:
+                return None
+            return self.turn * u.deg
+        angle = float(to_array(user_angle, u.deg, argument, finite=True))
         if self.turn is not None and abs((angle - self.turn + 180) % 360 - 180) > 0.5:
             wanted = f"{self.turn:.4g} deg, as the header of {self.path} says"
-            raise argument_error(argument, wanted, stated)
+            raise argument_error(argument, wanted, user_angle)
         return angle * u.deg
 
     def make_psf(self, **options):
@@ -213,14 +220,23 @@ class PSFFile:
 
 def _planes(hdu, path, wanted, plane):
     """The image of an extension, or the planes of its cube, shape (n, ny, nx)."""
-    data = hdu.data if hdu.is_image else None
+    if hdu.is_image:
+        data = hdu.data
+    else:
+        data = None
     shape = getattr(data, "shape", None)
     if shape is not None and len(shape) == 3 and shape[0] == 1 and plane is None:
         data = data[0]
         shape = data.shape
-    n_axes = 2 if plane is None else 3
+    if plane is None:
+        n_axes = 2
+    else:
+        n_axes = 3
     if shape is None or len(shape) != n_axes:
-        kind = "an image" if plane is None else "a cube"
+        if plane is None:
+            kind = "an image"
+        else:
+            kind = "a cube"
         hint = "; say FILE[EXTENSION,PLANE] or FILE[EXTENSION,mean] of a cube"
         raise data_error(path, f"must be {kind} with {wanted}, got the shape {shape}{hint}")
     if isinstance(plane, int) and not 0 <= plane < shape[0]:
@@ -258,8 +274,11 @@ def _best_extension(hdus, name):
         why = " (the first)"
     if len(images) > 1:
         label = hdus[chosen].name or chosen
-        others = ", ".join(str(hdus[k].name or k) for k in images if k != chosen)
-        msg = f"{name} has several images: extension {label} is taken{why}, not {others}; {name}[NUMBER] names one"
+        ignored_names = ", ".join(str(hdus[k].name or k) for k in images if k != chosen)
+        msg = (
+            f"{name} has several images: extension {label} is taken{why}, not {ignored_names}; "
+            f"{name}[NUMBER] names one"
+        )
         warn(msg, PSFWarning)
     return chosen
 
@@ -302,7 +321,10 @@ def header_grid(header):
     ValueError
         If the image is mirrored.
     """
-    wcs = header_wcs(header, where="the PSF or kernel") if "CTYPE1" in header else None
+    if "CTYPE1" in header:
+        wcs = header_wcs(header, where="the PSF or kernel")
+    else:
+        wcs = None
     if wcs is not None:
         wcs.wcs.set()
         matrix = wcs.pixel_scale_matrix
@@ -378,9 +400,9 @@ def read_psf(
     >>> psf = read_psf("f770w_psf.fits", ext=1, enclosed=0.95)  # doctest: +SKIP
     """
     if split_extension(path)[1] is None and is_written(path):
-        stated = {"frame": frame, "ext": ext, "plane": plane, "pixel_scale": pixel_scale}
-        stated |= {"oversampling": oversampling, "angle": angle, **options}
-        for name, value in stated.items():
+        arguments = {"frame": frame, "ext": ext, "plane": plane, "pixel_scale": pixel_scale}
+        arguments |= {"oversampling": oversampling, "angle": angle, **options}
+        for name, value in arguments.items():
             wanted = f"left out: {path} is a file of InstrumentPSF.write, which has it"
             check_that(value is None, name, wanted, value)
         return _read_psf(path)
@@ -392,7 +414,10 @@ def read_psf(
     if pixel_scale is None:
         raise argument_error("pixel_scale", "given where the header does not state it", None)
     if frame is None:
-        frame = "detector" if psf_file.on_detector else "sky"
+        if psf_file.on_detector:
+            frame = "detector"
+        else:
+            frame = "sky"
     if frame == "detector" and isinstance(header.get("PA_APER"), (int, float)):
         options.setdefault("pa_aper", float(header["PA_APER"]) * u.deg)
     if frame == "sky":
@@ -413,7 +438,8 @@ def is_written(path):
 def _write_psf(psf, path, *, overwrite=False):
     facts = psf.facts
     for name, unit in _UNITS.items():
-        facts[name] = None if facts[name] is None else facts[name].to_value(unit)
+        if facts[name] is not None:
+            facts[name] = facts[name].to_value(unit)
     text = {"facts": facts, "meta": psf.meta}
     write_parts(path, _LAYOUT, text=text, arrays={"psf": psf.data}, overwrite=overwrite)
 
@@ -422,7 +448,8 @@ def _read_psf(path):
     with open_parts(path, (_LAYOUT,), wanted="PSFs") as parts:
         facts = parts.text["facts"]
         for name, unit in _UNITS.items():
-            facts[name] = None if facts[name] is None else facts[name] * unit
+            if facts[name] is not None:
+                facts[name] = facts[name] * unit
         return InstrumentPSF(parts.array("psf"), **facts, meta=parts.text["meta"])
 
 

@@ -19,7 +19,8 @@ from miricigale.utils.units import ANGLE, to_array
 WFC3_FILTERS = ("wfc3.f105w", "wfc3.f125w", "wfc3.f140w", "wfc3.f160w")
 
 #: Width of the WFC3/IR pixel in arcsec and of the drop relative to it in the mosaics.
-_WFC3_PIXEL, _WFC3_PIXFRAC = 0.128, 0.8
+_WFC3_PIXEL = 0.128
+_WFC3_PIXFRAC = 0.8
 
 #: FWHM of the mosaics' PSF at F160W in arcsec.
 _WFC3_FWHM = 0.20

@@ -12,13 +12,13 @@ from miricigale.psf.kernels import MatchingKernel
 from miricigale.utils.exceptions import argument_error
 
 
-def as_kernel(given, argument="kernel"):
+def as_kernel(kernel, argument="kernel"):
     """
     Kernel of anything that is one.
 
     Parameters
     ----------
-    given : `MatchingKernel`, `KernelField`, path-like, pair or `~astropy.nddata.NDData`
+    kernel : `MatchingKernel`, `KernelField`, path-like, pair or `~astropy.nddata.NDData`
         A kernel, its file, an array with its pixel scale (``(array, 0.03 * u.arcsec)``), or an image with world
         coordinates.
     argument : str, optional
@@ -43,17 +43,17 @@ def as_kernel(given, argument="kernel"):
     >>> kernel.pixel_scale
     <Quantity 0.03 arcsec>
     """
-    if isinstance(given, (MatchingKernel, KernelField)):
-        return given
-    if isinstance(given, (str, os.PathLike)):
+    if isinstance(kernel, (MatchingKernel, KernelField)):
+        return kernel
+    if isinstance(kernel, (str, os.PathLike)):
         from miricigale.psf.kernel_io import read_kernel
 
-        return read_kernel(given)
-    if isinstance(given, NDData) and given.wcs is not None:
-        scale = np.sqrt(np.prod(proj_plane_pixel_scales(given.wcs.celestial))) * u.deg
-        return MatchingKernel.from_array(np.asarray(given.data), pixel_scale=scale)
-    if isinstance(given, (tuple, list)) and len(given) == 2:
-        array, scale = given
+        return read_kernel(kernel)
+    if isinstance(kernel, NDData) and kernel.wcs is not None:
+        scale = np.sqrt(np.prod(proj_plane_pixel_scales(kernel.wcs.celestial))) * u.deg
+        return MatchingKernel.from_array(np.asarray(kernel.data), pixel_scale=scale)
+    if isinstance(kernel, (tuple, list)) and len(kernel) == 2:
+        array, scale = kernel
         # kernels of astropy hold their array
         array = np.asarray(getattr(array, "array", array))
         return MatchingKernel.from_array(array, pixel_scale=scale)
@@ -61,4 +61,4 @@ def as_kernel(given, argument="kernel"):
         "a MatchingKernel, a KernelField, a file, or an array with its pixel scale, such as "
         "(array, 0.03 * u.arcsec) (or give 'psf')"
     )
-    raise argument_error(argument, wanted, type(given).__name__)
+    raise argument_error(argument, wanted, type(kernel).__name__)

@@ -13,7 +13,10 @@ def convolved(image, array):
     check_that(image.ndim == 2, "image", "2D", f"shape {image.shape}")
     bad = int(np.count_nonzero(~np.isfinite(image)))
     check_that(not bad, "image", "finite", f"{bad} pixels that are NaN or infinite")
-    convolve = oaconvolve if min(image.shape) > 2 * array.shape[0] else fftconvolve
+    if min(image.shape) > 2 * array.shape[0]:
+        convolve = oaconvolve
+    else:
+        convolve = fftconvolve
     full = convolve(image, array, mode="full")
     h = array.shape[0] // 2
     return full[h : h + image.shape[0], h : h + image.shape[1]]
@@ -21,17 +24,20 @@ def convolved(image, array):
 
 def blended(kernels, weights=None):
     """What the weighted mean of kernels is made of, by the arguments of `~miricigale.psf.MatchingKernel`."""
-    n, names = len(kernels), ("array", "source", "target")
-    w = np.ones(n) if weights is None else np.asarray(weights, dtype=float)
+    n = len(kernels)
+    names = ("array", "source", "target")
+    if weights is None:
+        w = np.ones(n)
+    else:
+        w = np.asarray(weights, dtype=float)
     if w.shape != (n,) or np.any(w < 0) or not w.sum() > 0:
         raise argument_error("weights", f"{n} non-negative numbers, not all 0", weights)
     forms = {(k.pixel_scale, *(np.shape(getattr(k, name)) for name in names)) for k in kernels}
     check_that(len(forms) <= 1, "kernels", "alike in pixel, shape and PSFs", forms)
     w = w / w.sum()
-    mean = {
-        name: np.tensordot(w, [getattr(k, name) for k in kernels], axes=1)
-        for name in names
-        if getattr(kernels[0], name) is not None
-    }
+    mean = {}
+    for name in names:
+        if getattr(kernels[0], name) is not None:
+            mean[name] = np.tensordot(w, [getattr(k, name) for k in kernels], axes=1)
     meta = {"weights": w.tolist(), "lost": float(w @ [k.meta.get("lost", 0) for k in kernels])}
     return {**mean, "pixel_scale": kernels[0].pixel_scale, "meta": meta}

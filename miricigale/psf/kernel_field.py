@@ -68,9 +68,9 @@ class KernelField:
 
     def __post_init__(self):
         kernels = self.__dict__["kernels"] = tuple(self.kernels)
-        if not kernels or not all(isinstance(one, MatchingKernel) for one in kernels):
+        if not kernels or not all(isinstance(kernel, MatchingKernel) for kernel in kernels):
             raise argument_error("kernels", "MatchingKernels, at least one", self.kernels)
-        if any(one.source is None or one.target is None for one in kernels):
+        if any(kernel.source is None or kernel.target is None for kernel in kernels):
             raise argument_error("kernels", "with their source and target", "one without")
         if not isinstance(self.sky, SkyCoord) or self.sky.shape != (len(kernels),):
             wanted = f"a SkyCoord of shape ({len(kernels)},), a place for each kernel"
@@ -155,12 +155,12 @@ class KernelField:
         at = self._plane(sky)
         inside = np.zeros(len(sky), bool)
         if self._triangles is not None and len(sky):
-            found = self._triangles.find_simplex(at)
-            inside = found >= 0
-            transform = self._triangles.transform[found[inside]]
+            triangle = self._triangles.find_simplex(at)
+            inside = triangle >= 0
+            transform = self._triangles.transform[triangle[inside]]
             two = np.einsum("nij,nj->ni", transform[:, :2], at[inside] - transform[:, 2])
             three = np.concatenate([two, 1 - two.sum(axis=1, keepdims=True)], axis=1)
-            weights[rows[inside, None], self._triangles.simplices[found[inside]]] = three
+            weights[rows[inside, None], self._triangles.simplices[triangle[inside]]] = three
         if not inside.all():
             # the nearest point of the rim
             first, last = (self._plane(self.sky)[ends] for ends in self._sides.T)
@@ -180,8 +180,8 @@ class KernelField:
     def at(self, sky):
         """The `MatchingKernel` at one position."""
         weights = self.weights(sky.reshape(1))[0]
-        used = np.flatnonzero(weights)
-        return MatchingKernel.blend([self.kernels[k] for k in used], weights[used])
+        nodes = np.flatnonzero(weights)
+        return MatchingKernel.blend([self.kernels[k] for k in nodes], weights[nodes])
 
     def _plane(self, sky):
         """Positions in the tangent plane about the first place, shape (n, 2)."""

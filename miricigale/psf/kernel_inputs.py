@@ -45,15 +45,17 @@ def psf_pair(
     Parameters are those of `~miricigale.psf.MatchingKernel.from_psfs`, ``scale`` the pixel in arcsec,
     ``angles`` those of the two.
     """
-    given, psfs, centering = {"hi": hi, "lo": lo}, {}, {}
-    for name, psf in given.items():
+    inputs = {"hi": hi, "lo": lo}
+    psfs = {}
+    centering = {}
+    for name, psf in inputs.items():
         wanted = "an ImagePSF or an array (psf_at gives the PSF of a grid at a position)"
         check_that(not isinstance(psf, GriddedPSFModel), name, wanted, type(psf).__name__)
         if hasattr(psf, "param_names") and not isinstance(psf, ImagePSF):
-            given[name] = from_photutils(psf, pixel_scale=scale * ANGLE, angle=grid_angle)
-    arrays = {k: np.shape(v) for k, v in given.items() if not isinstance(v, ImagePSF)}
+            inputs[name] = from_photutils(psf, pixel_scale=scale * ANGLE, angle=grid_angle)
+    arrays = {k: np.shape(v) for k, v in inputs.items() if not isinstance(v, ImagePSF)}
     check_that(len(set(arrays.values())) <= 1, "hi, lo", "arrays of the same shape", arrays)
-    for (name, psf), angle in zip(given.items(), angles, strict=True):
+    for (name, psf), angle in zip(inputs.items(), angles, strict=True):
         if name in arrays:
             psf = _from_array(psf, name, scale, angle, grid_angle, normalize)
         psfs[name], centering[name] = centered_psf(psf, 0.01 * scale, name)
@@ -65,10 +67,11 @@ def psf_pair(
         text = f"from 5 pixels to the {n * scale:.4g} arcsec of the PSFs"
         check_that(5 <= wanted <= n, "extent", text, extent)
         n = wanted
-    images = [
-        _on_grid(psf, name, angle, grid_angle, scale, n, resampling if name == "lo" else None)
-        for (name, psf), angle in zip(psfs.items(), angles, strict=True)
-    ]
+    images = []
+    for (name, psf), angle in zip(psfs.items(), angles, strict=True):
+        images.append(
+            _on_grid(psf, name, angle, grid_angle, scale, n, resampling if name == "lo" else None)
+        )
     held = [float(image.sum()) for image in images]
     if normalize is None:
         # templates are of unit sum through the sharp PSF, whatever that holds
@@ -79,7 +82,10 @@ def psf_pair(
             text = f"light beyond the PSFs' grids, by their own sums and wings: {text}. The kernel "
             text += "is normalized to 1: fluxes lack what lies beyond. Give the PSFs' 'enclosed' "
             warn(text + "(make_psf, read_psf) or 'normalize'", PSFWarning)
-    energy = 1.0 if normalize else held[1]
+    if normalize:
+        energy = 1.0
+    else:
+        energy = held[1]
     mended = {"energy": energy, "held": held, "centering": centering}
     return images[0] / held[0], images[1] * (energy / held[1]), mended
 
@@ -105,7 +111,10 @@ def _from_array(array, name, scale, angle, grid_angle, normalize):
     total = array.sum()
     wanted = "a PSF whose sum is the fraction of light it holds (or 'normalize' True)"
     check_that(0 < total < (np.inf if normalize else 1.02), name, wanted, f"a sum of {total:.6g}")
-    frame = "sky" if angle is None else "detector"
+    if angle is None:
+        frame = "sky"
+    else:
+        frame = "detector"
     try:
         return make_psf(
             array, pixel_scale=scale * ANGLE, frame=frame, angle=grid_angle,
@@ -125,12 +134,20 @@ def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
     if resampling:
         psf = psf_mosaic(psf, scale * ANGLE, angle, grid_angle=grid_angle)
     else:
-        angles = [None] if angle is None else list(np.atleast_1d(angle))
+        if angle is None:
+            angles = [None]
+        else:
+            angles = list(np.atleast_1d(angle))
         try:
-            turned = [rotate_psf(psf, one, grid_angle=grid_angle) for one in angles]
+            rotated = [
+                rotate_psf(psf, angle_of_roll, grid_angle=grid_angle) for angle_of_roll in angles
+            ]
         except ValueError as err:
             raise ValueError(str(err).replace("'angle'", f"'{name}_angle'")) from None
-        psf = average_psf(turned) if len(turned) > 1 else turned[0]
+        if len(rotated) > 1:
+            psf = average_psf(rotated)
+        else:
+            psf = rotated[0]
     return psf_image(psf, pixel_scale=scale * ANGLE, shape=n)
 
 
@@ -145,7 +162,10 @@ def ready_arrays(array, scale, **psfs):
     total = float(array.sum())
     check_that(0.9 <= total <= 1.1, "array", "a kernel whose sum is 1", f"a sum of {total:.6g}")
     array = array / total
-    texts = [f"summed to {total:.4f} and was brought to 1"] if abs(total - 1) > 1e-3 else []
+    if abs(total - 1) > 1e-3:
+        texts = [f"summed to {total:.4f} and was brought to 1"]
+    else:
+        texts = []
     c = array.shape[0] // 2
     x, y, _ = _core.core_moments(array)
     if not np.hypot(x - c, y - c) < 0.1:

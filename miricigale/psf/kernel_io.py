@@ -31,8 +31,8 @@ def _write_kernel(kernel, path, *, overwrite=False):
     if np.isfinite(kernel.regularization):
         header["REGULAR"] = (kernel.regularization, "Wiener parameter")
     header["META"] = json.dumps(kernel.meta, default=plain_value)
-    both = {"SOURCE": kernel.source, "TARGET": kernel.target}.items()
-    hdus += [fits.ImageHDU(psf, name=name) for name, psf in both if psf is not None]
+    psfs = {"SOURCE": kernel.source, "TARGET": kernel.target}.items()
+    hdus += [fits.ImageHDU(psf, name=name) for name, psf in psfs if psf is not None]
     with replacing(path, overwrite=overwrite) as partial:
         write_fits(hdus, partial)
 
@@ -129,8 +129,8 @@ def _write_field(field, path, *, overwrite=False):
     text = {
         "method": field.method,
         "pixel_scale": field.pixel_scale.value,
-        "regularization": [one.regularization for one in kernels],
-        "meta": [one.meta for one in kernels],
+        "regularization": [kernel.regularization for kernel in kernels],
+        "meta": [kernel.meta for kernel in kernels],
     }
     arrays = {name: np.stack([getattr(k, name) for k in kernels]) for name in _ARRAYS}
     icrs = field.sky.icrs
@@ -140,13 +140,15 @@ def _write_field(field, path, *, overwrite=False):
 
 def _read_field(path):
     with open_parts(path, (_FIELD_LAYOUT,), wanted="fields of kernels") as parts:
-        text, arrays = parts.text, [parts.array(name) for name in _ARRAYS]
-        kernels = [
-            MatchingKernel(array, text["pixel_scale"] * ANGLE, source, target, mu, meta)
-            for array, source, target, mu, meta in zip(
-                *arrays, text["regularization"], text["meta"], strict=True
+        text = parts.text
+        arrays = [parts.array(name) for name in _ARRAYS]
+        kernels = []
+        for array, source, target, mu, meta in zip(
+            *arrays, text["regularization"], text["meta"], strict=True
+        ):
+            kernels.append(
+                MatchingKernel(array, text["pixel_scale"] * ANGLE, source, target, mu, meta)
             )
-        ]
         sky = SkyCoord(parts.array("ra"), parts.array("dec"), unit="deg")
         return KernelField(kernels, sky, text["method"])
 

@@ -197,7 +197,8 @@ class MatchingKernel(Interactive):
         1.0
         """
         hi, lo = (named_psf(psf) for psf in (hi, lo))
-        pixel_scale = getattr(hi, "pixel_scale", None) if pixel_scale is None else pixel_scale
+        if pixel_scale is None:
+            pixel_scale = getattr(hi, "pixel_scale", None)
         if pixel_scale is None:
             raise argument_error("pixel_scale", "given where 'hi' does not state it", "None")
         scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
@@ -397,7 +398,8 @@ class MatchingKernel(Interactive):
         """
         from miricigale.plotting.measurements import plot_energies
 
-        matched, pixels = self.matched, energy_radii(self.target)
+        matched = self.matched
+        pixels = energy_radii(self.target)
         psfs = {"sharp PSF": self.source, "wide PSF": self.target, "convolved": matched}
         curves = {name: energy_error(psf, 0.0 * psf, pixels) for name, psf in psfs.items()}
         return plot_energies(pixels * self.pixel_scale.value, curves, ax=ax, **kwargs)
@@ -452,7 +454,8 @@ class MatchingKernel(Interactive):
             ``target`` stay as they are.
         """
         width = float(to_array(extent, ANGLE, "extent")) / self.pixel_scale.value
-        half, old = int(width // 2), self.array.shape[0] // 2
+        half = int(width // 2)
+        old = self.array.shape[0] // 2
         wanted = f"at most {self.array.shape[0] * self.pixel_scale.value:.4g} arcsec"
         check_that(0 <= half <= old, "extent", wanted, extent)
         array = self.array[old - half : old + half + 1, old - half : old + half + 1]

@@ -78,7 +78,8 @@ def _distorted_optics(telescope, map_, oversampling, n, cell):
 @cached(maxsize=24)
 def _miri_data(telescope, oversampling, fov, includes, calibration, position=None):
     """Data and pixel (arcsec) of a PSF; ``position`` is (x, y, sub-array)."""
-    name, scale = telescope.filter, MIRI_PIXEL_SCALE.value
+    name = telescope.filter
+    scale = MIRI_PIXEL_SCALE.value
     cell = scale / oversampling
     # light scattered in from just beyond the edge: two pixels more than asked for
     margin = 2 * oversampling
@@ -96,7 +97,10 @@ def _miri_data(telescope, oversampling, fov, includes, calibration, position=Non
     constants = jwst_constants()
     jitter = 0.0
     if "jitter" in includes:
-        extra = _IN_FLIGHT_BLUR.get(name, 0.0) if calibration == "flight" else 0.0
+        if calibration == "flight":
+            extra = _IN_FLIGHT_BLUR.get(name, 0.0)
+        else:
+            extra = 0.0
         jitter = math.hypot(constants["jitter"], extra) / scale
     if "cruciform" in includes:
         form = {"oversampling": oversampling, "calibration": calibration}
@@ -198,9 +202,15 @@ def miri_psf(
     telescope = Telescope.of(name, _V3_ANGLE, wavefront_error, seed)
     # written order, whatever the caller's
     effects = tuple(effect for effect in EFFECTS if effect in includes)
-    place = None if position is None else (*(float(v) for v in position), subarray)
+    if position is None:
+        place = None
+    else:
+        place = (*(float(v) for v in position), subarray)
     data, scale = _miri_data(telescope, oversampling, width, effects, calibration, place)
-    scattered = cruciform_fraction(name, calibration=calibration) if "cruciform" in effects else 0.0
+    if "cruciform" in effects:
+        scattered = cruciform_fraction(name, calibration=calibration)
+    else:
+        scattered = 0.0
     meta = {
         "instrument": "MIRI",
         "calibration": calibration,

@@ -107,18 +107,34 @@ class InstrumentPSF(ImagePSF):
         cells = check_count(oversampling, "oversampling")
         scale = positive(pixel_scale, ANGLE, "pixel_scale")
         super().__init__(data, oversampling=cells, origin=origin, meta=dict(meta or {}))
-        turn = float(to_array(angle, u.deg, "angle", finite=True)) if frame == "sky" else 0.0
-        self.pixel_scale, self.frame, self.angle = scale * ANGLE, frame, turn * u.deg
-        self.includes, self.filter = tuple(includes), filter
-        self.total_known, self.pa_aper = bool(total_known), pa_aper
-        self.position = None if position is None else tuple(float(v) for v in position)
+        if frame == "sky":
+            turn = float(to_array(angle, u.deg, "angle", finite=True))
+        else:
+            turn = 0.0
+        self.pixel_scale = scale * ANGLE
+        self.frame = frame
+        self.angle = turn * u.deg
+        self.includes = tuple(includes)
+        self.filter = filter
+        self.total_known = bool(total_known)
+        self.pa_aper = pa_aper
+        if position is None:
+            self.position = None
+        else:
+            self.position = tuple(float(v) for v in position)
         self.subarray = subarray
 
     def __repr__(self):
         ny, nx = self.data.shape
         cells = f"{ny} x {nx} cells of {self.cell:.4g} arcsec"
-        name = f"{self.filter}, " if self.filter else ""
-        held = f", with {', '.join(self.includes)}" if self.includes else ""
+        if self.filter:
+            name = f"{self.filter}, "
+        else:
+            name = ""
+        if self.includes:
+            held = f", with {', '.join(self.includes)}"
+        else:
+            held = ""
         return f"<InstrumentPSF {name}{cells}, frame of the {self.frame}{held}>"
 
     def encircled_energy(self, radius):
@@ -283,10 +299,12 @@ class PSFGrid(GriddedPSFModel):
         x, y = np.transpose(self.grid_xypos)
         columns = np.unique(x)
         rows = np.unique(y)
-        whole = np.all(columns == np.round(columns)) and np.all(rows == np.round(rows))
+        whole_pixels = np.all(columns == np.round(columns)) and np.all(rows == np.round(rows))
         full = columns.size * rows.size == x.size and max(columns.size, rows.size) < 100
         got = f"{x.size} positions at {columns.size} x and {rows.size} y"
-        check_that(full and whole, "positions", "a full grid of whole pixels for STDPSF", got)
+        check_that(
+            full and whole_pixels, "positions", "a full grid of whole pixels for STDPSF", got
+        )
         # photutils takes these numbers for several chips
         check_that(
             x.size not in (36, 56, 90, 200), "positions", "of another number for STDPSF", got
@@ -388,7 +406,8 @@ def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, *
     data = np.array(data, dtype=float)
     if data.ndim != 2 or not np.all(np.isfinite(data)) or not data.sum() > 0:
         raise argument_error("data", "a finite 2D array with a positive sum", f"{data.shape}")
-    total, factor = float(data.sum()), 1.0
+    total = float(data.sum())
+    factor = 1.0
     if enclosed is not None:
         check_that(0 < enclosed <= 1, "enclosed", "above 0 and at most 1", enclosed)
         factor = enclosed * oversampling**2 / total
@@ -453,8 +472,11 @@ def as_psf(psf, argument="psf"):
     cells = 1
     if {"x_0", "y_0", "flux"} <= set(getattr(psf, "param_names", ())):
         # copies of the model: the parameters of a model of photutils are the user's
-        cells, model = 4, psf.copy()
-        model.x_0, model.y_0, model.flux = 0.0, 0.0, 1.0
+        cells = 4
+        model = psf.copy()
+        model.x_0 = 0.0
+        model.y_0 = 0.0
+        model.flux = 1.0
         reach = max(5.0, *np.abs(np.ravel(model.bounding_box.bounding_box())))
         axis = np.arange(-np.ceil(reach * cells), np.ceil(reach * cells) + 1) / cells
         data = model(*np.meshgrid(axis, axis))
@@ -509,7 +531,8 @@ def from_photutils(model, *, x=None, y=None, **options):
         raise argument_error("model", "oversampled alike in x and y", oversampling.tolist())
     cells = int(oversampling[0])
     if isinstance(model, ImagePSF):
-        data, options["origin"] = model.data, tuple(model.origin)
+        data = model.data
+        options["origin"] = tuple(model.origin)
     else:
         check_that(x is not None and y is not None, "x, y", "given for a GriddedPSFModel", (x, y))
         yy, xx = ((np.arange(n) - (n - 1) / 2) * (1.0 / cells) for n in model.data.shape[1:])

@@ -107,7 +107,8 @@ class Pupil:
         v, u = np.meshgrid(axis, axis, indexing="ij")
         # back to the telescope's frame, so that the error turns with the telescope
         a = math.radians(self.angle)
-        x, y = -u * math.cos(a) + v * math.sin(a), u * math.sin(a) + v * math.cos(a)
+        x = -u * math.cos(a) + v * math.sin(a)
+        y = u * math.sin(a) + v * math.cos(a)
         rng = stream(seed, "psf", "wavefront")
         return _core.wavefront(self.amplitude, self.segments, x, y, rms, _SEGMENT_FRACTION, rng)
 
@@ -222,7 +223,8 @@ def hst_pupil(n=256, *, angle=45.0):
     2.40 m across, 0.64 of the grid open
     """
     diameter = 2.4
-    radius, step = 0.5 * diameter, diameter / n
+    radius = 0.5 * diameter
+    step = diameter / n
     amplitude = _core.polygon_coverage(_circle(radius), n, step, _ROWS)
     segments = (amplitude > 0).astype(np.int16)
     amplitude *= 1 - _core.polygon_coverage(_circle(_HST_OBSCURATION * radius), n, step, _ROWS)
@@ -230,7 +232,8 @@ def hst_pupil(n=256, *, angle=45.0):
     blocked = np.zeros((n, n))
     for k in range(2):
         a = math.radians(angle + 90 * k)
-        along, across = np.array([-math.sin(a), math.cos(a)]), np.array([math.cos(a), math.sin(a)])
+        along = np.array([-math.sin(a), math.cos(a)])
+        across = np.array([math.cos(a), math.sin(a)])
         s, t = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1]])[..., None]
         corners = s * radius * along + t * half * across
         blocked = np.maximum(blocked, _core.polygon_coverage(corners, n, step, _ROWS))
@@ -249,7 +252,8 @@ def _center(pupil, opd, wavelength):
     grid = np.linspace(-4, 4, 65) * scale
     function = pupil.amplitude * np.exp(2j * np.pi * opd / wavelength)
     image = _core.matrix_dft_intensity(function, pupil.step, wavelength, grid, grid)
-    x, y = 0.0, 0.0
+    x = 0.0
+    y = 0.0
     for _ in range(20):
         wx = np.exp(-0.5 * ((grid - x) / (0.6 * scale)) ** 2)
         wy = np.exp(-0.5 * ((grid - y) / (0.6 * scale)) ** 2)
@@ -258,7 +262,8 @@ def _center(pupil, opd, wavelength):
         # twice the step: for a core as wide as the window this converges at once
         dx = 2 * (np.sum(weighted.sum(0) * grid) / total - x)
         dy = 2 * (np.sum(weighted.sum(1) * grid) / total - y)
-        x, y = x + dx, y + dy
+        x = x + dx
+        y = y + dy
         if math.hypot(dx, dy) < 1e-5 * scale:
             break
     return x, y
@@ -287,14 +292,16 @@ def polychromatic_psf(pupil, opd, wavelengths, *, step, n):
         If ``n`` is even or the grid is wider than the transform's period.
     """
     check_that(n % 2 != 0, "n", "odd", n)
-    wavelengths, opd = np.asarray(wavelengths, float) * 1e-6, np.asarray(opd, float) * 1e-9
+    wavelengths = np.asarray(wavelengths, float) * 1e-6
+    opd = np.asarray(opd, float) * 1e-9
     period = wavelengths.min() / pupil.step / ARCSEC
     wanted = f"an image below {period:.1f} arcsec (a finer pupil allows more)"
     check_that(n * step <= period, "n", wanted, f"{n} x {step:.4g} arcsec = {n * step:.1f} arcsec")
     weight = 1.0 / wavelengths.size
     mean = float(np.average(wavelengths, weights=np.full(wavelengths.size, weight)))
     axis = (np.arange(n) - (n - 1) // 2) * step * ARCSEC
-    image, power = np.zeros((n, n)), float(pupil.amplitude.sum())
+    image = np.zeros((n, n))
+    power = float(pupil.amplitude.sum())
     across = (np.arange(pupil.n) - 0.5 * (pupil.n - 1)) * pupil.step
     # the same bits on any number of cores
     with single_threaded():

@@ -39,11 +39,13 @@ def sampled(psf, x, y, turn=0.0, data=None):
     """Values per cell at offsets x, y in arcsec (broadcast), after a turn in deg; of other data if given."""
     a = math.radians(turn)
     if turn % 360 == 0:
-        u_, v_ = x, y
+        u_ = x
+        v_ = y
     else:
         u_ = x * math.cos(a) + y * math.sin(a)
         v_ = -x * math.sin(a) + y * math.cos(a)
-    data = psf.data if data is None else data
+    if data is None:
+        data = psf.data
     return _core.interpolate(data, u_ / psf.cell + psf.origin[0], v_ / psf.cell + psf.origin[1])
 
 
@@ -140,7 +142,8 @@ def alike(psfs, names):
     first = psfs[0].facts
     for i, psf in enumerate(psfs[1:], start=1):
         for name in names:
-            mine, theirs = psf.facts[name], first[name]
+            mine = psf.facts[name]
+            theirs = first[name]
             close = name in _ANGLES and np.isclose(mine.value, theirs.value, rtol=1e-6)
             if not (close or mine == theirs):
                 raise argument_error("psfs", f"alike in {name}", f"{theirs} and {mine} (psfs[{i}])")
@@ -188,7 +191,11 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     """
     psf = instrument_psf(psf)
     scale = positive(pixel_scale, ANGLE, "pixel_scale")
-    ny, nx = (shape, shape) if np.isscalar(shape) else shape
+    if np.isscalar(shape):
+        ny = shape
+        nx = shape
+    else:
+        ny, nx = shape
     check_that(min(ny, nx) >= 1, "shape", "at least one row and column", shape)
     x = (np.arange(nx) - (nx - 1) / 2 - offset[0]) * scale
     y = ((np.arange(ny) - (ny - 1) / 2 - offset[1]) * scale)[:, None]
@@ -259,12 +266,18 @@ def psf_mosaic(
     check_that(0 < pixfrac <= 1, "pixfrac", "above 0 and at most 1", pixfrac)
     scale = positive(pixel_scale, ANGLE, "pixel_scale")
     grid = _degrees(grid_angle, "grid_angle")
-    angles = [None] if pa is None else list(np.atleast_1d(pa))
+    if pa is None:
+        angles = [None]
+    else:
+        angles = list(np.atleast_1d(pa))
     turns = [_turn_by(psf, angle, grid, "pa") for angle in angles]
     if oversampling is None:
         oversampling = max(1, math.ceil(scale / psf.cell - 1e-6))
     cell = scale / check_count(oversampling, "oversampling")
-    width = 2 * psf.half_width if fov is None else positive(fov, ANGLE, "fov")
+    if fov is None:
+        width = 2 * psf.half_width
+    else:
+        width = positive(fov, ANGLE, "fov")
     n = 2 * round(0.5 * width / cell - 0.5) + 1
     blurred = psf.data
     if resampling == "drizzle":

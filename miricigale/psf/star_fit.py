@@ -15,16 +15,22 @@ TERMS = dict.fromkeys(["width", "elongation", "diagonal", *(f"wings_{n}" for n i
 
 #: How many of the terms may change over the field; standard deviations of all terms, and of their changes from the
 #: middle of the field to its edges; deviation of single cells, as a fraction of the light about them.
-_SLOPED, _CELLS = 3, 0.1
+_SLOPED = 3
+_CELLS = 0.1
 _SPREAD = np.array([*TERMS.values(), *[0.05] * (2 * _SLOPED)])
 
 #: Least number of stars that are left out one by one (of fewer, halves are), with which changes over the field and
 #: single cells are tried; how much smaller chi-square must be of what was left out, and as a part of it: less may
 #: come from the wings of neighbors.
-WHOLE, _FIELD, _EFFECTIVE, _EVIDENCE, _PART = 3, 6, 3, 9.0, 1e-3
+WHOLE = 3
+_FIELD = 6
+_EFFECTIVE = 3
+_EVIDENCE = 9.0
+_PART = 1e-3
 
 #: Deviation of a star from any PSF, as a fraction of its light in a pixel; steps of the fit.
-_SCATTER, _STEPS = 0.02, 5
+_SCATTER = 0.02
+_STEPS = 5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,10 +52,10 @@ class Star:
     def halves(self):
         """Two stars, each with every other octant about its position."""
         odd = np.floor(np.arctan2(self.v, self.u) * (4 / np.pi)).astype(int) % 2 == 1
-        return [
-            dataclasses.replace(self, sigma=np.where(part, np.inf, self.sigma))
-            for part in (odd, ~odd)
-        ]
+        out = []
+        for part in (odd, ~odd):
+            out.append(dataclasses.replace(self, sigma=np.where(part, np.inf, self.sigma)))
+        return out
 
 
 def derivatives(psf, fwhm):
@@ -59,13 +65,16 @@ def derivatives(psf, fwhm):
     axis = np.arange(len(psf)) - len(psf) // 2
     place = np.log(np.maximum(np.hypot(axis, axis[:, None]), 0.1) / fwhm)
     cross = np.gradient(np.gradient(psf, axis=0), axis=1)
-    wings = (np.clip(1.0 + (place - one) / np.log(2.0), 0.0, 1.0) for one in np.log(_BEYOND))
+    wings = (
+        np.clip(1.0 + (place - log_radius) / np.log(2.0), 0.0, 1.0)
+        for log_radius in np.log(_BEYOND)
+    )
     core = variance * (xx + yy), 0.5 * variance * (xx - yy), variance * cross
-    found = np.stack([*core, *(psf * one for one in wings)])
-    light = found.sum(axis=(1, 2))
+    changes = np.stack([*core, *(psf * log_radius for log_radius in wings)])
+    light = changes.sum(axis=(1, 2))
     # what lies beyond the grid is wings too
     light[-len(_BEYOND) :] += 1.0 - psf.sum()
-    return found - light[:, None, None] * psf
+    return changes - light[:, None, None] * psf
 
 
 class FittedStar:
@@ -82,8 +91,10 @@ class FittedStar:
     def __init__(self, star, offset, images, slope):
         half = len(images) // 2
         use = np.isfinite(star.sigma)
-        data, sigma = star.data[use], star.sigma[use]
-        x, y = star.u[use] - offset[0], star.v[use] - offset[1]
+        data = star.data[use]
+        sigma = star.sigma[use]
+        x = star.u[use] - offset[0]
+        y = star.v[use] - offset[1]
         at = (y + half, x + half)
         light, dx, dy, *terms = _core.cubic_splines(images, *at)
         light = light + (slope @ star.place) @ terms[:_SLOPED]
@@ -92,7 +103,10 @@ class FittedStar:
         for _ in range(2):
             found = np.linalg.lstsq(own * weight[:, None], data * weight)[0]
             weight = 1.0 / np.hypot(sigma, _SCATTER * found[0] * own[:, 0])
-        self.star, self.at, self.flux, self.weight = star, at, found[0], weight
+        self.star = star
+        self.at = at
+        self.flux = found[0]
+        self.weight = weight
         self.offset = offset + np.clip(found[1:3] / np.where(found[0] > 0, found[0], np.inf), -1, 1)
         self.residual = data - own @ found
         #: What a change of the PSF by 1 is in each weighted pixel.
@@ -101,7 +115,8 @@ class FittedStar:
         self._left = self._apart(self.residual * weight)
         sloped = np.multiply.outer(star.place, terms[:_SLOPED]).reshape(-1, x.size)
         self.columns = self._apart((self.scale * np.concatenate([terms, sloped])).T)
-        self.normal, self.right = self.columns.T @ self.columns, self.columns.T @ self._left
+        self.normal = self.columns.T @ self.columns
+        self.right = self.columns.T @ self._left
         light = np.maximum(light, 0.0)
         self.chi2 = float(light @ (self.residual * weight) ** 2 / light.sum())
         self.snr = found[0] * np.sqrt(np.sum((own[:, 0] / sigma) ** 2))
@@ -147,12 +162,18 @@ def fitted_stars(psf, stars, *, slope=None, offsets=None):
     """
     fwhm = _core.half_maximum_width(psf, len(psf) // 2, len(psf) // 2)
     images = [psf, *np.gradient(psf)[::-1], *derivatives(psf, fwhm)]
-    images = np.stack([spline_filter(one) for one in images], axis=-1)
-    slope = np.zeros((_SLOPED, 2)) if slope is None else slope
-    steps, offsets = (_STEPS, np.zeros((len(stars), 2))) if offsets is None else (1, offsets)
+    images = np.stack([spline_filter(image) for image in images], axis=-1)
+    if slope is None:
+        slope = np.zeros((_SLOPED, 2))
+    if offsets is None:
+        steps = _STEPS
+        offsets = np.zeros((len(stars), 2))
+    else:
+        steps = 1
+        offsets = offsets
     for _ in range(steps):
-        fits = [FittedStar(*one, images, slope) for one in zip(stars, offsets, strict=True)]
-        offsets = [one.offset for one in fits]
+        fits = [FittedStar(*image, images, slope) for image in zip(stars, offsets, strict=True)]
+        offsets = [image.offset for image in fits]
     return fits
 
 
@@ -198,11 +219,17 @@ class StarPSF:
     def __init__(self, psf, stars, least=1):
         stars = list(stars)
         check_that(stars, "stars", "at least one star", "none")
-        self._model, half = psf, len(psf) // 2
+        self._model = psf
+        half = len(psf) // 2
         self._fwhm = _core.half_maximum_width(psf, half, half)
         # of few stars each one counts as two, of which one is left out
-        units = stars if len(stars) >= WHOLE else [half for one in stars for half in one.halves()]
-        self.kind, self._cells, self._state = "model", 0.0, np.zeros(len(_SPREAD))
+        if len(stars) >= WHOLE:
+            units = stars
+        else:
+            units = [half for one in stars for half in one.halves()]
+        self.kind = "model"
+        self._cells = 0.0
+        self._state = np.zeros(len(_SPREAD))
         self.before = self._fitted(stars)
         fits, without, inverse = self._solved(units, 0)
         self.chi2 = {"model": sum(one.misfit() for one in fits)}
@@ -210,7 +237,8 @@ class StarPSF:
         for kind, n, k in (("terms", 1, len(TERMS)), ("field", _FIELD, len(_SPREAD))):
             if len(stars) < max(n, least):
                 continue
-            kept, found = self._state, self._solved(units, k)
+            kept = self._state
+            found = self._solved(units, k)
             left = zip(*found[:2], strict=True)
             if self._better(kind, sum(fit.misfit(fit.columns @ step) for fit, step in left)):
                 fits, without, inverse = found
@@ -222,9 +250,11 @@ class StarPSF:
             whole, cells = self._common_cells(fits, image)
             at = [f.scale * map_coordinates(one, f.at) for one, f in zip(cells, fits, strict=True)]
             if self._better("effective", sum(map(FittedStar.misfit, fits, at))):
-                self._cells, changes = whole, changes + cells - whole
+                self._cells = whole
+                changes = changes + cells - whole
         self.after = self._fitted(stars)
-        self.terms, self.terms_err = self._state[: len(TERMS)], np.sqrt(np.diag(inverse))
+        self.terms = self._state[: len(TERMS)]
+        self.terms_err = np.sqrt(np.diag(inverse))
         matched = self.at() / np.sum(self.at() ** 2)
         slope = np.tensordot(derivatives(self.at(), self._fwhm), matched)
         scatter = (len(units) - 1) * np.var(np.tensordot(changes, matched))
@@ -246,7 +276,10 @@ class StarPSF:
         psf : `~numpy.ndarray`, shape (n, n)
         """
         terms = self._state[: len(TERMS)]
-        image = self._model if model is None else model
+        if model is None:
+            image = self._model
+        else:
+            image = model
         # in steps, since changes are linear for small ones
         for _ in range(_STEPS if terms.any() else 0):
             image = image + np.tensordot(terms / _STEPS, derivatives(image, self._fwhm), 1)
@@ -265,8 +298,10 @@ class StarPSF:
 
     def _solved(self, units, k):
         """Fit the first k terms: the stars, steps of terms where each is left out, covariance of `TERMS`."""
-        self._state, offsets = np.zeros(len(_SPREAD)), np.zeros((len(units), 2))
-        prior, free = np.diag(_SPREAD**-2.0), np.ix_(*[np.arange(k)] * 2)
+        self._state = np.zeros(len(_SPREAD))
+        offsets = np.zeros((len(units), 2))
+        prior = np.diag(_SPREAD**-2.0)
+        free = np.ix_(*[np.arange(k)] * 2)
         inverse = np.zeros_like(prior)
 
         def step(normal, right):
@@ -276,7 +311,8 @@ class StarPSF:
         for last in np.arange(_STEPS + 1) == _STEPS:
             fits = self._fitted(units, offsets)
             offsets = [one.offset for one in fits]
-            normal, right = sum(one.normal for one in fits), sum(one.right for one in fits)
+            normal = sum(one.normal for one in fits)
+            right = sum(one.right for one in fits)
             if not last:
                 self._state = self._state + step(normal, right)
         without = np.array([step(normal - one.normal, right - one.right) for one in fits])
@@ -288,12 +324,14 @@ class StarPSF:
         self.chi2[kind] = chi2
         known = self.chi2[self.kind]
         better = chi2 < known - max(_EVIDENCE, _PART * known)
-        self.kind = kind if better else self.kind
+        if better:
+            self.kind = kind
         return better
 
     def _common_cells(self, fits, image):
         """What the residuals have in common by cell, and that without each of the stars."""
-        shape, sums = image.shape, []
+        shape = image.shape
+        sums = []
         for fit in fits:
             corner = np.floor(fit.at).astype(int)
             part = fit.at - corner

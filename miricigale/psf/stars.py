@@ -68,19 +68,28 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
     0.47 arcsec of 4 stars
     """
     psf = instrument_psf(psf)
-    cells, (ny, nx) = psf.n_cells, psf.data.shape
+    cells = psf.n_cells
+    ny, nx = psf.data.shape
     middle = ny == nx and ny % 2 == 1 and np.allclose(psf.origin, (nx // 2, ny // 2))
     check_that(middle, "psf", "square and odd, with its center in the middle", psf.data.shape)
-    images = [images] if isinstance(images, NDData) else list(images)
-    stars = [stars] * len(images) if isinstance(stars, (Table, SkyCoord)) else list(stars)
+    if isinstance(images, NDData):
+        images = [images]
+    else:
+        images = list(images)
+    if isinstance(stars, (Table, SkyCoord)):
+        stars = [stars] * len(images)
+    else:
+        stars = list(stars)
     wanted = f"positions on the sky, or a table for each of {len(images)} images"
     check_that(len(stars) == len(images), "stars", wanted, f"{len(stars)} tables")
     half = round(
         0.5 * min(positive(fov, ANGLE, "fov"), 2 * psf.half_width) / psf.pixel_scale.value - 1
     )
-    found, wanted = [], 0
+    star_stamps = []
+    wanted = 0
     for image, table in zip(images, stars, strict=True):
-        data, use = np.asarray(image.data, float), np.isfinite(image.data)
+        data = np.asarray(image.data, float)
+        use = np.isfinite(image.data)
         use &= True if image.mask is None else ~np.asarray(image.mask, bool)
         if image.uncertainty is None:
             sigma = np.full(data.shape, mad_std(data[use]))
@@ -90,13 +99,18 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
         for x, y in _places(image, table):
             wanted += 1
             if half <= x < data.shape[1] - half - 1 and half <= y < data.shape[0] - half - 1:
-                i, j = round(x), round(y)
+                i = round(x)
+                j = round(y)
                 v, u = np.mgrid[j - half : j + half + 1, i - half : i + half + 1]
                 stamp = np.where(use, data, 0.0)[v, u], sigma[v, u]
-                found.append(Star(*stamp, (u - x) * cells, (v - y) * cells, area=cells**2))
-    check_that(found, "stars", "at least one with its stamp on an image", f"{wanted} without")
-    fit = StarPSF(psf.data / cells**2, found)
-    meta = {"n_images": len(images), "n_stamps": len(found), "n_left_out": wanted - len(found)}
+                star_stamps.append(Star(*stamp, (u - x) * cells, (v - y) * cells, area=cells**2))
+    check_that(star_stamps, "stars", "at least one with its stamp on an image", f"{wanted} without")
+    fit = StarPSF(psf.data / cells**2, star_stamps)
+    meta = {
+        "n_images": len(images),
+        "n_stamps": len(star_stamps),
+        "n_left_out": wanted - len(star_stamps),
+    }
     meta |= {"source": "stars", "correction": fit.kind, "flux_err": float(fit.error)}
     return psf.replace(
         fit.at() * cells**2, meta=meta | dict(zip(TERMS, fit.terms.tolist(), strict=True))
@@ -109,6 +123,9 @@ def _places(image, stars):
         if not {"x", "y"} <= set(stars.colnames):
             raise argument_error("stars", "tables with 'x' and 'y', or 'sky'", stars.colnames)
         return np.stack([np.asarray(stars[name], float) for name in "xy"], axis=1)
-    sky = stars if isinstance(stars, SkyCoord) else stars["sky"]
+    if isinstance(stars, SkyCoord):
+        sky = stars
+    else:
+        sky = stars["sky"]
     check_that(image.wcs is not None, "stars", "'x' and 'y' for images without a WCS", "the sky")
     return np.stack(np.atleast_1d(*image.wcs.world_to_pixel(sky)), axis=1)

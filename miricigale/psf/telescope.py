@@ -37,7 +37,10 @@ def odd_cells(width, cell):
 
 def checked_grid(oversampling, fov, default):
     """Cells per pixel and width in arcsec of a PSF's grid."""
-    width = default if fov is None else positive(fov, ANGLE, "fov")
+    if fov is None:
+        width = default
+    else:
+        width = positive(fov, ANGLE, "fov")
     return check_count(oversampling, "oversampling"), width
 
 

@@ -24,7 +24,8 @@ _SEQUENCE = tuple(10.0 ** (-0.5 * k) for k in range(2, 17))
 # what an automatic kernel may have: noise gain relative to that of the Gaussian between two
 # Gaussians as wide as the PSFs' cores (MIRI from F160W: 0.4-1.0; striped kernels: 1.4-5), and sum
 # of its negative pixels (-0.03 to -0.95; striped kernels: -0.9 to -6.6)
-_GAIN, _NEGATIVE = 1.25, -1.5
+_GAIN = 1.25
+_NEGATIVE = -1.5
 # largest error of the encircled energy that goes without a warning
 _ERROR = 0.02
 
@@ -33,7 +34,10 @@ def checked_square(value, name, *, odd=True):
     """An array as floats, checked: square, odd, finite; ``name`` is the argument's."""
     value = np.asarray(value, dtype=float)
     if value.ndim != 2 or value.shape[0] != value.shape[1] or (odd and value.shape[0] % 2 == 0):
-        wanted = "square with an odd number of pixels" if odd else "square"
+        if odd:
+            wanted = "square with an odd number of pixels"
+        else:
+            wanted = "square"
         raise argument_error(name, wanted, f"shape {value.shape}")
     check_that(np.all(np.isfinite(value)), name, "finite", "NaN or infinite pixels")
     return value
@@ -47,8 +51,9 @@ def wiener(source, target):
     is computed once for all that are tried.
     """
     shape = source.shape
-    own = rfft2(ifftshift(source))
-    power, product = np.abs(own) ** 2, rfft2(ifftshift(target)) * own.conj()
+    source_transform = rfft2(ifftshift(source))
+    power = np.abs(source_transform) ** 2
+    product = rfft2(ifftshift(target)) * source_transform.conj()
     rough = np.abs(rfft2(_LAPLACIAN, shape)) ** 2
 
     def make(mu):
@@ -124,7 +129,8 @@ def choose(regularization, make, source, target, tolerance):
         If no kernel keeps the limits, or the one that was chosen misses the wide PSF's
         encircled energy by more than 0.02.
     """
-    n, half = len(source), len(source) // 2
+    n = len(source)
+    half = len(source) // 2
     size = (next_fast_len(2 * n - 1, real=True),) * 2
     spectrum = rfft2(source, size)
 
@@ -145,22 +151,22 @@ def choose(regularization, make, source, target, tolerance):
         if regularization in REGULARIZATIONS:
             regularization = REGULARIZATIONS[regularization]
         elif regularization != "auto":
-            known = ["auto", *REGULARIZATIONS]
-            raise argument_error("regularization", f"positive or one of {known}", regularization)
+            names = ["auto", *REGULARIZATIONS]
+            raise argument_error("regularization", f"positive or one of {names}", regularization)
     if regularization != "auto":
         check_positive(regularization, "regularization")
         mu = float(regularization)
         return mu, make(mu), figures(mu)
-    tried = [(mu, figures(mu)) for mu in _SEQUENCE]
+    candidates = [(mu, figures(mu)) for mu in _SEQUENCE]
     total = float(target.sum())
     limits = _GAIN * reference * total, _NEGATIVE * total
     allowed = [
-        one for one in tried
-        if one[1]["noise_gain"] <= limits[0] and one[1]["negative_sum"] >= limits[1]
+        candidate for candidate in candidates
+        if candidate[1]["noise_gain"] <= limits[0] and candidate[1]["negative_sum"] >= limits[1]
     ]  # fmt: skip
-    kept = bool(allowed) or [min(tried, key=lambda one: one[1]["noise_gain"])]
-    smallest = min(one["max_error"] for _, one in allowed or kept)
-    mu, best = next(t for t in allowed or kept if t[1]["max_error"] <= smallest + tolerance)
+    choices = bool(allowed) or [min(candidates, key=lambda candidate: candidate[1]["noise_gain"])]
+    smallest = min(candidate["max_error"] for _, candidate in allowed or choices)
+    mu, best = next(t for t in allowed or choices if t[1]["max_error"] <= smallest + tolerance)
     best |= {"smallest_error": smallest, "within_limits": bool(allowed)}
     text = f"matching kernel with regularization {mu:.2g}: noise gain {best['noise_gain']:.4f} "
     text += f"(limit {limits[0]:.4f}), negative pixels {best['negative_sum']:.3f} (limit "

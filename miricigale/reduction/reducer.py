@@ -128,8 +128,8 @@ class Reducer(Interactive):
                 raise argument_error(name, f"a {kind.__name__}", "None")
             check_kind(value, name, kind)
         thread_count(self.n_threads)
-        known = isinstance(self.references, (ReferenceFiles, ReferenceCache))
-        if not known and self.references not in (None, "none", "simulated"):
+        is_reference_set = isinstance(self.references, (ReferenceFiles, ReferenceCache))
+        if not is_reference_set and self.references not in (None, "none", "simulated"):
             wanted = "ReferenceFiles, a ReferenceCache, 'none', 'simulated' or None"
             raise argument_error("references", wanted, repr(self.references))
 
@@ -138,8 +138,11 @@ class Reducer(Interactive):
     def __repr__(self):
         parts = [f"<Reducer {self.backend}"]
         for item in dataclasses.fields(self)[1:]:
-            made = item.default_factory
-            default = item.default if made is dataclasses.MISSING else made()
+            factory = item.default_factory
+            if factory is dataclasses.MISSING:
+                default = item.default
+            else:
+                default = factory()
             value = repr(getattr(self, item.name))
             # what is not by default; settings of many values by their name alone
             if value != repr(default):
@@ -152,7 +155,9 @@ class Reducer(Interactive):
     @property
     def detector(self):
         """The simulated detector, whose constants its ramps are reduced with."""
-        return miri_detector() if self.properties is None else self.properties
+        if self.properties is None:
+            return miri_detector()
+        return self.properties
 
     def fit_groups(self, ramp, *, progress_bar=False):
         """
@@ -199,7 +204,9 @@ class Reducer(Interactive):
         ramp = opened(ramp)
         maps = maps_of(self, ramp)
         rate = rate_image(self, ramp, maps, fit_slopes(self, ramp, maps, progress_bar))
-        return rate if planes else rate.image
+        if planes:
+            return rate
+        return rate.image
 
     def fit_integrations(self, ramp, *, planes=False, progress_bar=False):
         """
@@ -223,10 +230,20 @@ class Reducer(Interactive):
         maps = maps_of(self, ramp)
         rates = []
         for number in progress(range(ramp.shape[0]), show=progress_bar, desc="integrations"):
-            part, own = ramp.integration(number), maps.integration(number)
-            rates.append(rate_image(self, part, own, fit_slopes(self, part, own, first=number)))
+            part = ramp.integration(number)
+            integration_maps = maps.integration(number)
+            rates.append(
+                rate_image(
+                    self,
+                    part,
+                    integration_maps,
+                    fit_slopes(self, part, integration_maps, first=number),
+                )
+            )
             rates[-1].image.meta["integration"] = number
-        return rates if planes else [rate.image for rate in rates]
+        if planes:
+            return rates
+        return [rate.image for rate in rates]
 
     def calibrate(self, rate):
         """
@@ -255,10 +272,10 @@ class Reducer(Interactive):
             if not (before := rate.meta.get("photmjsr")):
                 raise argument_error("rate", "slopes, or an image with its PHOTMJSR", "neither")
             rate = with_data(rate, rate.data / before, factor=1 / before, unit=RATE)
-        brightness, used = brightness_of(self, rate)
-        where = {"filter": facts.filter, "subarray": facts.subarray}
-        cal = calibrate(rate, **where, **brightness)
-        cal.meta.update(used)
+        brightness, references = brightness_of(self, rate)
+        mode = {"filter": facts.filter, "subarray": facts.subarray}
+        cal = calibrate(rate, **mode, **brightness)
+        cal.meta.update(references)
         return cal
 
     def subtract_background(self, image):
@@ -328,7 +345,10 @@ class Reducer(Interactive):
             or lies elsewhere on the sky.
         """
         images = [opened(image) for image in several(images)]
-        wcs = own_grid(images, _SCALE) if wcs is None else as_wcs(wcs)
+        if wcs is None:
+            wcs = own_grid(images, _SCALE)
+        else:
+            wcs = as_wcs(wcs)
         return self.drizzle(images, wcs)[0].image
 
     def drizzle(self, images, wcs):
@@ -369,14 +389,18 @@ class Reducer(Interactive):
             exposure = self.fit_ramp(exposure)
         wanted = "a Ramp, a Charge, CCDData or a path"
         check_that(isinstance(exposure, CCDData), "exposure", wanted, type(exposure).__name__)
-        rate = exposure if exposure.unit.is_equivalent(RATE) else None
+        if exposure.unit.is_equivalent(RATE):
+            rate = exposure
+        else:
+            rate = None
         if rate is None and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
             wanted = f"in {RATE} or {SURFACE_BRIGHTNESS}"
             raise argument_error("exposure", wanted, exposure.unit)
-        files, history = self.references, ExposureHistory.of(exposure)
-        given = isinstance(files, ReferenceFiles) and files.photom is not None
-        again = given and history.done("photom") and "resample" not in history.steps
-        if rate is not None or again:
+        files = self.references
+        history = ExposureHistory.of(exposure)
+        has_photom = isinstance(files, ReferenceFiles) and files.photom is not None
+        recalibrates = has_photom and history.done("photom") and "resample" not in history.steps
+        if rate is not None or recalibrates:
             exposure = self.calibrate(exposure)
         if self.background.stripes and "resample" not in history.steps:
             exposure = remove_stripes(exposure)
@@ -415,15 +439,19 @@ class Reducer(Interactive):
             If there are no ramps, of more than one filter, or one of them twice.
         """
         to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
-        rates, images, backgrounds, name = [], [], [], None
-        seen = ExposureRecord()
+        rates = []
+        images = []
+        backgrounds = []
+        name = None
+        record = ExposureRecord()
         for number, ramp in enumerate(progress(several(ramps), show=progress_bar, desc="reduce")):
             ramp = opened(ramp)
-            seen.check(f"exposure {number + 1}", ramp)
+            record.check(f"exposure {number + 1}", ramp)
             rate, subtracted, background = self.reduce(ramp)
             del ramp
             band = ImageFacts.of(subtracted).filter
-            name = band if name is None else name
+            if name is None:
+                name = band
             check_that(band == name, "ramps", f"of one filter ({name})", band)
             if rate is not None:
                 rates.append(rate)
@@ -466,5 +494,6 @@ class Reducer(Interactive):
         if self.background.sky_flat is not None and len(images) == len(backgrounds):
             images, backgrounds = flattened(self, images, backgrounds)
         if isinstance(align, str) and align == "visits":
-            (images, _), align = align_images(images, groups=map(visit_of, images)), None
+            images, _ = align_images(images, groups=map(visit_of, images))
+            align = None
         return combine(self, images, backgrounds, rates, wcs, pixel_scale, align, planes)

@@ -150,18 +150,18 @@ def rate_image(reducer, ramp, maps, fit):
     """
     ipc = shares_charge(reducer, ramp)
     # errors of the pipeline are those of pixels that share nothing
-    own = ipc and reducer.backend == "native"
+    corrected = ipc and reducer.backend == "native"
     meta = provenance(
         **exposure_values(ramp.exposure),
         n_jumps=len(fit.jumps),
         settling_groups=fit.settling,
         ipc=ipc,
-        noise_correction=fit.noise_correction(reducer.detector.ipc_kernel) if own else 1.0,
+        noise_correction=fit.noise_correction(reducer.detector.ipc_kernel) if corrected else 1.0,
         **history_of(reducer, ramp, maps).meta(),
     )
     if None not in (ramp.exposure.filter, ramp.exposure.pointing) or ramp.observed:
-        known = isinstance(ramp, Ramp)
-        meta["keywords"] = kept_keywords(ramp.header if known else keywords(ramp.exposure))
+        is_ramp = isinstance(ramp, Ramp)
+        meta["keywords"] = kept_keywords(ramp.header if is_ramp else keywords(ramp.exposure))
     rate = flagged_image(
         fit.rate, RATE, error=fit.error, flags=fit.flags, wcs=ramp.exposure.wcs, meta=meta
     )

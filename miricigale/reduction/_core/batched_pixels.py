@@ -38,28 +38,36 @@ _Y, _X, _JUMPS, _FLAGS = range(4)
 def fitting_lanes(n_int, n_diff):
     """Arrays of the lanes: differences, which are kept, scratch (3), values, pixels (-1: none)."""
     size = n_int * (n_diff + 1), LANES
-    differences, kept, values = np.zeros(size), np.zeros(size), np.ones((_N_VALUES, LANES))
-    left, right, forward = np.zeros(size), np.zeros(size), np.zeros(size)
-    return differences, kept, left, right, forward, values, np.full((LANES, 4), -1)
+    differences = np.zeros(size)
+    keep = np.zeros(size)
+    values = np.ones((_N_VALUES, LANES))
+    weights_before = np.zeros(size)
+    right = np.zeros(size)
+    forward = np.zeros(size)
+    return differences, keep, weights_before, right, forward, values, np.full((LANES, 4), -1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_lane(lanes, b, d, cut, valid, s, inv_gain, slow, shared, y, x, jumps, flags):
     """Put a pixel into a lane: its differences, which are cut, and how many each integration has."""
-    values, pixels = lanes[5], lanes[6]
+    values = lanes[5]
+    pixels = lanes[6]
     n_int = valid.size
     n_diff = d.size // n_int
-    i, used, total = 0, 0.0, 0.0
+    i = 0
+    n_kept = 0.0
+    total = 0.0
     for k in range(n_int):
         for j in range(n_diff):
-            one, kept = d[k * n_diff + j], 1.0 if j < valid[k] and not cut[k * n_diff + j] else 0.0
-            lanes[0][i, b] = one
-            lanes[1][i, b] = kept
-            used += kept
-            total += kept * one
+            difference = d[k * n_diff + j]
+            weight = 1.0 if j < valid[k] and not cut[k * n_diff + j] else 0.0
+            lanes[0][i, b] = difference
+            lanes[1][i, b] = weight
+            n_kept += weight
+            total += weight * difference
             i += 1
         i += 1
-    values[_USED, b] = used
+    values[_USED, b] = n_kept
     values[_SUM, b] = total
     values[_S, b] = s
     values[_INV_GAIN, b] = inv_gain
@@ -74,17 +82,31 @@ def fill_lane(lanes, b, d, cut, valid, s, inv_gain, slow, shared, y, x, jumps, f
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def fit_lanes(lanes):
     """Fit all lanes: slopes, sums of weights, and the difference with the largest statistic."""
-    d, keep, left, right, forward, values, _ = lanes
+    d, keep, backward, right, forward, values, _ = lanes
     n = d.shape[0]
-    s, inv_gain, slow, slope = values[_S], values[_INV_GAIN], values[_SLOW], values[_SLOPE]
-    total, squares, v, used = values[_TOTAL], values[_SQUARES], values[_V], values[_USED]
-    worst, worst_t2, sign, worst_d = values[_WORST], values[_T2], values[_SIGN], values[_D]
-    lam, eps, inv_d, inv_v = values[13], values[14], values[15], values[16]
-    swd, f, acc = values[17], values[18], values[19]
+    s = values[_S]
+    inv_gain = values[_INV_GAIN]
+    slow = values[_SLOW]
+    slope = values[_SLOPE]
+    total = values[_TOTAL]
+    squares = values[_SQUARES]
+    v = values[_V]
+    n_used = values[_USED]
+    worst = values[_WORST]
+    worst_t2 = values[_T2]
+    sign = values[_SIGN]
+    worst_d = values[_D]
+    lam = values[13]
+    eps = values[14]
+    inv_d = values[15]
+    inv_v = values[16]
+    swd = values[17]
+    f = values[18]
+    acc = values[19]
     shared = values[_SHARED]
     # start with the plain mean, then twice the weights of the last slope
     for b in range(LANES):
-        slope[b] = values[_SUM, b] / used[b]
+        slope[b] = values[_SUM, b] / n_used[b]
     for last in range(2):
         for b in range(LANES):
             v[b], lam[b], eps[b], inv_d[b] = weights(
@@ -95,7 +117,7 @@ def fit_lanes(lanes):
         for i in range(n):
             for b in range(LANES):
                 f[b] = (f[b] + (1.0 - f[b]) * eps[b]) * keep[i, b]
-                left[i, b] = f[b]
+                backward[i, b] = f[b]
             if last:
                 for b in range(LANES):
                     h = f[b] * (2.0 - f[b])
@@ -105,21 +127,23 @@ def fit_lanes(lanes):
         for i in range(n - 1, -1, -1):
             for b in range(LANES):
                 f[b] = (f[b] + (1.0 - f[b]) * eps[b]) * keep[i, b]
-                g, residual = left[i, b], d[i, b] - slope[b]
-                both = f[b] * g
+                g = backward[i, b]
+                residual = d[i, b] - slope[b]
+                product = f[b] * g
                 # f of the whole segment, from the two sides; 1 where there is none
-                full = f[b] + g - both + (1.0 - keep[i, b])
+                full = f[b] + g - product + (1.0 - keep[i, b])
                 unit = 1.0 / (full * (2.0 - full))
-                w = both * full * unit * inv_v[b]
+                w = product * full * unit * inv_v[b]
                 total[b] += w
                 swd[b] += w * residual
                 if last:
                     squares[b] += w * w
-                    h, m = g * (2.0 - g), f[b] * (2.0 - f[b])
+                    h = g * (2.0 - g)
+                    m = f[b] * (2.0 - f[b])
                     # C^-1 times residuals, its diagonal and its sum
                     forward[i, b] = (m * forward[i, b] + h * acc[b]) * (unit * inv_d[b])
                     right[i, b] = h * m * (unit * inv_d[b])
-                    left[i, b] = w
+                    backward[i, b] = w
                     acc[b] = lam[b] * (acc[b] + m * residual) * keep[i, b]
         for b in range(LANES):
             swd[b] /= total[b]
@@ -133,36 +157,41 @@ def fit_lanes(lanes):
         sign[b] = 1.0
     for i in range(n):
         for b in range(LANES):
-            w, c = left[i, b], right[i, b]
+            w = backward[i, b]
+            c = right[i, b]
             z = forward[i, b] - swd[b] * w
             p = c - w * w * inv_total[b]
             t2 = z * z / p
-            best, one = worst_t2[b], d[i, b]
+            best = worst_t2[b]
+            difference = d[i, b]
             # two differences cannot tell which of them jumped: cosmic rays go up
-            higher = (t2 >= best * (1.0 - 1e-6)) & (one > worst_d[b])
+            higher = (t2 >= best * (1.0 - 1e-6)) & (difference > worst_d[b])
             take = (p > 1e-9 * c) & ((t2 > best * (1.0 + 1e-6)) | (higher & (best >= 0.0)))
             worst_t2[b] = t2 if take else best
-            worst_d[b] = one if take else worst_d[b]
+            worst_d[b] = difference if take else worst_d[b]
             worst[b] = float(i) if take else worst[b]
             sign[b] = z if take else sign[b]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
+def settle(lanes, n_int, scale, threshold, events, n_event, free_lanes, out):
     """
     Cut the most significant jump of each fitted lane, or store what has none and free its lane.
 
     ``free`` gets the lanes that hold no pixel; returns their number, the list of jumps (see
     `fit_pixels`; grown where it is full), and the number of those.
     """
-    keep, values, pixels = lanes[1], lanes[5], lanes[6]
-    each = keep.shape[0] // n_int
+    keep = lanes[1]
+    values = lanes[5]
+    pixels = lanes[6]
+    n_rows = keep.shape[0] // n_int
     n_free = 0
     for b in range(LANES):
-        y, x = pixels[b, _Y], pixels[b, _X]
-        used = int(values[_USED, b])
+        y = pixels[b, _Y]
+        x = pixels[b, _X]
+        n_used = int(values[_USED, b])
         t2 = values[_T2, b]
-        if y >= 0 and used > 1 and t2 > threshold * threshold:
+        if y >= 0 and n_used > 1 and t2 > threshold * threshold:
             i = int(values[_WORST, b])
             keep[i, b] = 0.0
             values[_USED, b] -= 1.0
@@ -172,8 +201,8 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
                 events = np.concatenate((events, np.empty_like(events)))
             events[n_event, 0] = y
             events[n_event, 1] = x
-            events[n_event, 2] = i // each
-            events[n_event, 3] = i % each
+            events[n_event, 2] = i // n_rows
+            events[n_event, 3] = i % n_rows
             events[n_event, 4] = np.sqrt(t2) if values[_SIGN, b] > 0.0 else -np.sqrt(t2)
             n_event += 1
             if values[_SHARED, b] > 0.0:
@@ -185,18 +214,20 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
                         values[_SUM, b] -= lanes[0][j, b]
             continue
         if y >= 0:
-            jumps, flags = pixels[b, _JUMPS], pixels[b, _FLAGS]
-            if used == 0:
+            jumps = pixels[b, _JUMPS]
+            flags = pixels[b, _FLAGS]
+            if n_used == 0:
                 no_slope(out, y, x)
             else:
-                total, squares = values[_TOTAL, b], values[_SQUARES, b]
+                total = values[_TOTAL, b]
+                squares = values[_SQUARES, b]
                 noise = values[_V, b], values[_SLOW, b], values[_S, b], values[_SHARED, b]
                 store(out, y, x, values[_SLOPE, b], noise, total, squares, scale)
-            out[3][y, x] = used
+            out[3][y, x] = n_used
             out[4][y, x] = jumps
             out[5][y, x] = flags | (JUMP if jumps > 0 else 0)
             pixels[b, _Y] = -1
-        free[n_free] = b
+        free_lanes[n_free] = b
         n_free += 1
     return n_free, events, n_event
 
@@ -241,7 +272,7 @@ def fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out):
     cut = np.empty(n_int * n_diff, np.bool_)
     valid = np.empty(n_int, np.int64)
     lanes = fitting_lanes(n_int, n_diff)
-    free = np.arange(LANES)
+    free_lanes = np.arange(LANES)
     n_free = LANES
     events = np.empty((256, 5))
     i = n_event = 0
@@ -249,7 +280,7 @@ def fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out):
         if i == ys.size or n_free == 0:
             fit_lanes(lanes)
             n_free, events, n_event = settle(
-                lanes, n_int, scale, threshold, events, n_event, free, out
+                lanes, n_int, scale, threshold, events, n_event, free_lanes, out
             )
             continue
         y = ys[i]
@@ -267,7 +298,7 @@ def fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out):
             flags |= JUMP | JUMP_NEIGHBOR
         n_free -= 1
         fill_lane(
-            lanes, free[n_free], d, cut, valid, at(variance, y, x), at(inv_gain, y, x), at(slow, y, x),
+            lanes, free_lanes[n_free], d, cut, valid, at(variance, y, x), at(inv_gain, y, x), at(slow, y, x),
             shared, y, x, out[4][y, x], flags,
         )  # fmt: skip
         i += 1

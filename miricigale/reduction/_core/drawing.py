@@ -35,7 +35,8 @@ def tabulate(levels, slopes, n_int, s, true_s, inv_gain, step):
     w = np.empty(n_diff + 2)
     for k in range(n):
         slope = (levels[k, n_diff] - levels[k, 0]) / n_diff
-        total, squares = 1.0, 1.0
+        total = 1.0
+        squares = 1.0
         for _ in range(2):
             v = slope * inv_gain
             total, squares = weight_sums(n_diff, v, s)
@@ -85,7 +86,8 @@ def draw_slopes(mean, electrons, time, normals, table, offset, scale, quoted, qu
     """
     rate, var_poisson, var_read = out
     n_row, n_col = mean.shape
-    last, end = table.shape[1] - 2, quoted.shape[1] - 2
+    last = table.shape[1] - 2
+    end = quoted.shape[1] - 2
     for y, x in np.ndindex(n_row, n_col):
         m = mean[y, x]
         if m != m:
@@ -127,12 +129,17 @@ def _list(rate, hits, electrons):
     group and the electrons; in arrays with space for 64 more.
     """
     ny, nx = rate.shape
-    head, tail = np.full((ny, nx), -1, np.int32), np.empty((ny, nx), np.int32)
+    head = np.full((ny, nx), -1, np.int32)
+    tail = np.empty((ny, nx), np.int32)
     size = electrons.size + 64
-    link, slot, charge = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size)
+    link = np.empty(size, np.int32)
+    slot = np.empty(size, np.int32)
+    charge = np.empty(size)
     n = 0
     for i in range(electrons.size):
-        when, y, x = hits[0, i], hits[1, i], hits[2, i]
+        when = hits[0, i]
+        y = hits[1, i]
+        x = hits[2, i]
         if rate[y, x] != rate[y, x]:
             continue
         if head[y, x] >= 0 and slot[tail[y, x]] == when:
@@ -143,7 +150,9 @@ def _list(rate, hits, electrons):
         else:
             link[tail[y, x]] = n
         tail[y, x] = n
-        link[n], slot[n], charge[n] = -1, when, electrons[i]
+        link[n] = -1
+        slot[n] = when
+        charge[n] = electrons[i]
         n += 1
     return head, link, slot, charge, n
 
@@ -172,9 +181,11 @@ def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
             j = g - g0
             full = mean[y, x] * step * (g + 1) + charge[i] >= limit
             if 1 <= j <= n_diff and not full:
-                slope, share = rate[y, x] * step, variance[y, x] * step * step
+                slope = rate[y, x] * step
+                share = variance[y, x] * step * step
                 q = charge[i] * dn
-                v, t = slope * inv_gain, 0.0
+                v = slope * inv_gain
+                t = 0.0
                 for _ in range(2):
                     weight, leverage = difference_weight(j, n_diff, v, s)
                     t = q * math.sqrt(max(leverage - weight * weight * share, 0.0))
@@ -185,8 +196,10 @@ def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
                 t += rng.standard_normal()
                 if abs(t) > jump:
                     cut[i] = _OWN
-                    jumps[n_jump, 0], jumps[n_jump, 1] = y, x
-                    jumps[n_jump, 2], jumps[n_jump, 3] = slot[i] // n_group, j - 1
+                    jumps[n_jump, 0] = y
+                    jumps[n_jump, 1] = x
+                    jumps[n_jump, 2] = slot[i] // n_group
+                    jumps[n_jump, 3] = j - 1
                     jumps[n_jump, 4] = t
                     n_jump += 1
             i = link[i]
@@ -194,13 +207,13 @@ def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cut_neighbors(rate, entries, cut, n, jumps, own, groups, neighbor):
+def _cut_neighbors(rate, entries, cut, n, jumps, own_jumps, groups, neighbor):
     """Cut the entries beside large jumps (``own``), or new ones without charge; returns what may grow."""
     ny, nx = rate.shape
     head, link, slot, charge = entries
     _, n_group, g0, _ = groups
     for m in range(jumps.shape[0]):
-        if own[m] < neighbor:
+        if own_jumps[m] < neighbor:
             continue
         when = int(jumps[m, 2]) * n_group + g0 + 1 + int(jumps[m, 3])
         for side in range(4):
@@ -208,15 +221,23 @@ def _cut_neighbors(rate, entries, cut, n, jumps, own, groups, neighbor):
             x = int(jumps[m, 1]) + (side == 2) - (side == 3)
             if not (0 <= y < ny and 0 <= x < nx and rate[y, x] == rate[y, x]):
                 continue
-            before, i = -1, head[y, x]
+            before = -1
+            i = head[y, x]
             while i >= 0 and slot[i] < when:
-                before, i = i, link[i]
+                before = i
+                i = link[i]
             if i < 0 or slot[i] != when:
                 if n == link.size:
-                    link, slot = np.append(link, link), np.append(slot, slot)
-                    charge, cut = np.append(charge, charge), np.append(cut, cut)
-                link[n], slot[n], charge[n], cut[n] = i, when, 0.0, 0
-                i, n = n, n + 1
+                    link = np.append(link, link)
+                    slot = np.append(slot, slot)
+                    charge = np.append(charge, charge)
+                    cut = np.append(cut, cut)
+                link[n] = i
+                slot[n] = when
+                charge[n] = 0.0
+                cut[n] = 0
+                i = n
+                n = n + 1
                 if before < 0:
                     head[y, x] = i
                 else:
@@ -226,14 +247,14 @@ def _cut_neighbors(rate, entries, cut, n, jumps, own, groups, neighbor):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sums(lengths, n, v, s, whole, n_whole):
+def _sums(lengths, n, v, s, n_differences, n_whole):
     """Sums of the weights and of their squares over the segments of a pixel."""
-    total, squares = weight_sums(whole, v, s)
+    total, squares = weight_sums(n_differences, v, s)
     total *= n_whole
     squares *= n_whole
     for i in range(n):
-        one, square = weight_sums(lengths[i], v, s)
-        total += one
+        weight, square = weight_sums(lengths[i], v, s)
+        total += weight
         squares += square
     return total, squares
 
@@ -270,61 +291,68 @@ def hit_slopes(mean, hits, electrons, groups, noise, truth, thresholds, rng, out
     )
     # segments that are not whole integrations; hits that stay: segment, difference, charge
     lengths = np.empty(n_int * (n_diff + 1) + 1, np.int64)
-    kept = np.empty((n_int * n_group, 3))
+    kept_hits = np.empty((n_int * n_group, 3))
     for y, x in np.ndindex(ny, nx):
         i = head[y, x]
-        each = mean[y, x] * step
-        whole = _usable(each, 0.0, 0, limit, g0, g1)
-        if rate[y, x] != rate[y, x] or (i < 0 and whole == n_diff):
+        charge_per_group = mean[y, x] * step
+        n_usable = _usable(charge_per_group, 0.0, 0, limit, g0, g1)
+        if rate[y, x] != rate[y, x] or (i < 0 and n_usable == n_diff):
             continue
-        n_whole, n_seg, n_kept = n_int, 0, 0
-        own, beside, full = 0, False, whole < n_diff
+        n_whole = n_int
+        n_seg = 0
+        n_kept = 0
+        n_cut = 0
+        near_jump = False
+        full = n_usable < n_diff
         while i >= 0:
             k = slot[i] // n_group
             n_whole -= 1
-            begin, last, extra = 1, whole, 0.0
+            begin = 1
+            last = n_usable
+            extra = 0.0
             while i >= 0 and slot[i] // n_group == k:
                 g = slot[i] % n_group
                 j = g - g0
-                beside = beside or (cut[i] & _NEIGHBOR) > 0
+                near_jump = near_jump or (cut[i] & _NEIGHBOR) > 0
                 if j <= last:
                     extra += charge[i]
-                    last = min(last, _usable(each, extra, g, limit, g0, g1))
+                    last = min(last, _usable(charge_per_group, extra, g, limit, g0, g1))
                     if 1 <= j <= last and cut[i]:
-                        own += cut[i] & _OWN
+                        n_cut += cut[i] & _OWN
                         if j > begin:
                             lengths[n_seg] = j - begin
                             n_seg += 1
                         begin = j + 1
                     elif 1 <= j <= last:
-                        kept[n_kept, 0], kept[n_kept, 1] = n_seg, j - begin + 1
-                        kept[n_kept, 2] = charge[i]
+                        kept_hits[n_kept, 0] = n_seg
+                        kept_hits[n_kept, 1] = j - begin + 1
+                        kept_hits[n_kept, 2] = charge[i]
                         n_kept += 1
                 i = link[i]
             full = full or last < n_diff
             if last >= begin:
                 lengths[n_seg] = last - begin + 1
                 n_seg += 1
-        used = n_whole * whole
+        n_differences = n_whole * n_usable
         for m in range(n_seg):
-            used += lengths[m]
-        n_used[y, x] = used
-        n_jump[y, x] = own
-        dq[y, x] |= SATURATED * full + JUMP * (own > 0 or beside) + JUMP_NEIGHBOR * beside
-        if used == 0:
+            n_differences += lengths[m]
+        n_used[y, x] = n_differences
+        n_jump[y, x] = n_cut
+        dq[y, x] |= SATURATED * full + JUMP * (n_cut > 0 or near_jump) + JUMP_NEIGHBOR * near_jump
+        if n_differences == 0:
             rate[y, x] = var_poisson[y, x] = var_read[y, x] = np.nan
             continue
         shift = 0.0
         # the fit's weights know the slope with the hits that it keeps
         for _ in range(1 if n_kept == 0 else 3):
             v = (rate[y, x] * step + shift) * inv_gain
-            total, squares = _sums(lengths, n_seg, v, s, whole, n_whole)
+            total, squares = _sums(lengths, n_seg, v, s, n_usable, n_whole)
             shift = 0.0
             for m in range(n_kept):
-                weight, _ = difference_weight(kept[m, 1], lengths[int(kept[m, 0])], v, s)
-                shift += weight * kept[m, 2] * dn / total
-        more = max(1.0 / total - (var_poisson[y, x] + var_read[y, x]) * step * step, 0.0)
-        rate[y, x] += (shift + math.sqrt(more) * rng.standard_normal()) / step
+                weight, _ = difference_weight(kept_hits[m, 1], lengths[int(kept_hits[m, 0])], v, s)
+                shift += weight * kept_hits[m, 2] * dn / total
+        added_variance = max(1.0 / total - (var_poisson[y, x] + var_read[y, x]) * step * step, 0.0)
+        rate[y, x] += (shift + math.sqrt(added_variance) * rng.standard_normal()) / step
         var_poisson[y, x] = max(v, 0.0) * squares / (total * step) ** 2
         var_read[y, x] = max(1.0 / (total * step * step) - var_poisson[y, x], 0.0)
     return jumps

@@ -29,8 +29,8 @@ def averaged_variance(s, v, shared):
     (`shared_photons`): that of single reads with another s, which is negative where the photons count more.
     """
     total = s - shared * v
-    least = S_MIN * v
-    return least if shared > 0.0 and abs(total) < least else total
+    floor = S_MIN * v
+    return floor if shared > 0.0 and abs(total) < floor else total
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -90,24 +90,24 @@ def own_charge(jumps, nx, n_diff):
 
     ``jumps`` (n, 5) are those of `fit_pixels`, in the order of rows, columns, integrations and differences.
     """
-    own = np.abs(jumps[:, 4])
-    if own.size == 0:
-        return own
+    size = np.abs(jumps[:, 4])
+    if size.size == 0:
+        return size
     n_all = (int(jumps[:, 2].max()) + 1) * n_diff
     width = nx + 1
     key = ((jumps[:, 0] * width + jumps[:, 1]) * n_all + jumps[:, 2] * n_diff + jumps[:, 3]).astype(
         np.int64
     )
-    leaked = np.zeros(own.size)
+    leaked = np.zeros(size.size)
     # the two before, which leak and are leaked to
     for away in (1, width):
         before = np.searchsorted(key, key - away * n_all)
-        for i in range(own.size):
+        for i in range(size.size):
             j = before[i]
             if key[j] == key[i] - away * n_all:
-                leaked[i] += own[j]
-                leaked[j] += own[i]
-    return own - LEAK * leaked
+                leaked[i] += size[j]
+                leaked[j] += size[i]
+    return size - LEAK * leaked
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -120,7 +120,8 @@ def gather(data, levels, response, y, x, g0, g1, d, valid):
     # of all groups
     row = y if drift.shape[2] > 1 else 0
     channel = x % drift.shape[3]
-    start, saturation = at(bias, y, x), at(limits, y, x)
+    start = at(bias, y, x)
+    saturation = at(limits, y, x)
     coef = np.empty(coefficients.shape[0])
     for j in range(coef.size):
         coef[j] = at(coefficients[j], y, x)
@@ -128,7 +129,8 @@ def gather(data, levels, response, y, x, g0, g1, d, valid):
     for k in range(n_int):
         valid[k] = n_diff
         before = 0.0
-        reads, shift = data[k, :, y, x], drift[k, :, row, channel]
+        reads = data[k, :, y, x]
+        shift = drift[k, :, row, channel]
         anomaly = reset[min(k, reset.shape[0] - 1), :, y, x]
         signal = dark[min(k, dark.shape[0] - 1), :, y, x]
         for g in range(g0, g1):
@@ -177,7 +179,8 @@ def cut_by_flags(group_dq, y, x, g0, g1, cut, valid, averaged):
     ``group_dq`` of no groups has no flags. Returns whether a group was saturated and whether a jump was flagged.
     """
     n_diff = g1 - g0 - 1
-    saturated, jumped = False, False
+    saturated = False
+    jumped = False
     if group_dq.shape[1] == 0:
         return saturated, jumped
     for k in range(group_dq.shape[0]):

@@ -24,7 +24,8 @@ _VOTE = 0.1
 # sigma of a pixel above which sources are detected
 _DETECTED = 10.0
 # sources to solve for a shift, and for a rotation too
-_LEAST, _LEAST_ROTATION = 3, 10
+_LEAST = 3
+_LEAST_ROTATION = 10
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -118,9 +119,9 @@ def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     >>> print(f"{solution.north.to(u.arcsec):.1f}, {solution.n_matched} stars")
     -0.2 arcsec, 4 stars
     """
-    found = [(image, *_sources(image, "image"))]
+    detected = [(image, *_sources(image, "image"))]
     reach = positive(radius, ANGLE, "radius")
-    (aligned,), alignment = _aligned(found, _positions(catalog, [image]), reach, "image")
+    (aligned,), alignment = _aligned(detected, _positions(catalog, [image]), reach, "image")
     return aligned, alignment
 
 
@@ -185,29 +186,33 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
     groups = list(range(len(images)) if groups is None else groups)
     if len(groups) != len(images):
         raise argument_error("groups", f"one for each of {len(images)} images", len(groups))
-    known = None
-    out, alignments = [None] * len(images), [None] * len(images)
+    reference = None
+    out = [None] * len(images)
+    alignments = [None] * len(images)
     for group in dict.fromkeys(groups):
-        members = [k for k, one in enumerate(groups) if one == group]
-        found = [(images[k], *_sources(images[k], f"images[{k}]")) for k in members]
+        members = [k for k, name in enumerate(groups) if name == group]
+        detected = [(images[k], *_sources(images[k], f"images[{k}]")) for k in members]
         if catalog is not None:
-            known = _positions(catalog, [images[k] for k in members])
-        if known is None:
+            reference = _positions(catalog, [images[k] for k in members])
+        if reference is None:
             still = dict.fromkeys(("east", "north", "scatter"), 0 * ANGLE)
-            moved, sizes = zip(*((im, x.size) for im, x, _ in found), strict=True)
+            moved, sizes = zip(*((im, x.size) for im, x, _ in detected), strict=True)
             alignment = Alignment(**still, rotation=0 * u.deg, n_matched=sum(sizes))
         else:
-            moved, alignment = _aligned(found, known, reach, f"images[{members[0]}]")
-        for k, im, (_, x, y) in zip(members, moved, found, strict=True):
-            out[k], alignments[k] = im, alignment
+            moved, alignment = _aligned(detected, reference, reach, f"images[{members[0]}]")
+        for k, im, (_, x, y) in zip(members, moved, detected, strict=True):
+            out[k] = im
+            alignments[k] = alignment
             if catalog is None:
                 sky = im.wcs.pixel_to_world(x, y).icrs
-                if known is not None:
+                if reference is not None:
                     # what is there already stays as it is
-                    _, apart, _ = sky.match_to_catalog_sky(known)
-                    sky = sky[apart.to_value(ANGLE) > 0.5]
-                    sky = SkyCoord(np.append(known.ra, sky.ra), np.append(known.dec, sky.dec))
-                known = sky
+                    _, separation, _ = sky.match_to_catalog_sky(reference)
+                    sky = sky[separation.to_value(ANGLE) > 0.5]
+                    sky = SkyCoord(
+                        np.append(reference.ra, sky.ra), np.append(reference.dec, sky.dec)
+                    )
+                reference = sky
     return out, alignments
 
 
@@ -229,7 +234,10 @@ def _positions(catalog, images):
     days = [np.nan if epoch is None else epoch.utc.mjd for epoch in epochs]
     # of any without a time the mean is unknown
     day = np.mean(days)
-    epoch = Time(day, format="mjd", scale="utc") if np.isfinite(day) else None
+    if np.isfinite(day):
+        epoch = Time(day, format="mjd", scale="utc")
+    else:
+        epoch = None
     return at_epoch(catalog, epoch, "catalog")
 
 
@@ -244,64 +252,73 @@ def _sources(image, argument):
     name = ImageFacts.of(image).filter
     check_that(name is not None, argument, "one whose meta names its filter", "none")
     width = psf_fwhm(name).to_value(ANGLE) / scale / 2.3548
-    mask, background = plain_mask(image), estimate_background(image, warn=False)
+    mask = plain_mask(image)
+    background = estimate_background(image, warn=False)
     data = np.where(mask, 0, image.data - background.level)
     try:
-        found, _ = sep_tools.extract(data, _DETECTED, err=background.rms, mask=mask)
+        detected, _ = sep_tools.extract(data, _DETECTED, err=background.rms, mask=mask)
     except ValueError as err:
         # more peaks in one area than sep can tell apart
         raise argument_error(argument, "one whose sources can be told apart", str(err)) from None
     # the edge, and what is masked, cuts sources
-    x, y, fine = sep_tools.window_positions(data, found["x"], found["y"], width, mask=mask)
-    moved = np.hypot(x - found["x"], y - found["y"])
-    good = fine & (moved < width) & (found["flag"] == 0)
+    x, y, fine = sep_tools.window_positions(data, detected["x"], detected["y"], width, mask=mask)
+    moved = np.hypot(x - detected["x"], y - detected["y"])
+    good = fine & (moved < width) & (detected["flag"] == 0)
     return x[good], y[good]
 
 
-def _aligned(found, catalog, radius, argument):
+def _aligned(detected, catalog, radius, argument):
     """Images, with pixels of their sources, moved together to a catalog: the images, and by how much."""
     # plane about the reference position of the first, deg, east and north
-    plane, first = WCS(naxis=2), found[0][0].wcs.wcs
+    plane = WCS(naxis=2)
+    first = detected[0][0].wcs.wcs
     plane.wcs.ctype = "RA---TAN", "DEC--TAN"
-    plane.wcs.crval, plane.wcs.crpix = first.crval, (1.0, 1.0)
+    plane.wcs.crval = first.crval
+    plane.wcs.crpix = (1.0, 1.0)
     plane.wcs.cdelt = 1.0, 1.0
-    seen = [im.wcs.pixel_to_world(x, y).icrs for im, x, y in found if x.size]
-    places = [(one.ra.deg, one.dec.deg) for one in seen] or [([], [])]
+    positions = [im.wcs.pixel_to_world(x, y).icrs for im, x, y in detected if x.size]
+    places = [(coordinates.ra.deg, coordinates.dec.deg) for coordinates in positions] or [([], [])]
     sky = SkyCoord(*np.concatenate(places, axis=1), unit="deg")
-    i, j, *_ = search_around_sky(sky, catalog, radius * ANGLE) if len(sky) else ([], [])
-    one, other = (
+    if len(sky):
+        i, j, *_ = search_around_sky(sky, catalog, radius * ANGLE)
+    else:
+        i, j, *_ = ([], [])
+    coordinates, target = (
         np.stack(plane.world_to_pixel(s[k]), axis=1) * 3600 if len(k) else np.empty((0, 2))
         for s, k in ((sky, i), (catalog, j))
     )
-    shift = other - one
-    used = np.zeros(len(shift), bool)
+    shift = target - coordinates
+    matched = np.zeros(len(shift), bool)
     if len(shift):
         tree = KDTree(shift)
         votes = tree.query_ball_point(shift, _VOTE, return_length=True)
         # of several shifts that are as frequent one: between them there are none
-        near = tree.query_ball_point(shift[np.argmax(votes)], _VOTE)
-        used = np.hypot(*(shift - np.median(shift[near], axis=0)).T) < _VOTE
-    turn, move, residual = 0.0, np.zeros(2), shift
+        neighbors = tree.query_ball_point(shift[np.argmax(votes)], _VOTE)
+        matched = np.hypot(*(shift - np.median(shift[neighbors], axis=0)).T) < _VOTE
+    turn = 0.0
+    move = np.zeros(2)
+    residual = shift
     for _ in range(5):
         wanted = f"one with at least {_LEAST} sources of the catalog within {radius:g} arcsec"
-        got = f"{np.count_nonzero(used)} of {len(sky)} sources"
-        check_that(np.count_nonzero(used) >= _LEAST, argument, wanted, got)
-        turn, move = _solved(one[used], other[used])
-        residual = other - one @ _rotation(turn).T - move
-        spread = np.sqrt(np.mean(np.square(residual[used])))
+        got = f"{np.count_nonzero(matched)} of {len(sky)} sources"
+        check_that(np.count_nonzero(matched) >= _LEAST, argument, wanted, got)
+        turn, move = _solved(coordinates[matched], target[matched])
+        residual = target - coordinates @ _rotation(turn).T - move
+        spread = np.sqrt(np.mean(np.square(residual[matched])))
         new = np.hypot(*residual.T) < max(3 * spread, 1e-6)
-        if np.array_equal(new, used):
+        if np.array_equal(new, matched):
             break
-        used = new
+        matched = new
     alignment = Alignment(
         east=move[0] * ANGLE,
         north=move[1] * ANGLE,
         rotation=np.degrees(turn) * u.deg,
-        n_matched=int(np.count_nonzero(used)),
-        scatter=float(np.sqrt(np.mean(np.square(residual[used])))) * ANGLE,
+        n_matched=int(np.count_nonzero(matched)),
+        scatter=float(np.sqrt(np.mean(np.square(residual[matched])))) * ANGLE,
     )
-    matrix, out = _rotation(turn), []
-    for im, *_ in found:
+    matrix = _rotation(turn)
+    out = []
+    for im, *_ in detected:
         new = with_data(im, im.data, n_aligned=alignment.n_matched)
         new.wcs = wcs = im.wcs.deepcopy()
         if wcs.wcs.has_cd():
@@ -318,14 +335,16 @@ def _aligned(found, catalog, radius, argument):
 
 def _rotation(turn):
     """Matrix of a turn from north to east, of places (east, north)."""
-    cos, sin = np.cos(turn), np.sin(turn)
+    cos = np.cos(turn)
+    sin = np.sin(turn)
     return np.array([[cos, sin], [-sin, cos]])
 
 
-def _solved(one, other):
+def _solved(places, targets):
     """Turn from north to east, and shift, that bring places to others."""
     turn = 0.0
-    if len(one) >= _LEAST_ROTATION:
-        a, b = one - one.mean(axis=0), other - other.mean(axis=0)
+    if len(places) >= _LEAST_ROTATION:
+        a = places - places.mean(axis=0)
+        b = targets - targets.mean(axis=0)
         turn = np.arctan2(np.sum(a[:, 1] * b[:, 0] - a[:, 0] * b[:, 1]), np.sum(a * b))
-    return turn, (other - one @ _rotation(turn).T).mean(axis=0)
+    return turn, (targets - places @ _rotation(turn).T).mean(axis=0)

@@ -58,9 +58,9 @@ def subtract_dithers(reducer, images, alone=None, wcs=None):
     """As `~miricigale.reduction.Reducer.subtract_dithers`; ``alone`` is the background of each image by itself."""
     if alone is None:
         alone = [estimate_background(im, warn=False, **reducer.background.mesh) for im in images]
-    backgrounds = [
-        subtractable(background) for background in dither_backgrounds(images, alone, wcs=wcs)
-    ]
+    backgrounds = []
+    for background in dither_backgrounds(images, alone, wcs=wcs):
+        backgrounds.append(subtractable(background))
     pairs = zip(images, backgrounds, strict=True)
     return [remove_background(*pair, **reducer.background.negative) for pair in pairs], backgrounds
 
@@ -90,27 +90,37 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
     wcs = as_wcs(wcs)
     notes = []
     if reducer.mosaics.outlier_threshold is not None and len(images) < 3:
-        number = "a single dither" if len(images) == 1 else "two dithers"
+        if len(images) == 1:
+            number = "a single dither"
+        else:
+            number = "two dithers"
         notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
     if reducer.background.method == "dithers":
         if len(images) >= 3 and len(backgrounds) == len(images):
-            whole = [restored(im, b.level) for im, b in zip(images, backgrounds, strict=True)]
-            images, backgrounds = subtract_dithers(reducer, whole, backgrounds, wcs)
+            unsubtracted = [
+                restored(im, b.level) for im, b in zip(images, backgrounds, strict=True)
+            ]
+            images, backgrounds = subtract_dithers(reducer, unsubtracted, backgrounds, wcs)
         else:
             notes.append("backgrounds are those of single exposures: it takes three and theirs")
     doubts = [b for b in backgrounds if not b.trusted]
     if doubts:
         doubt = f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted"
         notes.append(f"{doubt} ({_reasons(doubts)})")
-    known = len(backgrounds) == len(images)
-    whole = [im.data + b.level for im, b in zip(images, backgrounds, strict=True)] if known else []
+    has_backgrounds = len(backgrounds) == len(images)
+    if has_backgrounds:
+        unsubtracted = [im.data + b.level for im, b in zip(images, backgrounds, strict=True)]
+    else:
+        unsubtracted = []
     drizzled, images = drizzle(reducer.mosaics, images, wcs, planes)
     mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
     subtracted = mosaic_background.level
-    if known:
+    if has_backgrounds:
         # of the exposures too, and what brought them to one level
-        taken = [with_data(im, data - im.data) for im, data in zip(images, whole, strict=True)]
-        levels = drizzle_images(taken, wcs, pixfrac=reducer.mosaics.pixfrac).image
+        removed = [
+            with_data(im, data - im.data) for im, data in zip(images, unsubtracted, strict=True)
+        ]
+        levels = drizzle_images(removed, wcs, pixfrac=reducer.mosaics.pixfrac).image
         subtracted = subtracted + np.where(levels.mask, 0, levels.data)
     if not mosaic_background.trusted:
         reasons = _reasons([mosaic_background])
@@ -120,7 +130,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
         mosaic.meta[f"mosaic_{key}"] = mosaic.meta.pop(key, None)
         if key in drizzled.image.meta:
             mosaic.meta[key] = drizzled.image.meta[key]
-    made = (
+    products = (
         tuple(rates),
         tuple(images),
         tuple(backgrounds),
@@ -128,10 +138,12 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
         drizzled.weight,
         drizzled.n_images,
     )
-    return ReductionResult(*made, mosaic_background, subtracted, tuple(notes), drizzled.variances)
+    return ReductionResult(
+        *products, mosaic_background, subtracted, tuple(notes), drizzled.variances
+    )
 
 
 def _reasons(backgrounds):
     """Why backgrounds cannot be trusted."""
-    names = {name for one in backgrounds for name in BackgroundFlags.names(one.flags)}
+    names = {name for background in backgrounds for name in BackgroundFlags.names(background.flags)}
     return ", ".join(sorted(names)).replace("_", " ")

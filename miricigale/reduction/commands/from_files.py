@@ -103,7 +103,8 @@ def reduce_files(
     >>> table = reduce_files(files, "reduced", reducer=reducer)  # doctest: +SKIP
     """
     paths = [Path(path) for path in paths]
-    reducer = Reducer() if reducer is None else reducer
+    if reducer is None:
+        reducer = Reducer()
     to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
     check_that(paths, "paths", "at least one file", "none")
     stems = [_stem(path) for path in paths]
@@ -118,11 +119,11 @@ def reduce_files(
         reduction = _Reduction(reducer, products, _settings(reducer), resume, integrations)
         rows = []
         members = {}
-        seen = ExposureRecord()
+        record = ExposureRecord()
         for path in progress(paths, show=progress_bar, desc="reduce"):
-            same = seen.add_file(path)
-            if same is not None:
-                reason = f"the same exposure as {same}"
+            duplicate = record.add_file(path)
+            if duplicate is not None:
+                reason = f"the same exposure as {duplicate}"
                 log.warning("%s is left out: %s", path, reason)
                 rows.append({"file": str(path), "filter": "", "status": "failed", "reason": reason})
                 continue
@@ -155,7 +156,9 @@ def _name_parts(path):
     """Name of a file without its suffix of the stage, and the stage; an empty one if the name has none."""
     stem = path.name.removesuffix(".gz").removesuffix(".fits")
     head, _, stage = stem.rpartition("_")
-    return (head, stage) if head and stage in _STAGES else (stem, "")
+    if head and stage in _STAGES:
+        return (head, stage)
+    return (stem, "")
 
 
 def _stem(path):
@@ -178,7 +181,9 @@ def _product_names(path, integrations):
     except OSError:
         # what is wrong is said when the file is reduced
         return names
-    return names if band is None else [*names, _mosaic_name(str(band))]
+    if band is None:
+        return names
+    return [*names, _mosaic_name(str(band))]
 
 
 def _mosaic_name(band):
@@ -186,17 +191,19 @@ def _mosaic_name(band):
 
 
 def _reason(err):
-    text = str(err.args[0]) if isinstance(err, KeyError) and err.args else str(err)
+    if isinstance(err, KeyError) and err.args:
+        text = str(err.args[0])
+    else:
+        text = str(err)
     return " ".join(text.split()) or type(err).__name__
 
 
 def _settings(reducer):
     """What the products depend on: settings, and the content of reference files."""
-    values = {
-        field.name: repr(getattr(reducer, field.name))
-        for field in dataclasses.fields(reducer)
-        if field.name != "n_threads"
-    }
+    values = {}
+    for field in dataclasses.fields(reducer):
+        if field.name != "n_threads":
+            values[field.name] = repr(getattr(reducer, field.name))
     if isinstance(reducer.references, ReferenceFiles):
         for name in reducer.references.names():
             if isinstance(path := getattr(reducer.references, name), Path):
@@ -301,7 +308,8 @@ class _Reduction:
 def _show(page, path, members, notes):
     """Put the mosaic and its exposures on the page."""
     file = read_images(path)[0]
-    image, meta = file.image, file.image.meta
+    image = file.image
+    meta = file.image.meta
     band = meta["filter"].rpartition(".")[2].upper()
     page.section("mosaic", band=band, notes=" ".join(f"{note}." for note in notes))
     good = ~image.mask
@@ -329,23 +337,25 @@ def _show(page, path, members, notes):
 
 def _levels(members):
     metas = [read_images(cal)[0].image.meta for cal, _ in members]
-    known = [
-        f"{meta['background']:.4g} ± {meta.get('background_error', np.nan):.1g} "
-        + " ".join(meta.get("background_flags", []))
-        for meta in metas
-        if "background" in meta
-    ]
-    return ", ".join(map(str.strip, known)) + " MJy/sr" if known else "not known"
+    levels = []
+    for meta in metas:
+        if "background" in meta:
+            levels.append(
+                f"{meta['background']:.4g} ± {meta.get('background_error', np.nan):.1g} "
+                + " ".join(meta.get("background_flags", []))
+            )
+    if levels:
+        return ", ".join(map(str.strip, levels)) + " MJy/sr"
+    return "not known"
 
 
 def _references(meta):
     """The references that all exposures share."""
-    found = {
-        key.removeprefix("reference_"): text
-        for key, text in meta.items()
-        if key.startswith("reference_")
-    }
-    return "; ".join(f"{name}: {text}" for name, text in found.items()) or "differ, or not known"
+    names = {}
+    for key, text in meta.items():
+        if key.startswith("reference_"):
+            names[key.removeprefix("reference_")] = text
+    return "; ".join(f"{name}: {text}" for name, text in names.items()) or "differ, or not known"
 
 
 def _list(page, table):

@@ -141,12 +141,18 @@ def read_images(path):
         if "SCI" not in hdus or hdus["SCI"].header.get("NAXIS") not in (2, 3):
             raise data_error(path, f"cannot be read as {_WANTED}: it has no image in SCI")
         header = joined_header(hdus)
-        own = json.loads(header["META"]) if "META" in header else None
-        check_imager(path, header, own=own)
+        if "META" in header:
+            own_meta = json.loads(header["META"])
+        else:
+            own_meta = None
+        check_imager(path, header, own=own_meta)
         shape = hdus["SCI"].shape
         check_memory(24 * np.prod(shape, dtype=float), f"the image {path}", advice="cut it")
         unit = _unit(hdus["SCI"].header, path)
-        meta = _meta(header, path) if own is None else own
+        if own_meta is None:
+            meta = _meta(header, path)
+        else:
+            meta = own_meta
         meta.setdefault("keywords", kept_keywords(header))
         wcs = _wcs(hdus, header, meta)
         data = _plane(hdus, "SCI", shape, path)
@@ -158,16 +164,17 @@ def read_images(path):
     if error is not None and not np.any(np.isfinite(error) & (error > 0)):
         refused = "has no error in ERR, which is nowhere finite and above 0"
         if not any(name in planes for name in _VARIANCES):
-            hint = (
-                "photometry.read_mosaic takes the errors of WHT" if "WHT" in planes else "mend it"
-            )
+            if "WHT" in planes:
+                hint = "photometry.read_mosaic takes the errors of WHT"
+            else:
+                hint = "mend it"
             raise data_error(path, f"{refused}, and no variances: {hint}")
         error = None
     if error is None and (parts := [planes[name] for name in _VARIANCES if name in planes]):
         error = np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
     out = []
     for number in range(shape[0]) if len(shape) == 3 else (...,):
-        one = flagged_image(
+        integration = flagged_image(
             data[number],
             unit,
             error=None if error is None else error[number],
@@ -176,11 +183,13 @@ def read_images(path):
             meta=meta if number is ... else {**meta, "integration": number},
             mask=~(planes["WHT"][number] > 0) if "WHT" in planes else False,
         )
-        part = {
-            name: plane if name == "CON" or plane.shape != shape else plane[number]
-            for name, plane in planes.items()
-        }
-        out.append(ImageFile(one, part, header))
+        part = {}
+        for name, plane in planes.items():
+            if name == "CON" or plane.shape != shape:
+                part[name] = plane
+            else:
+                part[name] = plane[number]
+        out.append(ImageFile(integration, part, header))
     return out
 
 
@@ -209,7 +218,9 @@ def open_exposure(path):
     >>> exposure = open_exposure("jw01180001001_02101_00001_mirimage_uncal.fits")  # doctest: +SKIP
     """
     exposure = open_file(path)
-    return exposure if isinstance(exposure, Ramp) else exposure.image
+    if isinstance(exposure, Ramp):
+        return exposure
+    return exposure.image
 
 
 def open_file(path):
@@ -219,12 +230,15 @@ def open_file(path):
     if ramp:
         return Ramp.read(path)
     files = read_images(path)
-    return files[0] if len(files) == 1 else _mean(files)
+    if len(files) == 1:
+        return files[0]
+    return _mean(files)
 
 
 def _mean(files):
     """Mean of the integrations of an exposure; its flags are those of any, DO_NOT_USE those of all."""
-    images, error = [file.image for file in files], None
+    images = [file.image for file in files]
+    error = None
     first = images[0]
     mask = np.array([im.mask for im in images])
     count = np.ma.masked_equal(np.count_nonzero(~mask, axis=0), 0)
@@ -246,41 +260,52 @@ def _mean(files):
         wcs=first.wcs,
         meta=shared_meta(first),
     )
-    planes = {
-        name: (total([file.planes[name] for file in files]) / count**2).filled(np.nan)
-        for name in _VARIANCES
-        if name in files[0].planes
-    }
+    planes = {}
+    for name in _VARIANCES:
+        if name in files[0].planes:
+            planes[name] = (total([file.planes[name] for file in files]) / count**2).filled(np.nan)
     return ImageFile(image, planes, files[0].header)
 
 
 def scaled_planes(planes, before, after):
     """Variances and areas of an image, after it was multiplied as its errors say."""
-    kept = {"AREA": planes["AREA"]} if "AREA" in planes else {}
+    if "AREA" in planes:
+        scaled = {"AREA": planes["AREA"]}
+    else:
+        scaled = {}
     if before.uncertainty is None:
-        return kept
+        return scaled
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.square(sigma(after) / sigma(before))
-    return kept | {name: planes[name] * factor for name in _VARIANCES if name in planes}
+    return scaled | {name: planes[name] * factor for name in _VARIANCES if name in planes}
 
 
-def shared_meta(one):
+def shared_meta(entry):
     """The meta dictionary of an exposure, of an image of one of its integrations."""
-    return {key: value for key, value in one.meta.items() if key != "integration"}
+    return {key: value for key, value in entry.meta.items() if key != "integration"}
 
 
 def _unit(header, path):
     """Unit of an image; DN is what astropy's CCDData and this package call adu."""
     text = str(header.get("BUNIT", "")).strip()
     try:
-        unit = u.Unit(text.replace("counts", "DN")) if text else None
+        if text:
+            unit = u.Unit(text.replace("counts", "DN"))
+        else:
+            unit = None
     except ValueError:
         unit = None
     brightness = SURFACE_BRIGHTNESS
-    for known, own in ((u.Unit("DN/s"), RATE), (RATE, RATE), (brightness, brightness)):
-        if unit is not None and unit.is_equivalent(known):
-            factor = unit.to(known)
-            return own if factor == 1 else u.Unit(factor * own)
+    for stated_unit, unit_inside in (
+        (u.Unit("DN/s"), RATE),
+        (RATE, RATE),
+        (brightness, brightness),
+    ):
+        if unit is not None and unit.is_equivalent(stated_unit):
+            factor = unit.to(stated_unit)
+            if factor == 1:
+                return unit_inside
+            return u.Unit(factor * unit_inside)
     wanted = "must state in BUNIT that it is a rate (DN/s, adu/s) or a surface brightness (MJy/sr)"
     raise data_error(path, f"{wanted}, got {text!r}")
 
@@ -290,11 +315,20 @@ def _plane(hdus, name, shape, path):
         return None
     data = hdus[name].data
     # maps and counts are those of all integrations
-    same = slice(-2, None) if name in ("CON", "AREA") else slice(None)
-    if data is None or data.shape[same] != shape[same]:
-        got = None if data is None else data.shape
+    if name in ("CON", "AREA"):
+        last_axes = slice(-2, None)
+    else:
+        last_axes = slice(None)
+    if data is None or data.shape[last_axes] != shape[last_axes]:
+        if data is None:
+            got = None
+        else:
+            got = data.shape
         raise data_error(path, f"must have {shape} pixels in {name}, as in SCI, got {got}")
-    kind = data.dtype.newbyteorder("=") if data.dtype.kind in "iu" else np.float32
+    if data.dtype.kind in "iu":
+        kind = data.dtype.newbyteorder("=")
+    else:
+        kind = np.float32
     return np.array(data, kind)
 
 
@@ -321,7 +355,10 @@ def _flags(hdus, shape, path):
         return np.zeros(shape, np.int64)
     hdu = hdus["DQ"]
     # planes without our legend are JWST's own
-    flags = read_dq(hdu) if "DQSCHEME" in hdu.header else np.asarray(hdu.data).astype(np.int64)
+    if "DQSCHEME" in hdu.header:
+        flags = read_dq(hdu)
+    else:
+        flags = np.asarray(hdu.data).astype(np.int64)
     if flags.shape != shape:
         raise data_error(path, f"must have {shape} pixels in DQ, as in SCI, got {flags.shape}")
     return with_own_bits(flags, hdus)
@@ -331,7 +368,8 @@ def _meta(header, path):
     """Facts of an image from the keywords of JWST."""
     meta = {name: header[key] for key, name in _META.items() if header.get(key) is not None}
     name, readout, part, meta["dither"] = exposure_keywords(header)
-    part = part if part in subarrays() else None
+    if part not in subarrays():
+        part = None
     stated = {"filter": name, "subarray": part, "readout": readout}
     meta |= {key: value for key, value in stated.items() if value is not None}
     meta |= ExposureHistory.from_header(header).meta()
@@ -362,19 +400,25 @@ def opened(given):
     """An exposure of its file or data model; anything else itself."""
     if is_data_model(given):
         return read_data_model(given, open_exposure)
-    return open_exposure(given) if isinstance(given, (str, os.PathLike)) else given
+    if isinstance(given, (str, os.PathLike)):
+        return open_exposure(given)
+    return given
 
 
-def several(given):
+def several(exposures):
     """Exposures of one, of a pattern of files, or of several."""
-    if isinstance(given, str) and glob.has_magic(given) and not os.path.exists(given):
-        paths = sorted(glob.glob(os.path.expanduser(given)))
+    if isinstance(exposures, str) and glob.has_magic(exposures) and not os.path.exists(exposures):
+        paths = sorted(glob.glob(os.path.expanduser(exposures)))
         if not paths:
-            msg = f"no file is called {given}"
+            msg = f"no file is called {exposures}"
             raise DataError(msg)
         return paths
-    if isinstance(given, (str, os.PathLike)) and os.path.isdir(given):
-        wanted = f"files, such as {os.path.join(given, '*_uncal.fits')!r}"
+    if isinstance(exposures, (str, os.PathLike)) and os.path.isdir(exposures):
+        wanted = f"files, such as {os.path.join(exposures, '*_uncal.fits')!r}"
         raise argument_error("ramps", wanted, "a folder")
-    one = isinstance(given, (str, os.PathLike, Ramp, Charge, CCDData)) or is_data_model(given)
-    return [given] if one else given
+    is_single = isinstance(exposures, (str, os.PathLike, Ramp, Charge, CCDData)) or is_data_model(
+        exposures
+    )
+    if is_single:
+        return [exposures]
+    return exposures

@@ -72,7 +72,8 @@ def write_image(image, path, *, planes=None, overwrite=False):
     """
     path = Path(path)
     image, planes, wcs = _joined(image, planes or {})
-    meta, cal = image.meta, image.unit.is_equivalent(SURFACE_BRIGHTNESS)
+    meta = image.meta
+    cal = image.unit.is_equivalent(SURFACE_BRIGHTNESS)
     primary, science = placed_keywords(meta.get("keywords", {}), wcs=False)
     keywords = {
         "TELESCOP": "JWST", "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE", "EXP_TYPE": "MIR_IMAGE",
@@ -85,7 +86,10 @@ def write_image(image, path, *, planes=None, overwrite=False):
     primary.update({key: value for key, value in keywords.items() if value is not None})
     # as the pipeline writes them; astropy takes DN/s for another unit than adu/s
     names = {RATE: "DN/s", SURFACE_BRIGHTNESS: "MJy/sr"}
-    unit = next((n for own, n in names.items() if image.unit == own), image.unit.to_string("fits"))
+    unit = next(
+        (n for image_unit, n in names.items() if image.unit == image_unit),
+        image.unit.to_string("fits"),
+    )
     science["BUNIT"] = unit
     science["META"] = json_meta(meta)
     names = {"PHOTMJSR": "photmjsr", "PA_APER": "pa_aper", "XPOSURE": "exposure_time"}
@@ -95,9 +99,9 @@ def write_image(image, path, *, planes=None, overwrite=False):
     extension = asdf_extension()
     if wcs is not None:
         # what is no WCS keyword of this image confuses
-        known = {*science, "DATE-OBS", "MJD-OBS", "TIMESYS"}
+        written = {*science, "DATE-OBS", "MJD-OBS", "TIMESYS"}
         sky = wcs.to_header(relax=True).cards
-        science.extend(card for card in sky if card.keyword not in known)
+        science.extend(card for card in sky if card.keyword not in written)
         primary["S_WCS"] = "COMPLETE"
         ny, nx = image.shape[-2:]
         x = np.array([-0.5, -0.5, nx - 0.5, nx - 0.5])
@@ -151,12 +155,17 @@ def _nominal_area():
 
 def _joined(image, planes):
     """Image, planes and WCS that are written of an image, of one with planes, or of integrations."""
-    several = isinstance(image, (list, tuple))
-    files = [
-        part if isinstance(part, ImageFile) else ImageFile(part, {}, fits.Header())
-        for part in (image if several else [image])
-    ]
-    first = files[0].image if files else None
+    is_cube = isinstance(image, (list, tuple))
+    files = []
+    for part in image if is_cube else [image]:
+        if isinstance(part, ImageFile):
+            files.append(part)
+        else:
+            files.append(ImageFile(part, {}, fits.Header()))
+    if files:
+        first = files[0].image
+    else:
+        first = None
     alike = all(
         file.image.shape == first.shape
         and file.image.unit == first.unit
@@ -164,10 +173,10 @@ def _joined(image, planes):
         and set(file.planes) == set(files[0].planes)
         for file in files
     )
-    if not files or (several and not alike):
+    if not files or (is_cube and not alike):
         wanted = "integrations of one shape and unit, with errors and the same planes"
         raise argument_error("image", wanted, f"{len(files)} others")
-    if not several:
+    if not is_cube:
         return first, {**files[0].planes, **planes}, first.wcs
 
     def cube(values):
@@ -182,5 +191,5 @@ def _joined(image, planes):
         meta=shared_meta(first),
         mask=cube(lambda file: plain_mask(file.image)),
     )
-    own = {name: cube(lambda file, n=name: file.planes[n]) for name in files[0].planes}
-    return joined, {**own, **planes}, first.wcs
+    cubes = {name: cube(lambda file, n=name: file.planes[n]) for name in files[0].planes}
+    return joined, {**cubes, **planes}, first.wcs

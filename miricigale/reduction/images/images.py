@@ -28,7 +28,9 @@ def flagged_image(data, unit, *, error, flags, wcs, meta, mask=False):
 def plain_mask(image):
     """Mask of an image as a bool array, with pixels that are not finite."""
     bad = ~np.isfinite(image.data)
-    return bad if image.mask is None else bad | np.asarray(image.mask, bool)
+    if image.mask is None:
+        return bad
+    return bad | np.asarray(image.mask, bool)
 
 
 def plain_flags(image):
@@ -68,12 +70,12 @@ def with_data(source, data, *, factor=None, unit=None, **meta):
     )
 
 
-def flag_pixels(source, where, flag):
+def flag_pixels(source, selected, flag):
     """Copy an image with ``flag`` set, and masked if the flag says so, where ``where``."""
     out = with_data(source, source.data)
-    out.flags[where] |= int(flag)
+    out.flags[selected] |= int(flag)
     if flag & DQ.DO_NOT_USE:
-        out.mask |= where
+        out.mask |= selected
     return out
 
 
@@ -136,12 +138,13 @@ def check_alike(images):
 
 def check_overlap(pixel_maps, shape):
     """Refuse a grid that no image touches."""
-    if not any(overlaps(where, shape) for where in pixel_maps):
+    if not any(overlaps(pixels, shape) for pixels in pixel_maps):
         got = "one elsewhere on the sky: no image touches it"
         raise argument_error("wcs", "a grid that overlaps the images", got)
 
 
-def overlaps(where, shape):
+def overlaps(pixel_map, shape):
     """Whether an image's pixels come within half a pixel of a grid (NaN does not)."""
-    (x, y), (ny, nx) = where, shape
+    x, y = pixel_map
+    ny, nx = shape
     return bool(np.any((x > -1) & (x < nx) & (y > -1) & (y < ny)))

@@ -52,22 +52,30 @@ class ExposureRecord:
             The name of the first one that it repeats.
         """
         data = np.ascontiguousarray(data)
-        same = None
-        first = data.flat[0] if data.size else 0
+        duplicate = None
+        if data.size:
+            first = data.flat[0]
+        else:
+            first = 0
         if not np.all(data == first):
-            same = self._data.setdefault(hashlib.sha256(data).hexdigest(), name)
+            duplicate = self._data.setdefault(hashlib.sha256(data).hexdigest(), name)
         words = tuple(str(header.get(key)) for key in _NAMES)
         if header.get("EXPSTART") is not None and header.get("PROGRAM") is not None:
-            other, before = self._keywords.setdefault(words, (name, stage))
-            if (not _is_simulated(header) or before != stage) and same in (None, name):
-                same = other
-        return None if same == name else same
+            first_name, before = self._keywords.setdefault(words, (name, stage))
+            if (not _is_simulated(header) or before != stage) and duplicate in (None, name):
+                duplicate = first_name
+        if duplicate == name:
+            return None
+        return duplicate
 
     def add_file(self, path):
         """As `add`, of a FITS file with an image or ramp in SCI; None for what is no such file."""
         try:
             with open_fits(path, wanted="an exposure") as hdus:
-                science = hdus["SCI"] if "SCI" in hdus else hdus[0]
+                if "SCI" in hdus:
+                    science = hdus["SCI"]
+                else:
+                    science = hdus[0]
                 if science.data is None:
                     return None
                 header = joined_header(hdus)
@@ -83,16 +91,23 @@ class ExposureRecord:
         if data is None or np.ndim(data) < 2:
             return
         meta = getattr(exposure, "meta", None) or {}
-        kept = meta.get("keywords", {})
-        header = {key: card[0] if isinstance(card, list) else card for key, card in kept.items()}
+        keywords = meta.get("keywords", {})
+        header = {}
+        for key, card in keywords.items():
+            if isinstance(card, list):
+                header[key] = card[0]
+            else:
+                header[key] = card
         if getattr(exposure, "observed", False):
             header = exposure.header
         if ExposureHistory.of(exposure).origin != "other":
             header["ORIGIN"] = ORIGIN
         stage = f"{np.ndim(data)} {getattr(exposure, 'unit', None)}"
-        same = self.add(name, np.asarray(data), header, stage)
-        if same is not None:
-            raise argument_error("ramps", "exposures that differ", f"{name}, the same as {same}")
+        duplicate = self.add(name, np.asarray(data), header, stage)
+        if duplicate is not None:
+            raise argument_error(
+                "ramps", "exposures that differ", f"{name}, the same as {duplicate}"
+            )
 
 
 def _is_simulated(header):

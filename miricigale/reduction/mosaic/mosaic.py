@@ -144,24 +144,26 @@ def pixel_map(wcs_in, wcs_out, shape):
     if smooth and min(ny, nx) > _NODES:
         nodes_y, nodes_x = (np.linspace(0, n - 1, _NODES) for n in (ny, nx))
     else:
-        nodes_y, nodes_x = np.arange(ny, dtype=float), np.arange(nx, dtype=float)
+        nodes_y = np.arange(ny, dtype=float)
+        nodes_x = np.arange(nx, dtype=float)
     grid_x, grid_y = np.meshgrid(nodes_x, nodes_y)
     sky = pixel_to_radec(wcs_in, grid_x.ravel(), grid_y.ravel())
     world = radec_axes(wcs_out, *sky)
     try:
-        found = wcs_out.all_world2pix(*world, 0)
+        pixels = wcs_out.all_world2pix(*world, 0)
     except NoConvergence:
         wanted = "a WCS whose distortion can be inverted where the image lies"
         raise argument_error(
             "wcs_out (the grid's wcs)", wanted, "one that diverges there"
         ) from None
-    x, y = (np.reshape(values, grid_x.shape) for values in found)
+    x, y = (np.reshape(values, grid_x.shape) for values in pixels)
     if x.shape == (ny, nx):
         return x, y
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         # splines know no NaN; images on the other side of the sky come here
         return np.full((2, ny, nx), np.nan)
-    rows, columns = np.arange(ny, dtype=float), np.arange(nx, dtype=float)
+    rows = np.arange(ny, dtype=float)
+    columns = np.arange(nx, dtype=float)
     return tuple(RectBivariateSpline(nodes_y, nodes_x, values)(rows, columns) for values in (x, y))
 
 
@@ -249,7 +251,9 @@ def noise_correction(pixfrac, ratio):
     2.24
     """
     r = pixfrac / ratio
-    return r / (1 - 1 / (3 * r)) if r >= 1 else 1 / (1 - r / 3)
+    if r >= 1:
+        return r / (1 - 1 / (3 * r))
+    return 1 / (1 - r / 3)
 
 
 def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, variances=()):
@@ -321,10 +325,16 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     if pixel_maps is None:
         pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     check_overlap(pixel_maps, shape)
-    weights = [weight_map(im) for im in images] if weights is None else list(weights)
+    if weights is None:
+        weights = [weight_map(im) for im in images]
+    else:
+        weights = list(weights)
     # drizzle works in float32: weights near one
     medians = [np.median(w[w > 0]) for w in weights if np.any(w > 0)]
-    unit_weight = float(np.median(medians)) if medians else 1.0
+    if medians:
+        unit_weight = float(np.median(medians))
+    else:
+        unit_weight = 1.0
 
     sink = Drizzle(
         kernel="square", fillval="NAN", fillval2="NAN", out_shape=shape, disable_ctx=True
@@ -332,8 +342,12 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     n_images = np.zeros(shape, np.uint8)
     before = np.zeros(shape, np.float32)
     variances = list(variances) or [{}] * len(images)
-    names = [name for name in PLANES[:3] if all(name in own for own in variances)]
-    for im, own, weight, (x, y) in zip(images, variances, weights, pixel_maps, strict=True):
+    names = [
+        name for name in PLANES[:3] if all(name in image_variances for image_variances in variances)
+    ]
+    for im, image_variances, weight, (x, y) in zip(
+        images, variances, weights, pixel_maps, strict=True
+    ):
         nowhere = ~(np.isfinite(x) & np.isfinite(y))
         if nowhere.all():
             continue
@@ -345,7 +359,10 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
         weight = weight.astype(np.float32)
         if part is None or not weight.any():
             continue
-        parts = [np.square(np.asarray(sigma(im), float)), *(own[name] for name in names)]
+        parts = [
+            np.square(np.asarray(sigma(im), float)),
+            *(image_variances[name] for name in names),
+        ]
         parts = [np.where(weight > 0, plane, 0.0).astype(np.float32) for plane in parts]
         add_image(sink, im, weight, (x, y), wcs, pixfrac, data2=parts)
         touched = sink.out_wht[part] > before[part]
@@ -354,10 +371,13 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
         before[part] = sink.out_wht[part]
 
     if n_images.any():
-        data, parts, weight = sink.out_img, sink.out_img2, sink.out_wht
+        data = sink.out_img
+        parts = sink.out_img2
+        weight = sink.out_wht
     else:
         data = np.full(shape, np.nan, np.float32)
-        parts, weight = [data] * (1 + len(names)), np.zeros(shape, np.float32)
+        parts = [data] * (1 + len(names))
+        weight = np.zeros(shape, np.float32)
     covered = (weight > 0) & np.isfinite(data)
     flags = np.where(covered, 0, int(DQ.NON_SCIENCE | DQ.DO_NOT_USE))
     ratio = _scale(wcs) / float(np.mean([_scale(im.wcs) for im in images]))
@@ -382,7 +402,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     return Mosaic(out, weight, n_images, dict(zip(names, parts[1:], strict=True)))
 
 
-def _check_covered(touched, pixel_map, used, shape, pixfrac):
+def _check_covered(touched, pixel_map, weighted, shape, pixfrac):
     """
     Refuse a mosaic in which the area of an image is not that of its map of pixels.
 
@@ -396,7 +416,7 @@ def _check_covered(touched, pixel_map, used, shape, pixfrac):
     area = _pixel_area(x, y)
     # whole pixels within the grid
     reach = 0.5 * np.sqrt(area)
-    inside = used & (x > reach) & (x < nx - 1 - reach) & (y > reach) & (y < ny - 1 - reach)
+    inside = weighted & (x > reach) & (x < nx - 1 - reach) & (y > reach) & (y < ny - 1 - reach)
     expected = np.count_nonzero(inside) * area * pixfrac**2
     covered = np.count_nonzero(touched)
     if covered < _LEAST_COVERED * expected - _FEW_PIXELS:

@@ -90,7 +90,8 @@ def fit_steps(reducer, ramp, maps, *, reset, skipped):
             dq = ramp.pixel_dq.astype(np.int64) | maps.pixel_dq
             model.pixeldq = (dq & 0xFFFFFFFF).astype(np.uint32)
             model.groupdq = np.zeros(ramp.shape, np.uint8)
-            first, last = skipped[0], ramp.shape[1] - skipped[1]
+            first = skipped[0]
+            last = ramp.shape[1] - skipped[1]
             model.groupdq[:, :first] |= np.uint8(DQ.DO_NOT_USE)
             model.groupdq[:, last:] |= np.uint8(DQ.DO_NOT_USE)
             for kind, options, references in steps:
@@ -119,33 +120,37 @@ def _result(planes, flags, groups, first, last):
     bad = np.uint8(DQ.DO_NOT_USE | DQ.SATURATED)
     jumped = (groups & np.uint8(DQ.JUMP_DET)) != 0
     good = (groups & bad) == 0
-    used = (good[:, 1:] & good[:, :-1] & ~jumped[:, 1:]).sum(axis=(0, 1)).astype(np.int16)
+    n_used = (good[:, 1:] & good[:, :-1] & ~jumped[:, 1:]).sum(axis=(0, 1)).astype(np.int16)
     jumped &= good
     jumped[:, : first + 1] = jumped[:, last:] = False
     k, g, y, x = np.nonzero(jumped)
     # differences are counted from the first group that takes part
     events = np.stack([y, x, k, g - first - 1, np.full(k.size, np.nan)], axis=1)
     number = jumped.sum(axis=(0, 1)).astype(np.int16)
-    return fit_result(rate, var_poisson, var_read, used, number, flags, events, first)
+    return fit_result(rate, var_poisson, var_read, n_used, number, flags, events, first)
 
 
 class _References:
     """Reference models of the pipeline, from the maps of a detector."""
 
     def __init__(self, ramp, maps, datamodels):
-        self._exposure, self._maps, self._kinds = ramp.exposure, maps, datamodels
+        self._exposure = ramp.exposure
+        self._maps = maps
+        self._kinds = datamodels
         self._shape = ramp.shape[2:]
 
     def _model(self, kind, **arrays):
         model = getattr(self._kinds, kind)(**arrays)
-        part, (ny, nx) = self._exposure.aperture, self._shape
+        part = self._exposure.aperture
+        ny, nx = self._shape
         meta = {
             "name": self._exposure.subarray, "xstart": part.origin[0] + 1, "ystart": part.origin[1] + 1,
             "xsize": nx, "ysize": ny, "fastaxis": 1, "slowaxis": 2,
         }  # fmt: skip
         for name, value in meta.items():
             setattr(model.meta.subarray, name, value)
-        model.meta.instrument.name, model.meta.instrument.detector = "MIRI", "MIRIMAGE"
+        model.meta.instrument.name = "MIRI"
+        model.meta.instrument.detector = "MIRIMAGE"
         model.meta.description = "what miricigale takes the detector for"
         return model
 
@@ -169,7 +174,8 @@ class _References:
         return self._model("ReadnoiseModel", data=np.sqrt(variance))
 
     def linearity(self):
-        coefficients, bias = np.asarray(self._maps.linearity, float), self._maps.bias
+        coefficients = np.asarray(self._maps.linearity, float)
+        bias = self._maps.bias
         if np.any(np.asarray(bias) != 0):
             if coefficients.ndim != 1 or np.ndim(bias):
                 wanted = (
@@ -187,14 +193,16 @@ class _References:
 
     def reset(self, offsets):
         """Anomaly of each group and integration, of references and settings together."""
-        own = self._maps.reset
+        reset_map = self._maps.reset
         n_int, n_group = offsets.shape
         total = np.zeros((n_int, n_group, *self._shape), np.float32)
         total += offsets[:, :, None, None].astype(np.float32)
-        if own is not None:
-            many = min(own.shape[1], n_group)
+        if reset_map is not None:
+            n_groups = min(reset_map.shape[1], n_group)
             for k in range(n_int):
-                total[k, :many] += np.nan_to_num(own[min(k, len(own) - 1), :many])
+                total[k, :n_groups] += np.nan_to_num(
+                    reset_map[min(k, len(reset_map) - 1), :n_groups]
+                )
         return self._timed("ResetModel", total, self._good())
 
     def dark(self):

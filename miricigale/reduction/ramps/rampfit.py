@@ -215,7 +215,8 @@ def fit_groups(
     data = np.asarray(data)
     check_that(data.ndim == 4, "data", "of four dimensions", f"shape {data.shape}")
     _n_int, n_group, ny, nx = data.shape
-    last_group = n_group if last_group is None else last_group
+    if last_group is None:
+        last_group = n_group
     if not 0 <= first_group <= last_group - 2 <= n_group - 2:
         wanted = f"a range of at least two of the {n_group} groups"
         raise argument_error("first_group, last_group", wanted, f"{first_group}, {last_group}")
@@ -225,21 +226,25 @@ def fit_groups(
     jump = threshold(jump_threshold, "jump_threshold")
     neighbor = threshold(neighbor_threshold, "neighbor_threshold")
     shower = threshold(shower_threshold, "shower_threshold")
-    usable = np.ones((ny, nx), bool) if usable is None else np.ascontiguousarray(usable, bool)
+    if usable is None:
+        usable = np.ones((ny, nx), bool)
+    else:
+        usable = np.ascontiguousarray(usable, bool)
     check_that(usable.shape == (ny, nx), "usable", f"of shape {(ny, nx)}", usable.shape)
 
     gain = _map(maps.gain, "gain", usable, above=0.0, infinite=True)
-    read_noise = _map(maps.read_noise, "read_noise", usable, least=0.0)
-    slow_noise = _map(maps.slow_noise, "slow_noise", usable, least=0.0)
+    read_noise = _map(maps.read_noise, "read_noise", usable, floor=0.0)
+    slow_noise = _map(maps.slow_noise, "slow_noise", usable, floor=0.0)
     bias = _map(maps.bias, "bias", usable)
     saturation = _map(maps.saturation, "saturation", usable, infinite=True)
     coef = np.stack([_map(plane, "linearity", usable) for plane in maps.linearity])
     drift = _drift(drift, data.shape)
     if bias.size == 1:
         # one sum for all pixels
-        drift, bias = bias[0, 0] + drift, np.zeros((1, 1))
+        drift = bias[0, 0] + drift
+        bias = np.zeros((1, 1))
     reset = _groups(maps.reset, "reset", data.shape)
-    dark = _groups(maps.dark, "dark", data.shape, least=last_group)
+    dark = _groups(maps.dark, "dark", data.shape, n_least=last_group)
     if group_dq is None:
         group_dq = np.zeros((1, 0, 1, 1), np.uint8)
     elif np.shape(group_dq) != data.shape or np.asarray(group_dq).dtype != np.uint8:
@@ -291,15 +296,26 @@ def _plain(array):
     return array
 
 
-def _map(values, name, usable, *, above=-np.inf, least=-np.inf, infinite=False):
+def _map(values, name, usable, *, above=-np.inf, floor=-np.inf, infinite=False):
     """One value (1, 1), or one for each pixel, that is in range wherever it is used."""
     values = np.array(values, float, ndmin=2, order="C")
     if values.shape not in ((1, 1), usable.shape):
         raise argument_error(name, f"one number or of shape {usable.shape}", values.shape)
-    good = (values > above) & (values >= least) & (np.isfinite(values) | infinite)
-    bad = ~good if values.size == 1 else ~good & usable
-    wanted = "positive" if above == 0 else "at least 0" if least == 0 else "finite"
-    got = values[0, 0] if values.size == 1 else f"{np.count_nonzero(bad)} pixels with others"
+    good = (values > above) & (values >= floor) & (np.isfinite(values) | infinite)
+    if values.size == 1:
+        bad = ~good
+    else:
+        bad = ~good & usable
+    if above == 0:
+        wanted = "positive"
+    elif floor == 0:
+        wanted = "at least 0"
+    else:
+        wanted = "finite"
+    if values.size == 1:
+        got = values[0, 0]
+    else:
+        got = f"{np.count_nonzero(bad)} pixels with others"
     check_that(not bad.any(), name, wanted, got)
     # the value of pixels that are not used must not stop the others beside them
     return np.where(good, values, 1.0)
@@ -317,13 +333,13 @@ def _drift(values, shape):
     return np.array(values, order="C")
 
 
-def _groups(values, name, shape, *, least=0):
+def _groups(values, name, shape, *, n_least=0):
     """Maps of groups and integrations, float32; what is not finite there is taken as zero."""
     if values is None:
         return _plain(np.zeros((1, 0, 1, 1), np.float32))
     values = np.asarray(values, np.float32)
-    if values.ndim != 4 or values.shape[2:] != shape[2:] or values.shape[1] < least:
-        wanted = f"of shape (n, {least} or more, {shape[2]}, {shape[3]})"
+    if values.ndim != 4 or values.shape[2:] != shape[2:] or values.shape[1] < n_least:
+        wanted = f"of shape (n, {n_least} or more, {shape[2]}, {shape[3]})"
         raise argument_error(name, wanted, f"shape {values.shape}")
     if not np.isfinite(values).all():
         values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
@@ -343,7 +359,9 @@ def fit_result(rate, var_poisson, var_read, n_used, n_jump, flags, events, first
 def threshold(value, name):
     """Return a threshold as a float, infinite for None."""
     check_positive(value, name, optional=True)
-    return np.inf if value is None else float(value)
+    if value is None:
+        return np.inf
+    return float(value)
 
 
 def _again(events, threshold, usable, n_diff, showers):
@@ -360,22 +378,26 @@ def _again(events, threshold, usable, n_diff, showers):
     pixels = [showers[0] * nx + showers[1]]
     cuts = [showers[2] * n_diff + showers[3]]
     for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        y, x = large[:, 0] + dy, large[:, 1] + dx
+        y = large[:, 0] + dy
+        x = large[:, 1] + dx
         inside = (y >= 0) & (y < ny) & (x >= 0) & (x < nx)
         inside[inside] = usable[y[inside], x[inside]]
         pixels.append(y[inside] * nx + x[inside])
         cuts.append(cut[inside])
-    pixels, cuts = np.concatenate(pixels), np.concatenate(cuts)
-    own = events[:, :4].astype(np.int64)
-    own_pixels = own[:, 0] * nx + own[:, 1]
-    again = np.isin(own_pixels, pixels)
-    pixels = np.concatenate([pixels, own_pixels[again]])
-    cuts = np.concatenate([cuts, own[again, 2] * n_diff + own[again, 3]])
+    pixels = np.concatenate(pixels)
+    cuts = np.concatenate(cuts)
+    places = events[:, :4].astype(np.int64)
+    own_pixels = places[:, 0] * nx + places[:, 1]
+    is_refitted = np.isin(own_pixels, pixels)
+    pixels = np.concatenate([pixels, own_pixels[is_refitted]])
+    cuts = np.concatenate([cuts, places[is_refitted, 2] * n_diff + places[is_refitted, 3]])
     order = np.lexsort((cuts, pixels))
-    pixels, cuts = pixels[order], cuts[order]
+    pixels = pixels[order]
+    cuts = cuts[order]
     unique = np.unique(pixels)
     start = np.append(np.searchsorted(pixels, unique), len(pixels))
     for part in chunks(len(unique), _PIXELS):
-        first, last = start[part.start], start[part.stop]
+        first = start[part.start]
+        last = start[part.stop]
         y, x = np.divmod(unique[part], nx)
         yield y, x, start[part.start : part.stop + 1] - first, cuts[first:last]

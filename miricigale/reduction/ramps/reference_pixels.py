@@ -57,10 +57,10 @@ def _without(data, columns, offsets):
     n_int, n_group = pixels.shape[:2]
     for offset in offsets:
         shared = min(n_group, offset.shape[1])
-        which = np.minimum(np.arange(n_int), len(offset) - 1)
-        own = np.nan_to_num(offset[:, :shared, :, columns], posinf=0.0, neginf=0.0)
+        integration = np.minimum(np.arange(n_int), len(offset) - 1)
+        integration_offsets = np.nan_to_num(offset[:, :shared, :, columns], posinf=0.0, neginf=0.0)
         pixels = pixels.astype(float)
-        pixels[:, :shared] -= own[which]
+        pixels[:, :shared] -= integration_offsets[integration]
     return pixels
 
 
@@ -114,7 +114,8 @@ def reference_channels(data, reference, *, origin=(0, 0), offsets=()):
     """
     n_int, n_group, ny, nx = data.shape
     columns = np.flatnonzero(reference.any(axis=0))
-    pixels, known = _without(data, columns, offsets), reference[:, columns]
+    pixels = _without(data, columns, offsets)
+    valid = reference[:, columns]
     # left and right of the middle
     sides = [np.flatnonzero(columns < nx / 2), np.flatnonzero(columns >= nx / 2)]
     parity = (np.arange(ny) + origin[1]) % 2
@@ -127,7 +128,7 @@ def reference_channels(data, reference, *, origin=(0, 0), offsets=()):
         for odd in np.unique(parity):
             rows = np.flatnonzero(parity == odd)
             for side in mine:
-                good = known[np.ix_(rows, side)].ravel()
+                good = valid[np.ix_(rows, side)].ravel()
                 part = pixels[:, :, rows][..., side].reshape(n_int, n_group, -1)[..., good]
                 change = part.astype(float) - part[:, :1]
                 clipped = sigma_clip(change, _CLIP, maxiters=None, cenfunc="mean", axis=-1)

@@ -14,7 +14,8 @@ _SAMPLE = 20_000
 _FEWEST = 8
 
 #: Sigma and DN by which a group must be off.
-_SIGMA, _LEAST = 5.0, 1.0
+_SIGMA = 5.0
+_LEAST = 1.0
 
 
 def settling_groups(data, maps, usable):
@@ -63,11 +64,12 @@ def settling_groups(data, maps, usable):
 
     raw = data.reshape(n_int, n_group, -1)[:, :, pixels]
     levels = polyval(raw - sampled(maps.bias), [sampled(c) for c in maps.linearity], tensor=False)
-    for known in (maps.reset, maps.dark):
-        for k in range(n_int) if known is not None else ():
-            part = known[min(k, len(known) - 1), :n_group]
+    for reference in (maps.reset, maps.dark):
+        for k in range(n_int) if reference is not None else ():
+            part = reference[min(k, len(reference) - 1), :n_group]
             levels[k, : len(part)] -= np.nan_to_num(part.reshape(len(part), -1)[:, pixels])
-    mean, group = trim_mean(levels, 0.2, axis=2), np.arange(n_group)
+    mean = trim_mean(levels, 0.2, axis=2)
+    group = np.arange(n_group)
     # the last group is pulled by the reset
     late = slice(n_group // 4, n_group - 1)
     design = np.vander(group / n_group, 3)
@@ -109,10 +111,14 @@ def note_settling(ramp, maps, skipped, flags):
     if ramp.group_dq is not None and usable.any():
         first = (ramp.group_dq[0] & np.uint8(DQ.DO_NOT_USE))[:, usable] != 0
         skipped = max(skipped, int(np.argmin(np.append(first.mean(axis=1) > 0.5, False))))
-    worst, most = int(np.argmax(number)), int(number.max())
-    if most > skipped:
-        what = f"by {off[worst, skipped]:+.1f} DN in the first that is used (skip_first={most} leaves them out)"
-        warn(f"the first {most} groups still settle after the reset, {what}", ReductionWarning)
-        if most > 0.1 * len(off[worst]):
+    worst = int(np.argmax(number))
+    n_skipped = int(number.max())
+    if n_skipped > skipped:
+        text = (
+            f"by {off[worst, skipped]:+.1f} DN in the first that is used "
+            f"(skip_first={n_skipped} leaves them out)"
+        )
+        warn(f"the first {n_skipped} groups still settle after the reset, {text}", ReductionWarning)
+        if n_skipped > 0.1 * len(off[worst]):
             flags[usable] |= int(DQ.FLUX_ESTIMATED)
-    return most
+    return n_skipped

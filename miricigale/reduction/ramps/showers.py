@@ -7,7 +7,8 @@ from scipy.ndimage import gaussian_filter, label, maximum_position, sum_labels
 _LARGE = 300.0
 
 #: Pixels around a hit that are looked at, and the Gaussian width by which they are smoothed.
-_REACH, _WIDTH = 48, 4.0
+_REACH = 48
+_WIDTH = 4.0
 
 #: Groups before and after from which the usual charge of one group is measured.
 _BESIDE = 3
@@ -40,30 +41,31 @@ def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
         What is to be cut.
     """
     n_diff = last_group - first_group - 1
-    where = jumps[:, :4].astype(np.int64)
-    found = [np.zeros((0, 4), np.int64)]
-    for k, i in np.unique(where[:, 2:], axis=0):
-        beside = [j for j in range(i - _BESIDE, i + _BESIDE + 1) if 0 <= j < n_diff and j != i]
-        if len(beside) < 2:
+    places = jumps[:, :4].astype(np.int64)
+    flagged = [np.zeros((0, 4), np.int64)]
+    for k, i in np.unique(places[:, 2:], axis=0):
+        neighbors = [j for j in range(i - _BESIDE, i + _BESIDE + 1) if 0 <= j < n_diff and j != i]
+        if len(neighbors) < 2:
             continue
-        same = (where[:, 2] == k) & (where[:, 3] == i)
+        in_group = (places[:, 2] == k) & (places[:, 3] == i)
         hit = np.zeros(usable.shape, np.float32)
-        ys, xs = where[same, :2].T
-        hit[ys, xs] = np.abs(jumps[same, 4])
+        ys, xs = places[in_group, :2].T
+        hit[ys, xs] = np.abs(jumps[in_group, 4])
         for y, x in _tracks(hit):
             part = tuple(slice(max(c - _REACH, 0), c + _REACH + 1) for c in (y, x))
-            differences = [
-                data[k, first_group + j + 1][part].astype(np.float32)
-                - data[k, first_group + j][part]
-                for j in (i, *beside)
-            ]
+            differences = []
+            for j in (i, *neighbors):
+                differences.append(
+                    data[k, first_group + j + 1][part].astype(np.float32)
+                    - data[k, first_group + j][part]
+                )
             excess = differences[0] - np.median(differences[1:], axis=0)
             cut = _significant(excess, usable[part] & (hit[part] == 0), threshold)
             ys, xs = np.nonzero(cut & usable[part])
             place = np.full((len(ys), 4), (part[0].start, part[1].start, k, i))
             place[:, :2] += np.stack([ys, xs], axis=1)
-            found.append(place)
-    return tuple(np.unique(np.concatenate(found), axis=0).T)
+            flagged.append(place)
+    return tuple(np.unique(np.concatenate(flagged), axis=0).T)
 
 
 def _tracks(hit):
@@ -71,7 +73,9 @@ def _tracks(hit):
     labels, number = label(hit > 0, structure=np.ones((3, 3)))
     index = np.arange(1, number + 1)
     large = index[sum_labels(hit, labels, index) >= _LARGE]
-    return maximum_position(hit, labels, large) if large.size else []
+    if large.size:
+        return maximum_position(hit, labels, large)
+    return []
 
 
 def _significant(excess, good, threshold):

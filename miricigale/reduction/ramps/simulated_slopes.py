@@ -46,14 +46,18 @@ def draw_groups(charge, maps, drift, usable, part, *, thresholds, poisson_factor
     -------
     fit : `RampFit`
     """
-    exposure, truth = charge.exposure, charge.properties
-    n_int, n_group, group_time = exposure.n_integrations, exposure.n_groups, charge.group_time
+    exposure = charge.exposure
+    truth = charge.properties
+    n_int = exposure.n_integrations
+    n_group = exposure.n_groups
+    group_time = charge.group_time
     n_diff = part[1] - part[0] - 1
     offset = np.asarray(maps.bias + drift, float)
     offset = np.broadcast_to(offset, (n_int, n_group)).mean(axis=0)
     level = charge.level
     limit = charge.limit(maps.saturation - level.mean())
-    s, inv_gain = max(maps.read_noise**2 + 1 / 12, 1e-6), poisson_factor / maps.gain
+    s = max(maps.read_noise**2 + 1 / 12, 1e-6)
+    inv_gain = poisson_factor / maps.gain
     rng = stream(charge.seed, "slopes", exposure.filter, exposure.dither)
 
     # rates that fill a pixel by the last group, and below

@@ -51,7 +51,9 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
     ValueError
         If fewer than two groups are left.
     """
-    exposure, detector, history = ramp.exposure, reducer.detector, ramp.history
+    exposure = ramp.exposure
+    detector = reducer.detector
+    history = ramp.history
     dq = ramp.pixel_dq.astype(np.int64) | maps.pixel_dq
     if not isinstance(ramp, Charge) and ramp.data.dtype.kind in "iu":
         # counts of 0 are of pixels that were not read: the bias is thousands
@@ -65,7 +67,10 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
         msg = f"at most {n_group - 2} groups together for {n_group} groups"
         raise argument_error("skip_first, skip_last", msg, f"{skip_first}, {skip_last}")
     drift = _anomaly(reducer, ramp, maps, first)
-    factor = float(np.sum(detector.ipc_kernel**2)) if shares_charge(reducer, ramp) else 1.0
+    if shares_charge(reducer, ramp):
+        factor = float(np.sum(detector.ipc_kernel**2))
+    else:
+        factor = 1.0
     part = skip_first, n_group - skip_last
     thresholds = reducer.jump_threshold, reducer.ramps.neighbor_threshold
     if reducer.backend == "jwst":
@@ -124,13 +129,17 @@ def shares_charge(reducer, ramp):
     if reducer.ramps.ipc is not None:
         return bool(reducer.ramps.ipc)
     acted = ramp.shows(InterpixelCapacitance)
-    return is_own(reducer, ramp.history) if acted is None else acted
+    if acted is None:
+        return is_own(reducer, ramp.history)
+    return acted
 
 
 def _skipped(reducer, ramp):
     """Groups left out at the start and the end of the integrations of a ramp."""
-    n_group, steps = ramp.exposure.n_groups, ramp.history.steps
-    first, last = reducer.skip_first, reducer.skip_last
+    n_group = ramp.exposure.n_groups
+    steps = ramp.history.steps
+    first = reducer.skip_first
+    last = reducer.skip_last
     if first is None:
         done = {"firstframe", "rscd"} & steps
         first = int(ramp.shows(FirstFrame) is not False and n_group > 3 and not done)
@@ -152,34 +161,38 @@ def _drift(reducer, ramp, maps, reference, drift):
         how = ramp.history.simulated or (ramp.exposure.subarray == "FULL" and "channels")
     if not how or "refpix" in ramp.history.steps:
         return drift
-    offsets = [one for one in (maps.reset, maps.dark) if one is not None]
+    offsets = [
+        reference_map for reference_map in (maps.reset, maps.dark) if reference_map is not None
+    ]
     if how != "channels":
         return drift + _finite(reference_drift(ramp.data, reference, offsets), ramp)
     origin = ramp.exposure.aperture.origin
-    found = reference_channels(ramp.data, reference, origin=origin, offsets=offsets)
-    _finite(found, ramp)
-    return np.broadcast_to(drift, ramp.shape[:2])[:, :, None, None] + found
+    channels = reference_channels(ramp.data, reference, origin=origin, offsets=offsets)
+    _finite(channels, ramp)
+    return np.broadcast_to(drift, ramp.shape[:2])[:, :, None, None] + channels
 
 
 def _finite(drift, ramp):
     """Refuse a drift of reference pixels that are not finite."""
     if not np.isfinite(drift).all():
         path = ramp.meta.get("filename", "the ramp")
-        what = "has values that are not finite in the reference columns of SCI"
-        raise data_error(path, f"{what}: reference_correction=False leaves them out of account")
+        problem = "has values that are not finite in the reference columns of SCI"
+        raise data_error(path, f"{problem}: reference_correction=False leaves them out of account")
     return drift
 
 
 def _anomaly(reducer, ramp, maps, first):
     """Offset of each group after a reset, DN, in addition to that of the references."""
-    exposure, anomaly, left = ramp.exposure, reducer.reset_anomaly, []
+    exposure = ramp.exposure
+    anomaly = reducer.reset_anomaly
+    problems = []
     if ramp.shows(ResetDecay) and exposure.n_integrations > 1:
-        left.append(("a decay after the resets between integrations", ""))
+        problems.append(("a decay after the resets between integrations", ""))
     if anomaly is None and maps.reset is None and ramp.shows(ResetAnomaly):
-        left.append(("a reset anomaly", "'reset_anomaly', or "))
-    for what, remedy in left if reducer.skip_first is None else ():
+        problems.append(("a reset anomaly", "'reset_anomaly', or "))
+    for problem, remedy in problems if reducer.skip_first is None else ():
         msg = (
-            f"the ramp shows {what} that this Reducer leaves in: "
+            f"the ramp shows {problem} that this Reducer leaves in: "
             f"give it {remedy}'skip_first' groups to be left out"
         )
         warn(msg, ReductionWarning)

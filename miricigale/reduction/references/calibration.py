@@ -71,7 +71,10 @@ def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
         unit=SURFACE_BRIGHTNESS,
         photmjsr=float(conversion),
     )
-    outside = ~inside if inside.any() else np.zeros_like(inside)
+    if inside.any():
+        outside = ~inside
+    else:
+        outside = np.zeros_like(inside)
     if flags is not None:
         out.flags |= flags
         out.mask |= (flags & DQ.DO_NOT_USE) != 0

@@ -79,14 +79,15 @@ def imager_response(photom=None, *, date=None):
         raise argument_error("photom, date", "both given, or neither", f"{photom!r}, {date!r}")
     if not photom:
         return tuple((name, *row) for name in imager_filters() for row in _PARTS.items())
-    day, found = Time(date).mjd, []
+    day = Time(date).mjd
+    responses = []
     for name in imager_filters():
         conversion, times = photom_row(photom, name, "FULL")
         start = min((row["t0"] for row in times.values()), default=day)
         first = on_day(conversion, times, start)
         for part in subarrays():
-            found.append((name, part, first / on_day(*photom_row(photom, name, part), day)))
-    return tuple(found)
+            responses.append((name, part, first / on_day(*photom_row(photom, name, part), day)))
+    return tuple(responses)
 
 
 _OWN = "of the simulated detector"
@@ -118,8 +119,8 @@ def is_own(reducer, history):
     """
     if reducer.references is not None:
         return reducer.references == "simulated"
-    other = history.gain is not None and history.gain != reducer.detector.gain
-    if history.simulated and reducer.properties is None and other:
+    differs = history.gain is not None and history.gain != reducer.detector.gain
+    if history.simulated and reducer.properties is None and differs:
         raise ValueError(_OTHER.format(f"one with a gain of {history.gain:g} e-/DN"))
     return history.simulated
 
@@ -147,13 +148,13 @@ def maps_of(reducer, ramp):
     check_that(isinstance(ramp, (Ramp, Charge)), "ramp", "a Ramp or a Charge", type(ramp).__name__)
     history = ramp.history
     if is_own(reducer, history):
-        stated = reducer.references is not None or reducer.properties is not None
-        if not stated and ramp.properties not in (None, reducer.detector):
+        has_references = reducer.references is not None or reducer.properties is not None
+        if not has_references and ramp.properties not in (None, reducer.detector):
             raise ValueError(_OTHER.format(ramp.properties))
         return own_maps(reducer.detector, ramp)
     wanted = "None or 'simulated' for a Charge, which has no counts"
     check_that(not isinstance(ramp, Charge), "references", wanted, repr(reducer.references))
-    files = needed(reducer.references, ramp.header, history, names=SLOPES, what="slopes")
+    files = needed(reducer.references, ramp.header, history, names=SLOPES, product="slopes")
     return files.maps(ramp)
 
 
@@ -173,12 +174,12 @@ def history_of(reducer, ramp, maps):
     history : `~miricigale.instrument.ExposureHistory`
     """
     before = ramp.history
-    own = is_own(reducer, before)
-    used = {name for name, text in maps.used.items() if text != "none" and name in REFERENCES}
+    simulated = is_own(reducer, before)
+    names = {name for name, text in maps.used.items() if text != "none" and name in REFERENCES}
     # the own bias is a part of the own linearity
-    steps = {REFERENCES[name] for name in used} - ({"superbias"} if own else set()) - {None}
+    steps = {REFERENCES[name] for name in names} - ({"superbias"} if simulated else set()) - {None}
     return before.replace(
-        origin="simulated" if own else "other",
+        origin="simulated" if simulated else "other",
         steps=before.steps | steps | {"ramp_fit"},
         references=maps.used,
         gain=float(np.median(maps.gain)),
@@ -208,7 +209,8 @@ def brightness_of(reducer, rate):
     ValueError
         If there are no references for it.
     """
-    facts, history = ImageFacts.of(rate), ExposureHistory.of(rate)
+    facts = ImageFacts.of(rate)
+    history = ExposureHistory.of(rate)
     flattened = history.done("flat")
     if is_own(reducer, history):
         detector = reducer.detector
@@ -221,15 +223,21 @@ def brightness_of(reducer, rate):
             "conversion": photmjsr(facts.filter, gain=detector.gain)
             / detector.relative_response(facts.filter, facts.subarray),
         }
-        flat = "done before" if flattened else f"flat field {_OWN}"
-        used = {"flat": flat, "photom": f"conversion {_OWN}"}
+        if flattened:
+            flat = "done before"
+        else:
+            flat = f"flat field {_OWN}"
+        reference_names = {"flat": flat, "photom": f"conversion {_OWN}"}
     else:
-        values, used = _from_files(reducer, rate, facts, history)
+        values, reference_names = _from_files(reducer, rate, facts, history)
     if not history.done("dark"):
         msg = "nothing says that the dark current was taken out of the slopes: it becomes a part of the background"
         warn(msg, ReferenceWarning)
-    steps = {"photom"} if used["flat"] == "none" else {"photom", "flat"}
-    references = {**history.references, **used}
+    if reference_names["flat"] == "none":
+        steps = {"photom"}
+    else:
+        steps = {"photom", "flat"}
+    references = {**history.references, **reference_names}
     return values, history.replace(steps=history.steps | steps, references=references).meta()
 
 
@@ -243,17 +251,22 @@ def _from_files(reducer, rate, facts, history):
         pointing=None,
         roll=None,
     )
-    what, header = "surface brightness", _header(exposure, history.day)
-    files = needed(reducer.references, header, history, names=BRIGHTNESS, what=what)
-    check_that(files.photom is not None, "references", f"given with 'photom' for {what}", "none")
-    flat, flags, used = 1.0, None, {"flat": "none", "photom": files.photom.name}
+    quantity = "surface brightness"
+    header = _header(exposure, history.day)
+    files = needed(reducer.references, header, history, names=BRIGHTNESS, product=quantity)
+    check_that(
+        files.photom is not None, "references", f"given with 'photom' for {quantity}", "none"
+    )
+    flat = 1.0
+    flags = None
+    references = {"flat": "none", "photom": files.photom.name}
     if history.done("flat"):
-        used["flat"] = "done before"
+        references["flat"] = "done before"
     elif files.flat is not None:
         flat, flags = read_flat(files.flat, exposure)
-        used["flat"] = files.flat.name
+        references["flat"] = files.flat.name
     conversion = read_photom(files.photom, exposure, history.day)
-    return {"flat": flat, "conversion": conversion, "flags": flags}, used
+    return {"flat": flat, "conversion": conversion, "flags": flags}, references
 
 
 def _header(exposure, day):

@@ -72,9 +72,15 @@ class MeasuredNoise:
         if name == "read_noise":
             return f"{self.read_noise:.4g} DN (measured on the ramp)"
         if np.isinf(self.gain):
-            slow = f", {self.slow_noise:.3g} DN a group of the read-out" if self.slow_noise else ""
+            if self.slow_noise:
+                slow = f", {self.slow_noise:.3g} DN a group of the read-out"
+            else:
+                slow = ""
             return f"no photon noise{slow} (measured on the ramp)"
-        kind = ", effective" if self.effective else ""
+        if self.effective:
+            kind = ", effective"
+        else:
+            kind = ""
         return f"{self.gain:.4g} e-/DN{kind} (measured on the ramp)"
 
 
@@ -147,14 +153,15 @@ def measure_noise(ramp):
     wanted = f"one with {_FEWEST} usable pixels, to measure its noise"
     check_that(pixels[0].size >= _FEWEST, "ramp", wanted, pixels[0].size)
     blind = _few((dq & (_BAD_REFERENCE | DQ.REFERENCE_PIXEL)) == DQ.REFERENCE_PIXEL)
-    rows, dark = [], []
+    rows = []
+    dark = []
     # the first integration settles, and is left out where there are others
     for k in range(min(n_int - 1, 2), n_int):
         before, data, signal = _parts(ramp, k, pixels)
         order = _slope(before)
         limit = _BRIGHT * np.median(order)
-        kept = np.flatnonzero((order < limit) | (limit <= 0))
-        parts = np.array_split(kept[np.argsort(order[kept])], _CLASSES)
+        accepted = np.flatnonzero((order < limit) | (limit <= 0))
+        parts = np.array_split(accepted[np.argsort(order[accepted])], _CLASSES)
         rows += [(signal[part].mean(), *_noise(data[:, part])) for part in parts]
         if blind[0].size >= _FEWEST:
             dark.append(_noise(_parts(ramp, k, blind)[1])[:2])
@@ -167,23 +174,30 @@ def measure_noise(ramp):
     read -= read_variance(0.0, n_frames, rounded=rounded)
     read_noise = np.sqrt(max(n_frames * read, 0.0))
     mean, mean_err = _mean(v, v_err)
-    slow, slow_err = _mean(*np.array(dark).T) if dark else (0.0, 0.0)
+    if dark:
+        slow, slow_err = _mean(*np.array(dark).T)
+    else:
+        slow = 0.0
+        slow_err = 0.0
     # v = m / gain and slow noise of the read-out, which does not go with the signal
     weight = 1 / v_err**2
     middle = _mean(m, v_err)[0]
     squares = (weight * (m - middle) ** 2).sum()
     inverse = (weight * (m - middle) * v).sum() / squares
-    rest = weight * (v - mean - inverse * (m - middle)) ** 2
-    inverse_err = max(np.sqrt(rest.sum() / (len(rows) - 2)), 1.0) / np.sqrt(squares)
-    seen = inverse > _SEEN * inverse_err
-    if not seen:
+    residual = weight * (v - mean - inverse * (m - middle)) ** 2
+    inverse_err = max(np.sqrt(residual.sum() / (len(rows) - 2)), 1.0) / np.sqrt(squares)
+    detected = inverse > _SEEN * inverse_err
+    if not detected:
         inverse = (mean - slow) / middle
         inverse_err = np.hypot(mean_err, slow_err) / abs(middle)
     if inverse > _SEEN * inverse_err:
-        gain, gain_err = 1 / inverse, inverse_err / inverse**2
+        gain = 1 / inverse
+        gain_err = inverse_err / inverse**2
     else:
-        gain, gain_err, slow = np.inf, np.nan, mean
-    effective = not seen and not dark and np.isfinite(gain)
+        gain = np.inf
+        gain_err = np.nan
+        slow = mean
+    effective = not detected and not dark and np.isfinite(gain)
     slow_noise = np.sqrt(max(slow, 0.0))
     return MeasuredNoise(
         *map(float, (read_noise, gain, gain_err)), bool(effective), float(slow_noise)
@@ -213,8 +227,8 @@ def _mean(values, errors):
     """Weighted mean and its error, wider where the values scatter by more than their errors."""
     weight = 1 / errors**2
     mean = (weight * values).sum() / weight.sum()
-    rest = (weight * (values - mean) ** 2).sum() / max(values.size - 1, 1)
-    return mean, max(np.sqrt(rest), 1.0) / np.sqrt(weight.sum())
+    chi2 = (weight * (values - mean) ** 2).sum() / max(values.size - 1, 1)
+    return mean, max(np.sqrt(chi2), 1.0) / np.sqrt(weight.sum())
 
 
 def _slope(data):
@@ -234,27 +248,28 @@ def _noise(data):
     longest = (len(data) - 1) // 2
     number = min(_LAGS, longest // 2)
     short = np.arange(1, number + 1)
-    near, near_err = _scatter(data, short)
+    short_scatter, short_err = _scatter(data, short)
     far, far_err = _scatter(data, longest + 1 - short)
-    between = 2 * (longest - number)
-    v = (far.mean() - near.mean()) / between
-    v_err = np.hypot(far_err.mean(), near_err.mean()) / between
-    s = np.max(near - 2 * short * v) / 6
-    s_err = np.hypot(near_err.mean(), (number + 1) * v_err) / 6
+    n_between = 2 * (longest - number)
+    v = (far.mean() - short_scatter.mean()) / n_between
+    v_err = np.hypot(far_err.mean(), short_err.mean()) / n_between
+    s = np.max(short_scatter - 2 * short * v) / 6
+    s_err = np.hypot(short_err.mean(), (number + 1) * v_err) / 6
     return v, v_err, s, s_err
 
 
 def _scatter(data, lags):
     """Clipped variance of second differences over each of the lags, and its error."""
-    variances, errors = [], []
+    variances = []
+    errors = []
     for lag in lags:
         second = data[2 * lag :] - 2 * data[lag:-lag] + data[: -2 * lag]
         # what all pixels have in common: drifts of the read-out, settling, non-linearity
         second = (second - np.median(second, axis=1)[:, None]).ravel()
         spread = 1.4826 * np.median(np.abs(second))
         for _ in range(20):
-            kept = second[np.abs(second) <= _CLIP * spread]
-            new = np.sqrt(np.mean(np.square(kept)) / _KEPT)
+            clipped = second[np.abs(second) <= _CLIP * spread]
+            new = np.sqrt(np.mean(np.square(clipped)) / _KEPT)
             if abs(new - spread) < 1e-6 * spread:
                 break
             spread = new

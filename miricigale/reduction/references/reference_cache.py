@@ -56,11 +56,16 @@ class ReferenceCache:
     incomplete: bool = False
 
     def __post_init__(self):
-        folder = self.folder if self.folder is not None else os.environ.get("CRDS_PATH")
+        if self.folder is not None:
+            folder = self.folder
+        else:
+            folder = os.environ.get("CRDS_PATH")
         check_that(folder, "folder", "given, or the variable CRDS_PATH set", "neither")
         object.__setattr__(self, "folder", Path(folder).expanduser())
-        found = [path.name for path in self._mappings.glob("jwst_*.pmap")]
-        context = self.context or os.environ.get("CRDS_CONTEXT") or max(found, default="a context")
+        contexts = [path.name for path in self._mappings.glob("jwst_*.pmap")]
+        context = (
+            self.context or os.environ.get("CRDS_CONTEXT") or max(contexts, default="a context")
+        )
         object.__setattr__(self, "context", str(context))
         if not (self._mappings / self.context).is_file():
             raise data_error(self.folder, f"is no CRDS cache of JWST with {self.context}")
@@ -96,15 +101,16 @@ class ReferenceCache:
         kinds = {name: TYPES.get(name, name) for name in ReferenceFiles.names()}
         rmap = require("crds.core.rmap", extra="jwst")
         # by which crds finds the mappings of a context
-        own = mock.patch.dict(os.environ, CRDS_PATH=str(self.folder), CRDS_OBSERVATORY="jwst")
-        with file_errors(self.folder, "cannot be read as a CRDS cache", Exception), own:
+        environment = mock.patch.dict(
+            os.environ, CRDS_PATH=str(self.folder), CRDS_OBSERVATORY="jwst"
+        )
+        with file_errors(self.folder, "cannot be read as a CRDS cache", Exception), environment:
             rules = rmap.load_mapping(str(self._mappings / self.context))
             chosen = rules.get_best_references(words, include=list(kinds.values()))
-        files = {
-            name: self._file(chosen[kind])
-            for name, kind in kinds.items()
-            if not chosen.get(kind, "NOT FOUND").startswith("NOT FOUND")
-        }
+        files = {}
+        for name, kind in kinds.items():
+            if not chosen.get(kind, "NOT FOUND").startswith("NOT FOUND"):
+                files[name] = self._file(chosen[kind])
         return ReferenceFiles(**files, incomplete=self.incomplete, origin=self.context)
 
     def _file(self, name):
@@ -113,5 +119,5 @@ class ReferenceCache:
         for path in (folder / "miri" / name, folder / name):
             if path.is_file():
                 return path
-        what = f"lacks the reference file {name}, which {self.context} chooses"
-        raise data_error(self.folder, what)
+        problem = f"lacks the reference file {name}, which {self.context} chooses"
+        raise data_error(self.folder, problem)

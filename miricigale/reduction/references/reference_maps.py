@@ -30,15 +30,19 @@ def _wanted(name, extension):
     return f"a {name.replace('_', ' ')} reference of CRDS (FITS with {extension})"
 
 
-def _other(path, name, what):
+def _other(path, name, problem):
     """Error that says why a file is no reference for an exposure."""
-    return data_error(path, f"is no {name.replace('_', ' ')} reference for this exposure: {what}")
+    return data_error(
+        path, f"is no {name.replace('_', ' ')} reference for this exposure: {problem}"
+    )
 
 
 def _header(hdus, path, name, extension, exposure=None):
     """Keywords of a reference; one of another kind, detector, filter or read-out is refused."""
-    found = f"it has {[hdu.name for hdu in hdus]}"
-    check_data(extension in hdus, path, f"cannot be read as {_wanted(name, extension)}: {found}")
+    extensions = f"it has {[hdu.name for hdu in hdus]}"
+    check_data(
+        extension in hdus, path, f"cannot be read as {_wanted(name, extension)}: {extensions}"
+    )
     header = joined_header(hdus, extension)
     wanted = {"REFTYPE": TYPES.get(name, name).upper(), "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE"}
     patterns = _ANY
@@ -49,11 +53,14 @@ def _header(hdus, path, name, extension, exposure=None):
     if name == "flat" and exposure.filter is not None:
         wanted["FILTER"] = exposure.filter.rpartition(".")[2].upper()
     for key, value in wanted.items():
-        stated = str(header.get(key, "")).strip().upper()
-        stated = READOUT_NAMES.get(stated, stated)
-        others = patterns if key == "READPATT" else _ANY
-        if stated not in (value, *others):
-            raise _other(path, name, f"its {key} is {stated}, not {value}")
+        keyword_value = str(header.get(key, "")).strip().upper()
+        keyword_value = READOUT_NAMES.get(keyword_value, keyword_value)
+        if key == "READPATT":
+            allowed = patterns
+        else:
+            allowed = _ANY
+        if keyword_value not in (value, *allowed):
+            raise _other(path, name, f"its {key} is {keyword_value}, not {value}")
     for key, values in {"NFRAMES": _frame_counts(exposure), "GROUPGAP": (0,)}.items():
         if name in ("reset", "dark") and header.get(key, values[0]) not in values:
             raise _other(path, name, f"its {key} is {header[key]}, not {values[0]}")
@@ -62,7 +69,9 @@ def _header(hdus, path, name, extension, exposure=None):
 
 def _frame_counts(exposure):
     """Frames in a group of references of groups: those of the exposure, or one."""
-    return (1,) if exposure is None else (exposure.n_frames, 1)
+    if exposure is None:
+        return (1,)
+    return (exposure.n_frames, 1)
 
 
 def _cut(path, name, array, header, exposure):
@@ -78,7 +87,9 @@ def _cut(path, name, array, header, exposure):
     else:
         got = f"{array.shape[-2:]} pixels without SUBSTRT1 and SUBSTRT2"
         raise data_error(path, f"does not state which part of the detector it covers: {got}")
-    x, y = (own - other for own, other in zip(part.origin, origin, strict=True))
+    x, y = (
+        part_start - map_start for part_start, map_start in zip(part.origin, origin, strict=True)
+    )
     ny, nx = part.shape
     if x < 0 or y < 0 or y + ny > array.shape[-2] or x + nx > array.shape[-1]:
         covered = f"{array.shape[-2:]} pixels from column {origin[0] + 1}, row {origin[1] + 1} on"
@@ -95,15 +106,18 @@ def _flags(path, name, hdus, header, exposure):
     # those of groups and integrations together
     stored = np.bitwise_or.reduce(stored.reshape(-1, *stored.shape[-2:]), axis=0)
     stored = _cut(path, name, stored, header, exposure).astype(np.int64)
-    table = hdus["DQ_DEF"].data if "DQ_DEF" in hdus else None
+    if "DQ_DEF" in hdus:
+        table = hdus["DQ_DEF"].data
+    else:
+        table = None
     if table is None or len(table) == 0:
         return stored & 0xFFFFFFFF
     out = np.zeros(shape, np.int64)
-    known = {flag.name: int(flag) for flag in DQ}
+    bits = {flag.name: int(flag) for flag in DQ}
     for row in table:
         flag = str(row["NAME"]).strip().upper()
-        if flag in known:
-            out[stored & int(row["VALUE"]) != 0] |= known[flag]
+        if flag in bits:
+            out[stored & int(row["VALUE"]) != 0] |= bits[flag]
     return out
 
 
@@ -130,13 +144,13 @@ def _read_with_header(path, exposure, name, extension="SCI"):
 def _read_values(path, exposure, name):
     """Value of each pixel; those without one are flagged, and not to be used where they need it."""
     values, flags = _read(path, exposure, name)
-    flag, rest = _VALUES[name]
+    flag, options = _VALUES[name]
     bad = ~np.isfinite(values) | ((flags & flag) != 0)
     if name in _POSITIVE:
         bad |= ~(values > 0)
         flags[bad] |= int(DQ.DO_NOT_USE)
     flags[bad] |= int(flag)
-    return np.where(bad, np.float32(rest), values), flags
+    return np.where(bad, np.float32(options), values), flags
 
 
 def _read_noise(path, exposure):
@@ -233,8 +247,8 @@ def read_photom(path, exposure, day):
         If there is no row for them, or the time is needed and not known.
     """
     conversion, times = photom_row(path, exposure.filter, exposure.subarray)
-    what = "has a conversion that depends on time, and the exposure does not state when"
-    check_data(not (times and day is None), path, what)
+    problem = "has a conversion that depends on time, and the exposure does not state when"
+    check_data(not (times and day is None), path, problem)
     return on_day(conversion, times, day)
 
 
@@ -247,11 +261,11 @@ def photom_row(path, filter, subarray):
         columns = (map(str.upper, map(str.strip, rows[key])) for key in ("filter", "subarray"))
         keys = list(zip(*columns, strict=True))
         wanted = [(short, part) for part in (subarray, "GENERIC")]
-        known = [keys.index(key) for key in wanted if key in keys]
-        check_data(known, path, f"has no row for {short} and {subarray}")
-        conversion = float(rows["photmjsr"][known[0]])
+        key_columns = [keys.index(key) for key in wanted if key in keys]
+        check_data(key_columns, path, f"has no row for {short} and {subarray}")
+        conversion = float(rows["photmjsr"][key_columns[0]])
         times = {
-            name: {key.lower(): float(hdus[name].data[key][known[0]]) for key in hdus[name].data.names
+            name: {key.lower(): float(hdus[name].data[key][key_columns[0]]) for key in hdus[name].data.names
                    if key.lower() not in ("filter", "subarray")}
             for name in ("TIMECOEFF", *_TIMES) if name in hdus and hdus[name].data is not None
         }  # fmt: skip

@@ -89,12 +89,12 @@ class DetectorMaps:
         -------
         maps : `DetectorMaps`
         """
-        own = {}
+        parts = {}
         for name in ("reset", "dark"):
             if (array := getattr(self, name)) is not None:
                 k = min(number, len(array) - 1)
-                own[name] = array[k : k + 1]
-        return dataclasses.replace(self, **own)
+                parts[name] = array[k : k + 1]
+        return dataclasses.replace(self, **parts)
 
 
 def own_maps(properties, ramp):
@@ -113,31 +113,34 @@ def own_maps(properties, ramp):
     -------
     maps : `DetectorMaps`
     """
-    history, part = ramp.history, {"subarray": ramp.exposure.subarray}
-    own = "of the simulated detector"
+    history = ramp.history
+    part = {"subarray": ramp.exposure.subarray}
+    origin = "of the simulated detector"
     limit = properties.bias + _SATURATION * properties.saturation_dn
-    used = {
-        "mask": f"bad and reference pixels {own}",
-        "saturation": f"{limit:.8g} DN {own}",
-        "bias": f"{properties.bias:.8g} DN {own}",
-        "linearity": f"{', '.join(f'{c:.4g}' for c in properties.nonlinearity)} {own}",
-        "dark": f"{properties.dark_current:.4g} e-/s {own}, off the slopes",
-        "gain": f"{properties.gain:.6g} e-/DN {own}",
-        "read_noise": f"{properties.read_noise:.6g} DN {own}",
+    sources = {
+        "mask": f"bad and reference pixels {origin}",
+        "saturation": f"{limit:.8g} DN {origin}",
+        "bias": f"{properties.bias:.8g} DN {origin}",
+        "linearity": f"{', '.join(f'{c:.4g}' for c in properties.nonlinearity)} {origin}",
+        "dark": f"{properties.dark_current:.4g} e-/s {origin}, off the slopes",
+        "gain": f"{properties.gain:.6g} e-/DN {origin}",
+        "read_noise": f"{properties.read_noise:.6g} DN {origin}",
     }
     values = {"bias": properties.bias, "saturation": limit, "linearity": properties.nonlinearity}
-    done = {name for name in used if history.done(name)}
+    done = {name for name in sources if history.done(name)}
     if "dark" not in done:
         values["dark_rate"] = properties.dark_current / properties.gain
     if not history.simulated and "mask" not in done:
         masks = (bad_pixel_mask, DQ.DO_NOT_USE), (reference_pixel_mask, DQ.REFERENCE_PIXEL)
         values["pixel_dq"] = sum(mask(**part) * np.int64(flag) for mask, flag in masks)
-    used |= dict.fromkeys(done, "done before")
+    sources |= dict.fromkeys(done, "done before")
     values = {name: value for name, value in values.items() if name not in done}
-    return DetectorMaps(gain=properties.gain, read_noise=properties.read_noise, **values, used=used)
+    return DetectorMaps(
+        gain=properties.gain, read_noise=properties.read_noise, **values, used=sources
+    )
 
 
-def needed(references, header, history, *, names, what):
+def needed(references, header, history, *, names, product):
     """
     The reference files for one exposure, complete or with a warning.
 
@@ -151,7 +154,7 @@ def needed(references, header, history, *, names, what):
         Of the exposure.
     names : tuple of str
         References that are needed.
-    what : str
+    product : str
         What they are needed for, for messages.
 
     Returns
@@ -170,11 +173,11 @@ def needed(references, header, history, *, names, what):
     """
     if references is None:
         lacks = ", ".join(ReferenceFiles().missing(history, names=names))
-        made = f"the package's Detector did not simulate (needed: {lacks})"
+        reason = f"the package's Detector did not simulate (needed: {lacks})"
         if history.origin == "unrecorded":
-            made = "the package simulated (ORIGIN), with a detector that its file does not state any more"
+            reason = "the package simulated (ORIGIN), with a detector that its file does not state any more"
         msg = (
-            f"'references' must be given for {what} of an exposure that {made}: ReferenceFiles, a "
+            f"'references' must be given for {product} of an exposure that {reason}: ReferenceFiles, a "
             "ReferenceCache, 'simulated' for miri_detector(), or 'none' for slopes in DN/s without corrections"
         )
         raise ValueError(msg)
@@ -184,10 +187,10 @@ def needed(references, header, history, *, names, what):
         references = references.find(header)
     missing = references.missing(history, names=names)
     if missing and not references.incomplete:
-        wanted = f"complete for {what} (or incomplete=True, to do without)"
+        wanted = f"complete for {product} (or incomplete=True, to do without)"
         raise argument_error("references", wanted, f"none for {', '.join(missing)}")
     if missing:
-        msg = f"{what} without references for {', '.join(missing)}: these steps are left out"
+        msg = f"{product} without references for {', '.join(missing)}: these steps are left out"
         warn(msg, ReferenceWarning)
     return references
 
@@ -272,8 +275,14 @@ class ReferenceFiles:
                 continue
             number = isinstance(value, numbers.Real) and not isinstance(value, bool)
             if name not in _NUMBERS or not number or not (np.isfinite(value) and value > 0):
-                unit = f" or a number above 0 in {_NUMBERS[name]}" if name in _NUMBERS else ""
-                measured = " or 'measured'" if name in _MEASURED else ""
+                if name in _NUMBERS:
+                    unit = f" or a number above 0 in {_NUMBERS[name]}"
+                else:
+                    unit = ""
+                if name in _MEASURED:
+                    measured = " or 'measured'"
+                else:
+                    measured = ""
                 raise argument_error(name, f"a path{unit}{measured}", repr(value))
 
     @staticmethod
@@ -298,7 +307,8 @@ class ReferenceFiles:
         -------
         names : tuple of str
         """
-        history = ExposureHistory() if history is None else history
+        if history is None:
+            history = ExposureHistory()
         return tuple(n for n in names if getattr(self, n) is None and not history.done(n))
 
     def maps(self, ramp):
@@ -324,26 +334,30 @@ class ReferenceFiles:
         `~miricigale.utils.exceptions.DataError`
             If a file cannot be read as what it should be.
         """
-        values, used = {"pixel_dq": np.zeros(ramp.exposure.shape, np.int64)}, {}
+        values = {"pixel_dq": np.zeros(ramp.exposure.shape, np.int64)}
+        names = {}
         history = ramp.history
         for name, reader in READERS.items():
             value = getattr(self, name)
             if history.done(name):
-                used[name] = "done before"
+                names[name] = "done before"
             elif isinstance(value, Path):
-                found, flags = reader(value, ramp.exposure)
+                reference_map, flags = reader(value, ramp.exposure)
                 values["pixel_dq"] |= flags
-                if found is not None:
-                    values[name] = found
-                used[name] = value.name
+                if reference_map is not None:
+                    values[name] = reference_map
+                names[name] = value.name
             elif value is not None and value != "measured":
                 values[name] = float(value)
-                used[name] = f"{value:.6g} {_NUMBERS[name]} (given)"
+                names[name] = f"{value:.6g} {_NUMBERS[name]} (given)"
             else:
-                used[name] = "none"
+                names[name] = "none"
         if "saturation" not in values and not history.done("saturation"):
-            values["saturation"] = 65535.0 if ramp.data.dtype.kind == "u" else np.inf
-            used["saturation"] = "the highest number of the converter"
+            if ramp.data.dtype.kind == "u":
+                values["saturation"] = 65535.0
+            else:
+                values["saturation"] = np.inf
+            names["saturation"] = "the highest number of the converter"
         if "dark" in values and values["dark"].shape[1] < ramp.shape[1]:
             got = f"it has {values['dark'].shape[1]} groups, and the ramp {ramp.shape[1]}"
             raise data_error(self.dark, f"is no dark reference for this exposure: {got}")
@@ -351,7 +365,7 @@ class ReferenceFiles:
             measured = measure_noise(ramp)
             for name in unknown:
                 values[name] = getattr(measured, name)
-                used[name] = measured.describe(name)
+                names[name] = measured.describe(name)
             if "gain" in unknown:
                 values["slow_noise"] = measured.slow_noise
             if "gain" in unknown and measured.effective:
@@ -362,5 +376,5 @@ class ReferenceFiles:
                 )
                 warn(msg, ReferenceWarning)
         if self.origin is not None:
-            used["context"] = self.origin
-        return DetectorMaps(**values, used=used)
+            names["context"] = self.origin
+        return DetectorMaps(**values, used=names)

@@ -53,8 +53,8 @@ class RampSettings:
     def __post_init__(self):
         for name in ("neighbor_threshold", "shower_threshold"):
             check_positive(getattr(self, name), name, optional=True)
-        known = (True, False, "channels", None)
-        check_choice(self.reference_correction, "reference_correction", known)
+        choices = (True, False, "channels", None)
+        check_choice(self.reference_correction, "reference_correction", choices)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +116,10 @@ class BackgroundSettings:
     @property
     def mesh(self):
         """Options of `estimate_background`: those of single images, also where dithers follow."""
-        method = "masked" if self.method == "dithers" else self.method
+        if self.method == "dithers":
+            method = "masked"
+        else:
+            method = self.method
         names = ("box", "filter_size", "plane")
         return {"method": method, **{name: getattr(self, name) for name in names}}
 

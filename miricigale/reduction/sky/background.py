@@ -115,7 +115,10 @@ class Background:
         return not self.flags
 
     def __repr__(self):
-        doubt = "" if self.trusted else f", {', '.join(BackgroundFlags.names(self.flags))}"
+        if self.trusted:
+            doubt = ""
+        else:
+            doubt = f", {', '.join(BackgroundFlags.names(self.flags))}"
         return (
             f"<Background median {np.median(self.level):.4g} +- {np.median(self.error):.2g}, rms "
             f"{np.median(self.rms):.4g}, {100 * self.source_mask.mean():.1f} % masked as sources{doubt}>"
@@ -233,8 +236,9 @@ def estimate_background(image, *, method="masked", box=64, filter_size=3, plane=
     if method == "sep":
         background = _plain(data, mask, int(box), int(filter_size), correlation)
     else:
-        stated, mesh = _stated(image, mask), (int(box), int(filter_size), plane)
-        background = _masked(data, mask, stated, mesh, correlation)
+        noise_map = _stated(image, mask)
+        mesh = (int(box), int(filter_size), plane)
+        background = _masked(data, mask, noise_map, mesh, correlation)
     if warn:
         warn_of(background, mask, image.unit)
     return background
@@ -253,36 +257,40 @@ def subtractable(background):
     return dataclasses.replace(background, level=np.zeros_like(background.level))
 
 
-def _masked(data, mask, stated, mesh, correlation):
+def _masked(data, mask, noise_map, mesh, correlation):
     """Background with the sources masked; ``mesh`` has the size of the boxes, the filter and the plane."""
     box, filter_size, plane = mesh
     # pixels along each axis that share their noise, as far as boxes have four such groups of them
     step = max(1, min(int(correlation), box // 4))
     # without a plane what a gradient leaves at edges would be taken for sources, the more with each round
     if step == 1:
-        mesh, found, flags = _search(SkyMesh(data, mask, box, filter_size, True), stated)
+        mesh, sources_mask, flags = _search(SkyMesh(data, mask, box, filter_size, True), noise_map)
         sources = mesh.sources
     else:
-        mean, small, known = _averaged(data, mask, stated, step, correlation)
+        mean, small, coarse_noise = _averaged(data, mask, noise_map, step, correlation)
         mesh = SkyMesh(mean, small, box // step, filter_size, True)
-        mesh, found, flags = _search(mesh, known)
-        found, sources = (
-            pixels_of(part, data.shape, step) & ~mask for part in (found, mesh.sources)
+        mesh, sources_mask, flags = _search(mesh, coarse_noise)
+        sources_mask, sources = (
+            pixels_of(part, data.shape, step) & ~mask for part in (sources_mask, mesh.sources)
         )
     if step > 1 or not plane:
-        sources = None if flags and not sources.any() else sources
+        if flags and not sources.any():
+            sources = None
         mesh = SkyMesh(data, mask, box, filter_size, plane, sources)
-    noise = mesh.rms if stated is None else np.where(stated[1], stated[0], mesh.rms)
+    if noise_map is None:
+        noise = mesh.rms
+    else:
+        noise = np.where(noise_map[1], noise_map[0], mesh.rms)
     # an image without any has that of its numbers
     noise = np.maximum(noise, np.float32(1e-6 * np.abs(mesh.level).max() or 1))
-    shift, dark, light = light_left(mesh, found, noise * np.float32(correlation), step)
+    shift, dark, light = light_left(mesh, sources_mask, noise * np.float32(correlation), step)
     if shift + np.median(_some(light)) > _DOUBT * np.median(_some(noise)):
         flags |= BackgroundFlags.CONFUSED
     error = np.sqrt((mesh.error * np.float32(correlation)) ** 2 + dark**2 + light**2)
     level = mesh.level - shift
     if _is_unknown(level, error, noise):
         flags |= BackgroundFlags.UNKNOWN
-    return Background(level, mesh.rms, error, found, mesh.box, mesh.filter_size, flags)
+    return Background(level, mesh.rms, error, sources_mask, mesh.box, mesh.filter_size, flags)
 
 
 def _is_unknown(level, error, noise):
@@ -296,29 +304,30 @@ def _is_unknown(level, error, noise):
     return np.median(_some(error)) > limit
 
 
-def _search(mesh, stated):
+def _search(mesh, noise_map):
     """Mesh of what sources leave, mask of all that were found, and whether they leave enough."""
-    mask, found = mesh.mask, mesh.sources
+    mask = mesh.mask
+    sources = mesh.sources
     for _ in range(_ROUNDS):
-        noise = _noise(stated, mesh.rms, mask | found)
-        found = grown(detect(mesh.residual, noise, mask, found), mask)
-        if np.count_nonzero(~found & ~mask) < _LEAST_SKY * np.count_nonzero(~mask):
-            return mesh, found, BackgroundFlags.FEW_SKY
+        noise = _noise(noise_map, mesh.rms, mask | sources)
+        sources = grown(detect(mesh.residual, noise, mask, sources), mask)
+        if np.count_nonzero(~sources & ~mask) < _LEAST_SKY * np.count_nonzero(~mask):
+            return mesh, sources, BackgroundFlags.FEW_SKY
         # what one pixel in a thousand changes is less than the noise
-        if np.count_nonzero(found ^ mesh.sources) <= 1e-3 * found.size:
+        if np.count_nonzero(sources ^ mesh.sources) <= 1e-3 * sources.size:
             break
-        mesh = mesh.measured(found)
+        mesh = mesh.measured(sources)
     return mesh, mesh.sources, BackgroundFlags.GOOD
 
 
-def _averaged(data, mask, stated, step, correlation):
+def _averaged(data, mask, noise_map, step, correlation):
     """Means over pixels that share their noise, their mask, and what `_stated` says of them."""
     mean, share = cells_of(data, ~mask, step)
     small = share < 0.5
-    if stated is not None:
-        error, part = cells_of(*stated, step)
-        stated = error * np.float32(correlation / step), ~small & (part > 0)
-    return np.where(small, 0, mean), small, stated
+    if noise_map is not None:
+        error, part = cells_of(*noise_map, step)
+        noise_map = error * np.float32(correlation / step), ~small & (part > 0)
+    return np.where(small, 0, mean), small, noise_map
 
 
 def _stated(image, mask):
@@ -336,12 +345,12 @@ def _some(values):
     return values[::step, ::step]
 
 
-def _noise(stated, rms, mask):
+def _noise(noise_map, rms, mask):
     """Noise about the mesh, larger where the errors are: no mesh follows the seams of mosaics."""
-    if stated is None or not (known := _some(stated[1] & ~mask)).any():
+    if noise_map is None or not (sampled := _some(noise_map[1] & ~mask)).any():
         return rms
-    scale = np.median(_some(rms)[known] / _some(stated[0])[known])
-    return np.fmax(rms, stated[0] * np.float32(scale))
+    scale = np.median(_some(rms)[sampled] / _some(noise_map[0])[sampled])
+    return np.fmax(rms, noise_map[0] * np.float32(scale))
 
 
 def warn_of(background, mask, unit):
@@ -365,7 +374,10 @@ def _plain(data, mask, box, filter_size, correlation):
     level, rms = sep_tools.background(data, mask, box, filter_size)
     # sep takes boxes of which half is left, and gives 0 and 1 where there is none
     enough = (sky_boxes(data, mask, box).share >= 0.5).any()
-    flags = BackgroundFlags.GOOD if enough else BackgroundFlags.FEW_SKY
+    if enough:
+        flags = BackgroundFlags.GOOD
+    else:
+        flags = BackgroundFlags.FEW_SKY
     error = rms * (2.14 * correlation * min(1.0, 1.2533 / filter_size) / box)
     level, rms, error = (a.astype(np.float32, copy=False) for a in (level, rms, error))
     return Background(level, rms, error, np.zeros(mask.shape, bool), box, filter_size, flags)
@@ -427,14 +439,18 @@ def remove_background(image, background, *, negative_threshold=10.0, negative_no
     """
     check_choice(negative_noise, "negative_noise", ("larger", "background"))
     check_positive(negative_threshold, "negative_threshold", optional=True)
-    good, error = ~plain_mask(image), background.error
-    known = {"background_error": float(np.median(error[good]))} if np.isfinite(error).all() else {}
+    good = ~plain_mask(image)
+    error = background.error
+    if np.isfinite(error).all():
+        entries = {"background_error": float(np.median(error[good]))}
+    else:
+        entries = {}
     out = with_data(
         image,
         np.asarray(image.data, np.float32) - background.level,
         background=float(np.median(background.level[good])),
         background_flags=BackgroundFlags.names(background.flags),
-        **known,
+        **entries,
     )
     if negative_threshold is not None:
         noise = background.rms

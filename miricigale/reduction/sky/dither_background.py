@@ -94,33 +94,38 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
         check_that(im.shape == shape, "images", f"of one shape {shape}", im.shape)
     if backgrounds is None:
         backgrounds = [estimate_background(im, warn=False) for im in images]
-    alone = list(backgrounds)
-    if len(alone) != len(images):
-        raise argument_error("backgrounds", f"one for each of {len(images)} images", len(alone))
+    single = list(backgrounds)
+    if len(single) != len(images):
+        raise argument_error("backgrounds", f"one for each of {len(images)} images", len(single))
     masks = [plain_mask(im) for im in images]
     if wcs is None:
         wcs = own_grid(images, 0.11 * ANGLE)
-    sources = _deep_masks(images, alone, wcs)
-    levels = [float(np.median(b.level[~m])) for b, m in zip(alone, masks, strict=True)]
+    sources = _deep_masks(images, single, wcs)
+    levels = [float(np.median(b.level[~m])) for b, m in zip(single, masks, strict=True)]
     templates = other_medians(images, masks, sources, levels)
     out = []
-    for im, own, mask, source, level, template in zip(
-        images, alone, masks, sources, levels, templates, strict=True
+    for im, background, mask, source, level, template in zip(
+        images, single, masks, sources, levels, templates, strict=True
     ):
-        known = np.isfinite(template)
+        finite = np.isfinite(template)
         wanted = "ones that leave some sky to each other"
-        check_that(known.any(), "images", wanted, "none in common")
-        boxes = sky_boxes(np.where(known, template, 0), ~known, _BOX)
+        check_that(finite.any(), "images", wanted, "none in common")
+        boxes = sky_boxes(np.where(finite, template, 0), ~finite, _BOX)
         smooth, error = (boxes.smooth(v, shape, filter_size=1) for v in (boxes.level, boxes.error))
         sky = ~(mask | source)
-        rest = with_data(im, im.data - smooth)
-        constant = float(np.median(rest.data[sky])) if sky.any() else level
+        remainder = with_data(im, im.data - smooth)
+        if sky.any():
+            constant = float(np.median(remainder.data[sky]))
+        else:
+            constant = level
         # what is left is judged as an image is, its mesh is not taken off
-        left = estimate_background(rest, warn=False, box=own.box, filter_size=own.filter_size)
+        residual = estimate_background(
+            remainder, warn=False, box=background.box, filter_size=background.filter_size
+        )
         new = dataclasses.replace(
-            left,
+            residual,
             level=(smooth + constant).astype(np.float32),
-            error=np.hypot(error, left.error).astype(np.float32),
+            error=np.hypot(error, residual.error).astype(np.float32),
             source_mask=source,
         )
         warn_of(new, mask, im.unit)
@@ -130,12 +135,12 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
 
 def restored(image, level):
     """An image of which a background was subtracted, with that background."""
-    whole = with_data(image, image.data + level)
+    image_with_sky = with_data(image, image.data + level)
     # what was far below the background is to be judged again
-    low = (whole.flags & int(DQ.NEGATIVE)) != 0
-    whole.flags[low] &= ~int(DQ.NEGATIVE | DQ.DO_NOT_USE)
-    whole.mask[low] = False
-    return whole
+    low = (image_with_sky.flags & int(DQ.NEGATIVE)) != 0
+    image_with_sky.flags[low] &= ~int(DQ.NEGATIVE | DQ.DO_NOT_USE)
+    image_with_sky.mask[low] = False
+    return image_with_sky
 
 
 def _deep_masks(images, backgrounds, wcs):
@@ -145,24 +150,28 @@ def _deep_masks(images, backgrounds, wcs):
     flat = [with_data(im, im.data - background.level) for im, background in pairs]
     maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     mosaic = drizzle_images(flat, wcs, pixel_maps=maps).image
-    found = binary_dilation(estimate_background(mosaic, warn=False).source_mask, iterations=_WIDER)
+    sources = binary_dilation(
+        estimate_background(mosaic, warn=False).source_mask, iterations=_WIDER
+    )
     out = []
     for x, y in maps:
         # beside the grid nothing is known
-        inside = (x > -0.5) & (x < found.shape[1] - 0.5) & (y > -0.5) & (y < found.shape[0] - 0.5)
+        inside = (
+            (x > -0.5) & (x < sources.shape[1] - 0.5) & (y > -0.5) & (y < sources.shape[0] - 0.5)
+        )
         at = (np.rint(np.where(inside, v, 0)).astype(int) for v in (y, x))
-        out.append(found[tuple(at)] & inside)
+        out.append(sources[tuple(at)] & inside)
     return out
 
 
-def other_medians(images, masks, sources, levels, others=None):
+def other_medians(images, masks, sources, levels, uses=None):
     """
     For each image the median of the others in each pixel, each less its level; NaN without any.
 
     ``others`` has a row for each image: which ones count, all but itself by default.
     """
-    if others is None:
-        others = ~np.eye(len(images), dtype=bool)
+    if uses is None:
+        uses = ~np.eye(len(images), dtype=bool)
     shape = images[0].shape
     out = [np.full(shape, np.nan, np.float32) for _ in images]
     for rows in chunks(shape[0], _ROWS):
@@ -173,5 +182,5 @@ def other_medians(images, masks, sources, levels, others=None):
             ]
         ).astype(np.float32)
         for k, template in enumerate(out):
-            template[rows], _ = nan_median(stack[others[k]])
+            template[rows], _ = nan_median(stack[uses[k]])
     return out

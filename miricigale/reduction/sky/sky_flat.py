@@ -69,30 +69,31 @@ def sky_flats(images, *, window=None, box=16):
         raise argument_error("images", f"of one shape {images[0].shape}", images[-1].shape)
     days = np.array([ExposureHistory.of(im).day for im in images], float)
     # comparisons with the NaN of an unknown day are False
-    apart = np.abs(np.subtract.outer(days, days)) > (np.inf if window is None else window)
-    others = ~apart & ~np.eye(days.size, dtype=bool)
-    if not others.size or others.sum(axis=1).min() < 2:
+    distant = np.abs(np.subtract.outer(days, days)) > (np.inf if window is None else window)
+    uses = ~distant & ~np.eye(days.size, dtype=bool)
+    if not uses.size or uses.sum(axis=1).min() < 2:
         raise argument_error("images", "three or more within the window", f"{len(images)} images")
     masks = [plain_mask(im) for im in images]
-    sources, out = [np.zeros(mask.shape, bool) for mask in masks], None
+    sources = [np.zeros(mask.shape, bool) for mask in masks]
+    out = None
     # peaks of the response look like sources: these are searched for when it is gone
     for search in (False, True):
         if search:
-            even = [
+            images_flat = [
                 with_data(im, im.data / flat.data) for im, flat in zip(images, out, strict=True)
             ]
-            sources = [estimate_background(im, warn=False).source_mask for im in even]
+            sources = [estimate_background(im, warn=False).source_mask for im in images_flat]
         hidden = zip(images, masks, sources, strict=True)
         levels = [float(np.median(im.data[~(mask | source)])) for im, mask, source in hidden]
         check_that(min(levels) > 0, "images", "of positive sky levels", f"{min(levels):.3g}")
         relative = [with_data(im, im.data / v) for im, v in zip(images, levels, strict=True)]
         out = []
-        for template in other_medians(relative, masks, sources, [1.0] * len(images), others):
-            known = np.isfinite(template)
-            boxes = sky_boxes(np.where(known, template, 0), ~known, box)
-            flat = 1 + boxes.smooth(boxes.level, known.shape, filter_size=1)
-            error = boxes.smooth(boxes.error, known.shape, filter_size=1)
-            flat = flat / np.median(flat[known])
+        for template in other_medians(relative, masks, sources, [1.0] * len(images), uses):
+            finite = np.isfinite(template)
+            boxes = sky_boxes(np.where(finite, template, 0), ~finite, box)
+            flat = 1 + boxes.smooth(boxes.level, finite.shape, filter_size=1)
+            error = boxes.smooth(boxes.error, finite.shape, filter_size=1)
+            flat = flat / np.median(flat[finite])
             out.append(CCDData(flat, unit="", uncertainty=StdDevUncertainty(error)))
     return out
 
@@ -117,14 +118,14 @@ def flattened(reducer, images, backgrounds):
     backgrounds : list of `Background`
         Measured again, with the error of the flat in theirs.
     """
-    whole = [restored(im, b.level) for im, b in zip(images, backgrounds, strict=True)]
+    unsubtracted = [restored(im, b.level) for im, b in zip(images, backgrounds, strict=True)]
     out = []
-    flats = sky_flats(whole, window=reducer.background.sky_flat)
-    for im, flat in zip(whole, flats, strict=True):
+    flats = sky_flats(unsubtracted, window=reducer.background.sky_flat)
+    for im, flat in zip(unsubtracted, flats, strict=True):
         error = flat.uncertainty.array
         values = {"factor": 1 / flat.data, "sky_flat_error": float(np.median(error))}
-        even = with_data(im, im.data / flat.data, **values)
-        even, background = reducer.subtract_background(even)
+        flat_image = with_data(im, im.data / flat.data, **values)
+        flat_image, background = reducer.subtract_background(flat_image)
         error = np.hypot(background.error, background.level * error).astype(np.float32)
-        out.append((even, dataclasses.replace(background, error=error)))
+        out.append((flat_image, dataclasses.replace(background, error=error)))
     return tuple(map(list, zip(*out, strict=True)))

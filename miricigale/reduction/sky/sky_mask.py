@@ -11,19 +11,24 @@ _TIERS = ((0.85, 5), (2.5, 20))
 _THRESHOLD = 3.0
 # light too faint and wide for these is looked for in cells of so many pixels: standard deviations of the
 # smoothing in cells, least numbers of connected ones, and sigma
-_CELL, _WIDE_TIERS = 4, ((1.0, 3, 3.0), (2.0, 12, 6.0))
+_CELL = 4
+_WIDE_TIERS = ((1.0, 3, 3.0), (2.0, 12, 6.0))
 # the mask of the sources is dilated by this many pixels
 _GROW = 3
 # the mask of a source grows by the first of these shares of its half width that leaves half of the sky
 _GROWTH = (2.0, 1.0, 0.5)
 # light that no mask finds is looked for in cells of so many pixels: those so many sigma below the sky
-_DARK_CELL, _DARK = 8, 2.58
+_DARK_CELL = 8
+_DARK = 2.58
 # less than the first of these, in the noise of a pixel, is not taken off, for errors are not known so well, nor
 # where sources cover less than the second and it is less than the third, in that noise
-_HIDDEN, _LEAST_SHARE, _STRUCTURE = 0.1, 0.05, 20.0
+_HIDDEN = 0.1
+_LEAST_SHARE = 0.05
+_STRUCTURE = 20.0
 # shares of the light that masks find, and of that in the mesh where they cover all, in the error of the level,
 # as measured (benchmarks/background.py)
-_MASKED, _WIDE = 0.5, 2.5
+_MASKED = 0.5
+_WIDE = 2.5
 
 
 def cells_of(values, weight=None, size=_CELL):
@@ -37,9 +42,9 @@ def cells_of(values, weight=None, size=_CELL):
 
 def _added(values, size):
     """Sums over cells; what is beyond the edge is zero."""
-    left = [(0, -n % size) for n in values.shape]
-    if any(more for _, more in left):
-        values = np.pad(values, left)
+    padding = [(0, -n % size) for n in values.shape]
+    if any(end for _, end in padding):
+        values = np.pad(values, padding)
     rows = values[::size] + values[1::size]
     for k in range(2, size):
         rows += values[k::size]
@@ -62,61 +67,63 @@ def detect(residual, rms, mask, sources):
         return np.zeros(mask.shape, bool)
     scaled = np.zeros(mask.shape, np.float32)
     np.divide(residual, rms, out=scaled, where=good, casting="same_kind")
-    found = np.zeros(mask.shape, bool)
+    detected = np.zeros(mask.shape, bool)
     for width, area in _TIERS:
         smooth = gaussian_filter(scaled, width, mode="nearest")
-        found |= _risen(smooth, good, sky, _THRESHOLD, area)
+        detected |= _risen(smooth, good, sky, _THRESHOLD, area)
     # what is found is left out, or it would be smeared over cells
-    cells, share = cells_of(scaled, good & ~found)
-    sky, wide = cells_of(sky) >= 0.5, np.zeros(share.shape, bool)
+    cells, share = cells_of(scaled, good & ~detected)
+    sky = cells_of(sky) >= 0.5
+    wide = np.zeros(share.shape, bool)
     for width, area, threshold in _WIDE_TIERS if sky.any() else ():
         smooth, weight = (
             gaussian_filter(a, width, mode="constant") for a in (cells * share, share)
         )
         # of one noise also where few cells count, as at the edge
         smooth /= np.sqrt(np.maximum(weight, 1e-3))
-        seen = (share >= 0.5) & (weight >= 0.3)
-        wide |= _risen(smooth, seen, sky & seen, threshold, area)
-    found |= pixels_of(wide, mask.shape)
-    return found & ~mask
+        covered = (share >= 0.5) & (weight >= 0.3)
+        wide |= _risen(smooth, covered, sky & covered, threshold, area)
+    detected |= pixels_of(wide, mask.shape)
+    return detected & ~mask
 
 
 def _risen(smooth, good, sky, threshold, area):
     """Connected places of an image that rise above the noise that its sky has."""
     # correlated noise is smoothed less, so that it is measured, on the negative side: of the
     # other the mask leaves a part
-    below = -smooth[sky & (smooth < 0)]
+    negative = -smooth[sky & (smooth < 0)]
     # a million of them determine the median
-    below = below[:: max(1, below.size // 1_000_000)].copy()
-    if not below.size:
+    negative = negative[:: max(1, negative.size // 1_000_000)].copy()
+    if not negative.size:
         return np.zeros(smooth.shape, bool)
-    high = good & (smooth > threshold * 1.4826 * _median(below))
+    high = good & (smooth > threshold * 1.4826 * _median(negative))
     labels, n = label(high, np.ones((3, 3), bool))
     # the sky, label 0, is most of the image: only what is high is looked at
     inside = labels[high]
-    found = np.zeros(smooth.shape, bool)
-    found[high] = (np.bincount(inside, minlength=n + 1) >= area)[inside]
-    return found
+    detected = np.zeros(smooth.shape, bool)
+    detected[high] = (np.bincount(inside, minlength=n + 1) >= area)[inside]
+    return detected
 
 
 def grown(sources, mask):
     """A mask of sources, each part of it wider by a share of its half width, in cells."""
     # small ones by the cells around them
-    cores, radius = [(distance_transform_edt(cells_of(sources) < 0.5), 0.6)], 2.5
+    cores = [(distance_transform_edt(cells_of(sources) < 0.5), 0.6)]
+    radius = 2.5
     sources = binary_dilation(sources, iterations=_GROW)
     depth = distance_transform_edt(cells_of(sources) >= 0.5)
     while (core := depth >= radius).any():
         cores.append((distance_transform_edt(~core), radius))
         radius *= 1.5
-    seen = cells_of(mask) < 0.5
+    covered = cells_of(mask) < 0.5
     for growth in _GROWTH:
         wide = np.any([away <= (1 + growth) * r for away, r in cores], axis=0)
-        if np.count_nonzero(seen & ~wide) >= 0.5 * np.count_nonzero(seen):
+        if np.count_nonzero(covered & ~wide) >= 0.5 * np.count_nonzero(covered):
             break
     return sources | pixels_of(wide, sources.shape)
 
 
-def light_left(mesh, found, noise, step=1):
+def light_left(mesh, sources, noise, step=1):
     """
     Light of sources in what is left as sky, as far as the image shows it.
 
@@ -124,7 +131,7 @@ def light_left(mesh, found, noise, step=1):
     ----------
     mesh : `~miricigale.reduction.sky.sky_mesh.SkyMesh`
         Sky of the image.
-    found : `~numpy.ndarray` of bool, shape (ny, nx)
+    sources : `~numpy.ndarray` of bool, shape (ny, nx)
         All that was found as sources, if the mesh masks less.
     noise : `~numpy.ndarray`, shape (ny, nx)
         Error of each pixel, as it is in sums over many.
@@ -140,19 +147,23 @@ def light_left(mesh, found, noise, step=1):
     light : `~numpy.ndarray`, shape (ny, nx)
         Share of the sources' own light that may be in it.
     """
-    good, size = ~mesh.mask, _DARK_CELL * step
+    good = ~mesh.mask
+    size = _DARK_CELL * step
     sky = good & ~mesh.sources
     (mean, share), (error, _) = (cells_of(v, sky, size) for v in (mesh.residual, noise))
-    used = share >= min(0.5, share.max())
-    error = error[used] / (np.sqrt(share[used]) * size)
+    enough = share >= min(0.5, share.max())
+    error = error[enough] / (np.sqrt(share[enough]) * size)
     part = norm.cdf(-_DARK)
-    low = -np.quantile(mean[used] / error, part)
-    chance, error = np.sqrt(part / error.size) / norm.pdf(_DARK), float(np.median(error))
-    below = max(0.0, low - _DARK)
+    low = -np.quantile(mean[enough] / error, part)
+    chance = np.sqrt(part / error.size) / norm.pdf(_DARK)
+    error = float(np.median(error))
+    dark_level = max(0.0, low - _DARK)
     # in quadrature, beyond chance: all that may be there
     hidden = max(0.0, low**2 - _DARK**2 - 2 * _DARK * chance)
-    dark, shift = error * max(below, np.sqrt(hidden)), error * max(0.0, below - chance)
-    covered, sigma = np.mean(found[good]), float(np.median(noise[good]))
+    dark = error * max(dark_level, np.sqrt(hidden))
+    shift = error * max(0.0, dark_level - chance)
+    covered = np.mean(sources[good])
+    sigma = float(np.median(noise[good]))
     # without sources it is structure of another kind, as dark as bright, unless it is too strong for that
     sure = (covered / _LEAST_SHARE) ** 2 + (dark / (_STRUCTURE * sigma)) ** 2
     shift *= sure / (1 + sure) * shift**2 / (shift**2 + max(_HIDDEN * sigma, error) ** 2)

@@ -73,20 +73,22 @@ def sky_offsets(images, wcs, *, pixel_maps=None):
     check_images(images, wcs)
     if pixel_maps is None:
         pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
-    means = [
-        _means(im, where, wcs.pixel_shape[::-1])
-        for im, where in zip(images, pixel_maps, strict=True)
-    ]
+    means = []
+    for im, pixels in zip(images, pixel_maps, strict=True):
+        means.append(_means(im, pixels, wcs.pixel_shape[::-1]))
     n = len(images)
     pairs = {(i, j): _difference(means[i], means[j]) for i in range(n) for j in range(i)}
-    pairs = {pair: found for pair, found in pairs.items() if found is not None}
+    pairs = {
+        pair: offset_of_pair for pair, offset_of_pair in pairs.items() if offset_of_pair is not None
+    }
     if not pairs:
         return np.zeros(n)
     # images that are one and the same have no scatter: others would count for nothing beside them
-    least = 1e-3 * max(spread for _, spread, _ in pairs.values()) or 1.0
-    matrix, right = np.zeros((n, n)), np.zeros(n)
+    floor = 1e-3 * max(spread for _, spread, _ in pairs.values()) or 1.0
+    matrix = np.zeros((n, n))
+    right = np.zeros(n)
     for (i, j), (difference, spread, number) in pairs.items():
-        weight = number / max(spread, least) ** 2
+        weight = number / max(spread, floor) ** 2
         # the normal equations of offset i - offset j = difference
         for k, m, sign in ((i, j, 1.0), (j, i, -1.0)):
             matrix[k, k] += weight
@@ -97,9 +99,9 @@ def sky_offsets(images, wcs, *, pixel_maps=None):
     return np.linalg.pinv(matrix / scale, rcond=1e-10, hermitian=True) @ (right / scale)
 
 
-def _means(im, where, shape):
+def _means(im, pixels, shape):
     """Numbers of the cells that an image fills at least by half, in order, and its mean in them."""
-    x, y = where
+    x, y = pixels
     ny, nx = (-(-n // _CELL) for n in shape)
     good = ~plain_mask(im) & np.isfinite(x) & np.isfinite(y)
     column, row = (np.floor((v[good] + 0.5) / _CELL).astype(int) for v in (x, y))
@@ -113,12 +115,12 @@ def _means(im, where, shape):
     return numbers, total[numbers] / count[numbers]
 
 
-def _difference(one, other):
+def _difference(means, reference):
     """Median difference of two images in the cells that both fill, its scatter and their number; None with few."""
-    _, i, j = np.intersect1d(one[0], other[0], assume_unique=True, return_indices=True)
+    _, i, j = np.intersect1d(means[0], reference[0], assume_unique=True, return_indices=True)
     if i.size < _LEAST:
         return None
-    difference = one[1][i] - other[1][j]
+    difference = means[1][i] - reference[1][j]
     middle = float(np.median(difference))
     return middle, 1.4826 * float(np.median(np.abs(difference - middle))), i.size
 
@@ -160,11 +162,13 @@ def match_levels(images, wcs, *, pixel_maps=None):
     """
     images = list(images)
     offsets = sky_offsets(images, wcs, pixel_maps=pixel_maps)
-    return [
-        with_data(
-            im,
-            im.data - np.asarray(offset, im.data.dtype),
-            sky_offset=float(offset) + float(im.meta.get("sky_offset", 0.0)),
+    out = []
+    for im, offset in zip(images, offsets, strict=True):
+        out.append(
+            with_data(
+                im,
+                im.data - np.asarray(offset, im.data.dtype),
+                sky_offset=float(offset) + float(im.meta.get("sky_offset", 0.0)),
+            )
         )
-        for im, offset in zip(images, offsets, strict=True)
-    ]
+    return out

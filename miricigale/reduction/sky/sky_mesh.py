@@ -9,7 +9,8 @@ from scipy.interpolate import make_interp_spline
 from scipy.ndimage import distance_transform_edt
 
 #: Clipping of a box, in standard deviations, and what it leaves of that of a Gaussian.
-_CLIP, _CLIPPED = 3.0, 0.98655
+_CLIP = 3.0
+_CLIPPED = 0.98655
 #: Error of the median of n Gaussian values, times sqrt(n) over their standard deviation.
 _MEDIAN_ERROR = 1.2533
 #: A box counts if it has so many pixels of sky, and half as large a share of them as the boxes at large.
@@ -49,7 +50,9 @@ class SkyBoxes:
         if not full.any():
             return full
         enough = (self.count >= _MIN_PIXELS) & (self.share >= 0.5 * np.median(self.share[full]))
-        return enough if enough.any() else full
+        if enough.any():
+            return enough
+        return full
 
     @property
     def error(self):
@@ -67,9 +70,16 @@ class SkyBoxes:
         # in units of the image, about its middle
         y, x = (v / edge[-1] - 0.5 for v, edge in zip(self.center, self.edges, strict=True))
         everywhere = np.stack([np.ones_like(y), y, x, y * y, y * x, x * x], axis=-1)
-        terms, level = everywhere[self.used], values[self.used]
-        number = 6 if level.size >= 20 else 3 if level.size >= 6 else 0
-        coefficients, keep = np.zeros(6), np.ones(level.size, bool)
+        terms = everywhere[self.used]
+        level = values[self.used]
+        if level.size >= 20:
+            number = 6
+        elif level.size >= 6:
+            number = 3
+        else:
+            number = 0
+        coefficients = np.zeros(6)
+        keep = np.ones(level.size, bool)
         for _ in range(10 if number else 0):
             fitted, *_ = np.linalg.lstsq(terms[keep, :number], level[keep], rcond=None)
             coefficients[:number] = fitted
@@ -83,9 +93,9 @@ class SkyBoxes:
         y, x = (np.arange(n) / edge[-1] - 0.5 for n, edge in zip(shape, self.edges, strict=True))
         constant, along_y, along_x, y2, yx, x2 = coefficients
         # one product of matrices in place of six images
-        left = np.stack([constant + (along_y + y2 * y) * y, np.ones_like(y), yx * y], axis=1)
+        row_terms = np.stack([constant + (along_y + y2 * y) * y, np.ones_like(y), yx * y], axis=1)
         right = np.stack([np.ones_like(x), (along_x + x2 * x) * x, x])
-        pixels = left.astype(np.float32) @ right.astype(np.float32)
+        pixels = row_terms.astype(np.float32) @ right.astype(np.float32)
         return pixels, everywhere @ coefficients
 
     def smooth(self, values, shape, filter_size):
@@ -148,7 +158,8 @@ def sky_boxes(data, mask, box, *, mode=False):
     Bertin & Arnouts 1996, A&AS 117, 393, sec. 4.
     """
     ny, nx = data.shape
-    rows, columns = box_edges(ny, box), box_edges(nx, box)
+    rows = box_edges(ny, box)
+    columns = box_edges(nx, box)
     n = columns.size - 1
     width = int(np.diff(columns).max())
     at = columns[:-1, None] + np.arange(width)
@@ -163,8 +174,8 @@ def sky_boxes(data, mask, box, *, mode=False):
         values[:, ~inside] = np.inf
         values = np.sort(values.swapaxes(0, 1).reshape(n, -1), axis=1)
         number = np.add.reduceat(good.sum(axis=0), columns[:-1])
-        for j, many in enumerate(number):
-            level[i, j], spread[i, j], count[i, j] = _clipped(values[j, :many], mode)
+        for j, n_pixels in enumerate(number):
+            level[i, j], spread[i, j], count[i, j] = _clipped(values[j, :n_pixels], mode)
         share[i] = number / (np.diff(columns) * good.shape[0])
         along_y = np.add.reduceat(good.T @ np.arange(rows[i], rows[i + 1]), columns[:-1])
         along_x = np.add.reduceat(good.sum(axis=0) * np.arange(nx), columns[:-1])
@@ -179,7 +190,8 @@ def _clipped(values, mode):
     # sums of squares of what is near zero are exact enough
     shift = float(values[values.size // 2])
     values = values.astype(float) - shift
-    low, high = 0, values.size
+    low = 0
+    high = values.size
     for _ in range(20):
         part = values[low:high]
         mean = np.add.reduce(part) / part.size
@@ -211,18 +223,27 @@ def _filtered(values, size):
     """Median of the finite values in windows; NaN where fewer than three would stand for none."""
     if size == 1:
         return values
-    before, after = (size - 1) // 2, size // 2
+    before = (size - 1) // 2
+    after = size // 2
     # what rises toward an edge is continued beyond it, or the median would pull it back
     padded = values
     for axis, n in enumerate(values.shape):
-        ends = [(before, after) if k == axis else (0, 0) for k in (0, 1)]
-        mirror = {"mode": "reflect", "reflect_type": "odd"} if n > after else {"mode": "edge"}
+        ends = []
+        for k in (0, 1):
+            if k == axis:
+                ends.append((before, after))
+            else:
+                ends.append((0, 0))
+        if n > after:
+            mirror = {"mode": "reflect", "reflect_type": "odd"}
+        else:
+            mirror = {"mode": "edge"}
         padded = np.pad(padded, ends, **mirror)
     window = np.lib.stride_tricks.sliding_window_view(padded, (size, size))
     window = window.reshape(*values.shape, -1)
-    seen = np.isfinite(values) | (np.isfinite(window).sum(axis=-1) >= 3)
+    valid = np.isfinite(values) | (np.isfinite(window).sum(axis=-1) >= 3)
     out = np.full(values.shape, np.nan)
-    out[seen] = np.nanmedian(window[seen], axis=-1)
+    out[valid] = np.nanmedian(window[valid], axis=-1)
     return out
 
 
@@ -254,11 +275,15 @@ class SkyMesh:
     """
 
     def __init__(self, data, mask, box, filter_size, plane, sources=None):
-        self._data, self.mask, self.plane = data, mask, plane
-        self.box, self.filter_size = box, filter_size
+        self._data = data
+        self.mask = mask
+        self.plane = plane
+        self.box = box
+        self.filter_size = filter_size
         self._smooth = np.zeros((1, 1), data.dtype)
         mode = sources is None
-        sources = np.zeros_like(mask) if mode else sources
+        if mode:
+            sources = np.zeros_like(mask)
         # boxes are measured once more without the surface, which widens their distribution
         if plane:
             boxes = sky_boxes(data, mask | sources, box, mode=mode)
@@ -276,8 +301,9 @@ class SkyMesh:
         boxes = sky_boxes(self._data - self._smooth, self.mask | sources, self.box, mode=mode)
         values = boxes.level
         if self.plane:
-            more, there = boxes.surface(values, self._data.shape)
-            self._smooth, values = self._smooth + more, values - there
+            surface, is_valid = boxes.surface(values, self._data.shape)
+            self._smooth = self._smooth + surface
+            values = values - is_valid
         self._boxes = boxes
         mesh = self._over(values)
         self.residual = self._data - self._smooth - mesh

@@ -57,20 +57,26 @@ def remove_stripes(image):
     >>> print(f"{remove_stripes(image).meta['stripes']:.0f} MJy/sr")
     5 MJy/sr
     """
-    mask, pattern = plain_mask(image), np.zeros(image.shape, np.float32)
+    mask = plain_mask(image)
+    pattern = np.zeros(image.shape, np.float32)
     # stripes look like sources until most of them are gone
     for method in ("sep", "masked", "masked"):
         flat = with_data(image, image.data - pattern)
         background = estimate_background(flat, method=method, warn=False)
         low = np.abs(flat.data - background.level) < _CLIP * background.rms
         sky = low & ~(mask | background.source_mask)
-        rest, unknown = np.where(sky, image.data - background.level, np.nan), 0
+        residual = np.where(sky, image.data - background.level, np.nan)
+        unknown = 0
         pattern[:] = 0
-        for left, part in ((rest, pattern), (rest.T, pattern.T)):
+        for lines, part in ((residual, pattern), (residual.T, pattern.T)):
             # NaN - pattern stays NaN: what is masked never counts
-            level, count = nan_median((left - part).astype(np.float32))
-            known = (count >= _LEAST) & np.isfinite(level)
-            part += np.where(known, level - np.median(level[known]) if known.any() else 0, 0)
-            unknown += int(np.count_nonzero(~known & ~mask.all(axis=0 if part is pattern else 1)))
+            level, count = nan_median((lines - part).astype(np.float32))
+            measured = (count >= _LEAST) & np.isfinite(level)
+            part += np.where(
+                measured, level - np.median(level[measured]) if measured.any() else 0, 0
+            )
+            unknown += int(
+                np.count_nonzero(~measured & ~mask.all(axis=0 if part is pattern else 1))
+            )
     values = {"stripes": float(np.std(pattern[~mask])), "stripes_unknown": unknown}
     return with_data(image, image.data - pattern, **values)
