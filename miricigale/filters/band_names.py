@@ -1,17 +1,25 @@
 """Names of bands: of CIGALE, old and new, and of surveys, for ours."""
 
 import re
+import warnings
+
+import astropy.units as u
 
 from miricigale.filters.library import FILTERS, SEDPY, curve_folder
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.package_tables import declared
+from miricigale.utils.units import FNU, flux_unit
 
 # between the parts of a name, and the endings of the files of curves
 _BETWEEN = re.compile(r"[\s._/:-]+")
 _ENDING = re.compile(r"\.(dat|txt|par|res|filter)$", re.IGNORECASE)
 # bands that are one of a single instrument, whatever is before them
 _ALONE = re.compile(r"f\d+\w*|ch[1-4]|j[123]|h[12]|f850lp")
+# a unit at the end of the name of a column: "F770W [uJy]", "f_F770W_nJy"
+_UNIT = re.compile(
+    r"(?P<name>.+?)\s*(?:[\[(](?P<inner>[^\[\]]+)[\])]|_(?P<suffix>[num]?Jy|nanomaggies))"
+)
 _XRAY = re.compile(r"xray_boxcar_(\d+(?:p\d+)?)to(\d+(?:p\d+)?)keV")
 
 
@@ -71,6 +79,39 @@ def find_filter(text):
         else:
             name = SEDPY + text
     return name
+
+
+def name_and_unit(text):
+    """
+    Take the unit off the end of the name of a column.
+
+    Parameters
+    ----------
+    text : str
+        Such as ``"F770W [uJy]"``, ``"flux_f770w(mJy)"`` or ``"f_F770W_nJy"``.
+
+    Returns
+    -------
+    name : str
+        Without the unit; the text itself if no unit of flux density and none of magnitudes ends it.
+    unit : `~astropy.units.UnitBase` or `~astropy.units.FunctionUnitBase` or None
+        None without one, and for magnitudes that do not say of which kind.
+    """
+    match = _UNIT.fullmatch(text)
+    if match is None:
+        return text, None
+    word = match["inner"] or match["suffix"]
+    if word.strip().lower() == "mag":
+        return match["name"], None
+    unit = flux_unit(word)
+    if unit is None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", u.UnitsWarning)
+            unit = u.Unit(word, parse_strict="silent")
+    is_flux = isinstance(unit, u.UnitBase) and unit.is_equivalent(FNU)
+    if is_flux or unit == u.ABmag:
+        return match["name"], unit
+    return text, None
 
 
 def known_filter(label, names, kind="filter"):

@@ -140,7 +140,11 @@ def codes_of(table, bands):
     coded = {}
     for name in bands:
         error = error_column(name)
-        if any(n not in table.colnames or table[n].dtype.kind == "c" for n in (name, error)):
+        names = (name, error)
+        if not set(names) <= set(table.colnames):
+            continue
+        # the reader of the columns refuses others
+        if any(np.ndim(table[n]) != 1 or table[n].dtype.kind == "c" for n in names):
             continue
         try:
             values = plain_floats(table[name], name, "photometry")

@@ -11,7 +11,7 @@ import numpy as np
 from astropy.coordinates import Angle
 from astropy.table import MaskedColumn, QTable
 
-from miricigale.filters.band_names import eazy_filter
+from miricigale.filters.band_names import eazy_filter, name_and_unit
 from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
 from miricigale.utils.exceptions import (
@@ -281,6 +281,9 @@ class CatalogMap:
         out = QTable(meta=table.meta)
         for theirs, ours in names.items():
             out[ours] = table[theirs]
+            unit = name_and_unit(theirs)[1]
+            if is_band(ours) and unit is not None and getattr(out[ours], "unit", None) is None:
+                out[ours].unit = unit
         check_names(self.units, f"column of {argument}", [*out.colnames, "flux"])
         _plain_ids(out, argument)
         coded = {}
@@ -301,7 +304,7 @@ class CatalogMap:
             return 1.0
         check_names([self.factor], f"column of {argument}", table.colnames)
         column = table[self.factor]
-        values = plain_floats(column, self.factor, argument)
+        values = _column_floats(column, self.factor, argument)
         in_magnitudes = column.unit == u.mag
         missing = is_code(values) | np.isinf(values)
         if not in_magnitudes:
@@ -348,14 +351,16 @@ class CatalogMap:
         error = error_column(name)
         unit = self._unit_of_column(name, table[name], True, argument)
         if unit is None or unit == u.mag or not (_is_ab(unit) or unit.is_equivalent(FNU)):
-            say = "AB magnitudes are units={'flux': 'ABmag'}"
-            if unit is None:
-                say = "say it, such as units={'flux': 'uJy'}"
+            say = "say it, such as units={'flux': 'uJy'}"
+            if unit == u.mag:
+                say = "AB magnitudes are units={'flux': 'ABmag'}"
+            elif unit is not None:
+                say = "say another, such as units={'flux': 'uJy'}, if it is wrong"
             raise units_error(argument, f"convertible to {FNU}", f"{unit}: {say}", column=name)
-        values = plain_floats(table[name], name, argument)
+        values = _column_floats(table[name], name, argument)
         errors = None
         if error in table.colnames:
-            errors = plain_floats(table[error], error, argument)
+            errors = _column_floats(table[error], error, argument)
         ab = _is_ab(unit)
         missing, no_error = without_codes(values, errors, magnitudes=ab, further=self.missing)
         if errors is not None and not self.limits and not ab:
@@ -396,6 +401,14 @@ class CatalogMap:
         if unit is None or not unit.is_equivalent(FNU):
             raise units_error(argument, f"convertible to {FNU}", unit, column=name)
         return u.Quantity(errors, unit).to_value(FNU) * factor
+
+
+def _column_floats(column, name, argument):
+    """Numbers of a column that has one in each row (`miricigale.utils.missing_values.plain_floats`)."""
+    shape = np.shape(column)
+    wanted = f"a table with one number in a row of {name!r}"
+    check_that(len(shape) == 1, argument, wanted, f"shape {shape}")
+    return plain_floats(column, name, argument)
 
 
 def _translate_rows(text):

@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.filters.band_names import find_filter
+from miricigale.filters.band_names import find_filter, name_and_unit
 from miricigale.filters.catalog_files import catalog_messages
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
@@ -43,9 +43,10 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     ----------
     data : `~astropy.table.Table` or anything for `~miricigale.utils.tables.as_table`
         Fluxes by any usual name of a band (``F770W``, ``f_F770W``, ``mag_F770W``, ``jwst.miri.F770W``) and
-        their errors (``F770W_err``, ``e_F770W``, ``err_F770W``), as flux densities or AB magnitudes. Where one
-        band is meant and none is named, ``flux`` or ``mag`` is it. Also the ``obs`` of Prospector, a single object
-        in maggies: a dict, or its ``Photometry``.
+        their errors (``F770W_err``, ``e_F770W``, ``err_F770W``), as flux densities or AB magnitudes; a unit may
+        end the name of a column without one (``F770W [uJy]``, ``f_F770W_nJy``). Where one band is meant and none
+        is named, ``flux`` or ``mag`` is it. Also the ``obs`` of Prospector, a single object in maggies: a dict, or
+        its ``Photometry``.
     bands : iterable of str
         Our names of the bands that are meant; other columns stay as they are.
     argument : str, optional
@@ -107,7 +108,10 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     if "id" not in out.colnames:
         out["id"] = counted_ids(table, argument)
     catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag) | stated_units)
-    converted = [name for name in bands if name in magnitudes or name in stated_units]
+    converted = []
+    for name in bands:
+        if name in magnitudes or {name, error_column(name)} & set(stated_units):
+            converted.append(name)
     coded = {name: catalog_map.set_band(out, name, 1.0, argument) for name in converted}
     for text in catalog_messages((), [coded]):
         warn(f"{argument}: {text}", CatalogWarning)
@@ -116,8 +120,9 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
 
 def _stated_units(table, names, bands, units):
     """Units that a caller says of fluxes and errors without one: by our names of the columns."""
+    by_name = _units_in_names(table, names, bands)
     if units is None:
-        return {}
+        return by_name
     by_band = units
     if isinstance(units, Mapping):
         by_band = {find_filter(str(name)) or str(name): unit for name, unit in units.items()}
@@ -142,7 +147,20 @@ def _stated_units(table, names, bands, units):
         lacks_unit = error in names and getattr(table[names[error]], "unit", None) is None
         if lacks_unit and unit != u.ABmag:
             units_by_column[error] = unit
-    return units_by_column
+    return units_by_column | by_name
+
+
+def _units_in_names(table, names, bands):
+    """Units at the end of names of columns that have no other, by our names of the columns."""
+    units = {}
+    for band in bands:
+        for name in (band, error_column(band)):
+            if name not in names or getattr(table[names[name]], "unit", None) is not None:
+                continue
+            unit = name_and_unit(names[name])[1]
+            if unit is not None:
+                units[name] = unit
+    return units
 
 
 def unit_of_fluxes(unit, argument="units"):
@@ -266,8 +284,12 @@ def _our_names(colnames, bands, argument):
     ids = id_column(colnames, argument)
     if ids is not None:
         columns["id"] = ids
+    for name in columns:
+        same = [other for other in colnames if other.lower() == name.lower()]
+        if name != "id":
+            check_that(len(same) == 1, argument, f"a table with one column for {name!r}", same)
     unmatched = [name for name in colnames if name not in columns and name != ids]
-    logarithmic = [name for name in unmatched if _MAGNITUDE.match(name)]
+    logarithmic = [name for name in unmatched if _MAGNITUDE.match(name_and_unit(name)[0])]
     linear = [name for name in unmatched if name not in logarithmic]
     columns |= _matched(linear, colnames, bands, argument)
     magnitudes = _matched(logarithmic, colnames, bands, argument)
@@ -303,7 +325,10 @@ def _matched(names, colnames, bands, argument):
 
 
 def _band_of(name, bands):
-    """Our name of a column of flux or error; None of others."""
+    """Our name of a column of flux or error; None of others. A unit at the end of a name is no part of it."""
+    if _find(name, bands):
+        return _find(name, bands)
+    name, _ = name_and_unit(name)
     if _find(name, bands):
         return _find(name, bands)
     for pattern, called in ((_ERROR, error_column), (_FLUX, str)):
@@ -332,5 +357,7 @@ def _is_ab(table, name):
         return False
     unit = getattr(table[name], "unit", None)
     if unit is None:
-        return _MAGNITUDE.match(name) is not None
+        plain, unit = name_and_unit(name)
+        if unit is None:
+            return _MAGNITUDE.match(plain) is not None
     return unit == u.ABmag

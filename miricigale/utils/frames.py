@@ -31,7 +31,7 @@ def frame_columns(data, argument):
     Raises
     ------
     ValueError
-        If an index and a column have one name and differ.
+        If two columns have one name, or an index and a column have one name and differ.
     """
     if not hasattr(data, "index"):
         from miricigale.utils.table_files import arrow_table
@@ -42,7 +42,10 @@ def frame_columns(data, argument):
             rows = data.to_arrow()
         table = arrow_table(rows, where=argument)
         return {name: table[name] for name in table.colnames}
-    columns = {str(name): _of_series(data[name]) for name in data.columns}
+    names = [str(name) for name in data.columns]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    check_that(not repeated, argument, "a frame whose columns have different names", repeated)
+    columns = {name: _of_series(data[key]) for name, key in zip(names, data.columns, strict=True)}
     return _of_index(data, columns, argument) | columns
 
 

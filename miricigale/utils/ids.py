@@ -147,13 +147,15 @@ def ids_and_missing(column, argument):
     Raises
     ------
     ValueError
-        If there are several ids in a row, ids of different kinds, bytes that are not UTF-8 or whole numbers in
-        floats of too few digits, which are not exact.
+        If there are several ids in a row, ids of different kinds or that are neither numbers nor text, bytes that
+        are not UTF-8 or whole numbers in floats of too few digits, which are not exact.
     """
     mask = np.asarray(getattr(column, "mask", False))
     column = getattr(column, "unmasked", column)
     ids = np.ma.getdata(getattr(column, "value", column))
     check_that(ids.ndim == 1, argument, "a table with one id in a row", ids.shape)
+    wanted = "a table with ids as integers or text"
+    check_that(ids.dtype.kind in "iufSUO", argument, wanted, f"the type {ids.dtype}")
     missing = np.broadcast_to(mask, ids.shape).copy()
     if ids.dtype.kind in "US":
         missing |= np.char.str_len(ids) == 0

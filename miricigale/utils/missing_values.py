@@ -234,11 +234,14 @@ def plain_floats(column, name, argument):
     """
     A column as plain floats, NaN where masked, blank or a word for no value (`is_missing_word`).
 
-    A `ValueError` names the row and the text that is no number.
+    A `ValueError` names the row and the text that is no number; truth values, dates and complex numbers are none.
     """
     mask = mask_of(column)
     column = getattr(column, "value", column)
     values = np.ma.getdata(getattr(column, "unmasked", column))
+    if values.dtype.kind not in "iufSUO":
+        wanted = f"a table with numbers in {name!r}"
+        raise argument_error(argument, wanted, f"values of the type {values.dtype}")
     if values.dtype.kind == "S":
         values = np.char.decode(values, "utf-8", "replace")
     if values.dtype.kind in "OU":

@@ -4,12 +4,19 @@ import re
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
+from astropy.coordinates import Angle, SkyCoord, UnitSphericalRepresentation
 from astropy.time import Time
 
 from miricigale.utils.exceptions import CatalogWarning, argument_error, units_error, warn
-from miricigale.utils.missing_values import floats, plain_floats, without_codes
+from miricigale.utils.missing_values import (
+    floats,
+    is_missing_word,
+    mask_of,
+    plain_floats,
+    without_codes,
+)
 from miricigale.utils.options import check_that
+from miricigale.utils.units import angle_unit
 
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
 #: Columns of right ascension and declination, in lower case and without ``_j2000``.
@@ -24,6 +31,10 @@ _PAIRS = (
 _MOTIONS = (("pmra", "pmdec"), ("pm_ra_cosdec", "pm_dec"), ("pm_ra", "pm_dec"), ("pmra", "pmde"))
 _EPOCHS = ("ref_epoch", "refepoch", "obstime", "epoch")
 _MOTION = u.mas / u.yr
+#: Rounding of positions that is worth a word, deg; a tenth of a pixel of MIRI.
+_ROUNDING = 0.011 / 3600
+#: Right ascensions that are taken for degrees, which may go once around.
+_RIGHT_ASCENSIONS = (-360.0, 720.0)
 
 
 def as_position(value, argument):
@@ -102,8 +113,9 @@ def at_epoch(sky, epoch, argument):
     ESA 1997, The Hipparcos and Tycho Catalogues, vol. 1, sec. 1.5.5.
     """
     if "s" not in sky.data.differentials:
-        icrs = sky.icrs
-        return SkyCoord(icrs.ra, icrs.dec)
+        # positions in Cartesian coordinates have no right ascension
+        angles = sky.icrs.represent_as(UnitSphericalRepresentation)
+        return SkyCoord(angles.lon, angles.lat)
     icrs = sky.icrs
     east, north = (
         floats(motion.to_value(u.rad / u.yr)) for motion in (icrs.pm_ra_cosdec, icrs.pm_dec)
@@ -149,6 +161,7 @@ def as_positions(table, argument, wcs=None, *, missing=False, epoch=None, motion
     table : `~astropy.table.Table`
         With ``sky`` or another column of `~astropy.coordinates.SkyCoord`; ``ra`` and ``dec`` in any case and
         unit (degrees without one), also ``ALPHA_J2000`` and ``RAJ2000``; or, with a WCS, pixels ``x`` and ``y``.
+        Text is right ascension in hours and declination in degrees (``03:32:30``, ``3h32m30s``), or a number.
     argument : str
         What the table is called in messages.
     wcs : `~astropy.wcs.WCS`, optional
@@ -169,19 +182,23 @@ def as_positions(table, argument, wcs=None, *, missing=False, epoch=None, motion
     Raises
     ------
     ValueError
-        If there are no such columns, a position is not finite and ``missing`` is False, or there are proper
-        motions without both times.
+        If there are no such columns, two that differ in case alone, or values that are no such angles; if a
+        position is not finite and ``missing`` is False, or there are proper motions without both times.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.CatalogWarning`
+        If positions are rounded by more than a tenth of a pixel, as in single precision.
     """
     skies = [name for name in table.colnames if isinstance(table[name], SkyCoord)]
-    columns = {}
-    for name in table.colnames:
-        columns.setdefault(name.lower().removesuffix("_j2000"), name)
+    columns = _by_plain_name(table.colnames)
     pair = next(((columns[a], columns[b]) for a, b in _PAIRS if {a, b} <= set(columns)), None)
     if "sky" in skies or (skies and pair is None):
         sky = at_epoch(table["sky" if "sky" in skies else skies[0]], epoch, argument)
     elif pair is not None:
-        angles = [_degrees(table, name, argument) for name in pair]
-        sky = SkyCoord(*angles, unit="deg")
+        for name in pair:
+            _check_only(table.colnames, name, argument)
+        sky = SkyCoord(*_sky_degrees(table, pair, argument), unit="deg")
         if motions:
             sky = at_epoch(sky_with_motions(table, sky, columns, argument), epoch, argument)
     elif wcs is not None and {"x", "y"} <= set(columns):
@@ -273,15 +290,99 @@ def _plain_years(column, name, argument):
     return plain_floats(column, name, argument) * unit.to(u.yr)
 
 
-def _degrees(table, name, argument):
-    """Angles in degrees, NaN where they are missing."""
+def _by_plain_name(colnames):
+    """Columns by their names in lower case and without ``_j2000``; the shorter name is preferred."""
+    columns = {}
+    for name in colnames:
+        lower = name.lower()
+        plain = lower.removesuffix("_j2000")
+        if plain not in columns or plain == lower:
+            columns[plain] = name
+    return columns
+
+
+def _check_only(colnames, name, argument):
+    """Refuse a column of a position beside another one whose name differs in case alone."""
+    same = [other for other in colnames if other.lower() == name.lower()]
+    check_that(len(same) == 1, argument, f"a table with one column {name.lower()!r}", same)
+
+
+def _sky_degrees(table, pair, argument):
+    """Right ascensions and declinations in degrees, NaN where they are missing."""
+    ra, dec = pair
+    angles = [_degrees(table, ra, u.hourangle, argument), _degrees(table, dec, u.deg, argument)]
+    low, high = _RIGHT_ASCENSIONS
+    _check_range(angles[0], low, high, ra, argument)
+    _check_range(angles[1], -90.0, 90.0, dec, argument)
+    _warn_of_rounding(table[ra], angles[0], np.cos(np.radians(angles[1])), ra, argument)
+    _warn_of_rounding(table[dec], angles[1], 1.0, dec, argument)
+    return angles
+
+
+def _check_range(values, low, high, name, argument):
+    """Refuse angles in degrees that are outside a range."""
+    rows = np.flatnonzero((values < low) | (values > high))
+    if rows.size:
+        wanted = f"a table with angles of {low:g} to {high:g} deg in {name!r}"
+        raise argument_error(argument, wanted, f"{values[rows[0]]:g} in row {rows[0]} (from 0)")
+
+
+def _warn_of_rounding(column, degrees, scale, name, argument):
+    """Warn if a column of floats of few digits rounds its positions."""
+    dtype = np.asarray(getattr(column, "value", column)).dtype
+    if dtype.kind != "f" or dtype.itemsize >= 8:
+        return
+    with np.errstate(invalid="ignore"):
+        steps = 0.5 * np.spacing(np.abs(degrees).astype(dtype)).astype(float) * scale
+    largest = np.nanmax(steps, initial=0.0)
+    if largest > _ROUNDING:
+        msg = (
+            f"{argument}: {name!r} has floats of {8 * dtype.itemsize} bits, which round positions by up to "
+            f"{3600 * largest:.2g} arcsec"
+        )
+        warn(msg, CatalogWarning)
+
+
+def _degrees(table, name, text_unit, argument):
+    """Angles in degrees, NaN where they are missing; text that is no number is in ``text_unit``."""
     column = table[name]
-    unit = getattr(column, "unit", None) or u.deg
+    unit = angle_unit(getattr(column, "unit", None) or u.deg)
     if not u.Unit(unit).is_equivalent(u.deg):
         raise units_error(argument, "an angle", unit, column=name)
+    if column.dtype.kind in "OSU" and _is_sexagesimal(column):
+        return _of_text(column, name, text_unit, argument)
     values = plain_floats(column, name, argument)
     values[without_codes(values)[0] | np.isinf(values)] = np.nan
     return values * u.Unit(unit).to(u.deg)
+
+
+def _texts(column):
+    """Values of a column as text, and where they are missing."""
+    values = np.ma.getdata(getattr(column, "value", column))
+    if values.dtype.kind == "S":
+        values = np.char.decode(values, "utf-8", "replace")
+    texts = np.char.strip(values.astype(str))
+    return texts, mask_of(column) | is_missing_word(texts)
+
+
+def _is_sexagesimal(column):
+    """Whether text has angles such as 03:32:30, 3h32m30s or 3 32 30."""
+    texts, missing = _texts(column)
+    return any(re.search(r"\d *[:hd ] *\d|\d[hd]", text) for text in texts[~missing].tolist())
+
+
+def _of_text(column, name, unit, argument):
+    """Angles of text in degrees, NaN where they are missing."""
+    texts, missing = _texts(column)
+    values = np.full(texts.shape, np.nan)
+    for row in np.flatnonzero(~missing):
+        try:
+            values[row] = Angle(str(texts[row]), unit).deg
+        except (ValueError, TypeError, u.UnitsError):
+            wanted = f"a table with angles in {name!r}"
+            got = f"{texts[row]!s:.40} in row {row} (from 0)"
+            raise argument_error(argument, wanted, got) from None
+    return values
 
 
 def sky_as_angles(table):

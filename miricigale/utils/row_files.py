@@ -19,8 +19,10 @@ from miricigale.utils.optional_packages import require
 from miricigale.utils.table_files import (
     LDAC_HEADER,
     arrow_table,
+    check_names_differ,
     in_units,
     mask_scaled_nulls,
+    names_in_header,
     ragged_columns,
     read_table,
     silent_units,
@@ -149,6 +151,10 @@ class _FitsRows(RowFile):
             table = self._choose(hdus)
             self._header = table.header.copy()
             self.n_rows = table.header["NAXIS2"]
+            try:
+                check_names_differ(names_in_header(table))
+            except ValueError as err:
+                raise unreadable(path, "a catalog", err) from None
         # what belongs to the whole table
         for key in ("CHECKSUM", "DATASUM", "THEAP"):
             self._header.remove(key, ignore_missing=True)
@@ -193,6 +199,7 @@ class _ParquetRows(RowFile):
             # without a buffer a group of rows is read as a whole
             self._file = parquet.ParquetFile(path, buffer_size=1 << 20)
             self.n_rows = self._file.metadata.num_rows
+            check_names_differ(self._file.schema_arrow.names)
             self._begin()
             self.colnames = tuple(arrow_table(self._take(0), where=path.name).colnames)
         except (OSError, ValueError, NotImplementedError) as err:

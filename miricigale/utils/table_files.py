@@ -9,8 +9,8 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
-from astropy.io.ascii import convert_numpy
+from astropy.io import fits, votable
+from astropy.io.ascii import InconsistentTableError, convert_numpy
 from astropy.table import Column, MaskedColumn, QTable, Table
 from astropy.units import UnitsWarning, UnrecognizedUnit
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
@@ -32,6 +32,7 @@ from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
 from miricigale.utils.region_files import region_table
+from miricigale.utils.text_tables import csv_layout, drop_repeated, is_sextractor
 from miricigale.utils.units import flux_unit
 
 _PIECE = 1 << 20
@@ -61,8 +62,9 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
     cls : type, optional
         Class of the table.
     form : str, optional
-        Format by `astropy.table.Table.read`. By default by content and suffix: those of `write_table`, or
-        plain text, whose names of columns stand behind ``#`` if one of ids is among them.
+        Format by `astropy.table.Table.read`. By default by content and suffix: those of `write_table` (``.csv``
+        also with semicolons or tabs, and after lines of comment), text of SExtractor with a line of comment for
+        each column, or plain text, whose names of columns stand behind ``#`` if one of ids is among them.
     hdu : int or str, optional
         Extension of a FITS file; the first table by default, without that of keywords in FITS_LDAC.
     id_names : iterable of str, optional
@@ -76,12 +78,13 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the file is missing or no such table.
+        If the file is missing or no such table, or two columns of one name differ.
 
     Warns
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
-        Of columns of variable length in FITS, and of those of a parquet file that no table can hold.
+        Of columns of variable length in FITS, of those of a parquet file that no table can hold, and of columns
+        that stand twice in text with the same values.
     """
     path, extension = split_extension(path)
     if hdu is None:
@@ -99,24 +102,35 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
                     chosen = _first_table(hdus)
                 else:
                     chosen = hdu
-                table = Table.read(hdus, format=form, character_as_bytes=False, hdu=chosen)
                 read = _table_read(hdus, chosen)
+                check_names_differ(names_in_header(read))
+                table = Table.read(hdus, format=form, character_as_bytes=False, hdu=chosen)
                 mask_scaled_nulls(table, read)
                 leave_ragged_out(table, read, Path(path).name)
         elif hdu is not None:
             raise unreadable(path, wanted, f"'hdu' is {hdu!r}, and it is no FITS file")
         elif form == "parquet":
-            rows = require("pyarrow.parquet", extra="parquet").read_table(path)
+            parquet = require("pyarrow.parquet", extra="parquet")
+            check_names_differ(parquet.read_schema(path).names)
+            rows = parquet.read_table(path)
             table = arrow_table(rows, Table, where=Path(path).name)
         else:
             _check_text(path)
             with silent_units():
                 table = _read_text(path, form, id_names)
+                # SExtractor numbers the parts of a vector as astropy does names that stand twice
+                if form.startswith("ascii") and form != "ascii.sextractor":
+                    drop_repeated(table, path)
         if not table.colnames:
             raise unreadable(path, wanted, "it has no columns")
         return in_units(table, cls, id_names)
     except DataError:
         raise
+    except InconsistentTableError as err:
+        # for text of an unknown layout astropy lists all that it tried
+        if "Unable to guess" in str(err):
+            err = "no usual layout of a table in text fits it"
+        raise unreadable(path, wanted, err) from None
     except Exception as err:  # readers of different formats raise different exceptions
         raise unreadable(path, wanted, err) from err
 
@@ -175,6 +189,21 @@ def _table_read(hdus, chosen):
     if chosen is not None:
         return hdus[chosen]
     return next(hdu for hdu in hdus if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU)))
+
+
+def names_in_header(hdu):
+    """Names of the columns of a FITS table as its header has them, also where two are the same."""
+    header = getattr(hdu, "header", {})
+    names = [header.get(f"TTYPE{i}") for i in range(1, header.get("TFIELDS", 0) + 1)]
+    return [str(name).strip() for name in names if name is not None]
+
+
+def check_names_differ(names):
+    """Raise a `ValueError` if two columns have one name."""
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            msg = f"it has two columns {name!r}: give each its own name"
+            raise ValueError(msg)
 
 
 def mask_scaled_nulls(table, hdu):
@@ -357,29 +386,35 @@ def _read_text(path, form, id_names):
         if _DS9.search(start[:_PIECE]):
             return region_table(path)
         source = str(path)
-        if start.startswith(_BOM) or is_zip(path):
+        options = {"format": form}
+        n_comments = 0
+        if form == "ascii.csv":
+            options["delimiter"], n_comments = csv_layout(path)
+        if n_comments or start.startswith(_BOM) or is_zip(path):
             # a mark at the start is no part of the first name, and of archives astropy reads no text
             with packed_open(path) as stream:
-                source = stream.read().decode("utf-8-sig").splitlines()
+                source = stream.read().decode("utf-8-sig").splitlines()[n_comments:]
         with warnings.catch_warnings():
             # what 64 bits do not hold is read as text
             warnings.filterwarnings("ignore", "OverflowError converting to IntType", AstropyWarning)
-            table = Table.read(source, format=form)
+            table = Table.read(source, **options)
         if form != "ascii.ecsv":
             names = [name for name in table.colnames if name in id_names or is_id_name(name)]
             _numbers_among_words(table, names)
-            _ids_as_written(table, path, source, form, names)
+            _ids_as_written(table, path, source, options, names)
             _unmark_first_name(table)
         return table
     if is_zip(path):
         msg = f"of {form} in a zip archive: unpack it first"
         raise ValueError(msg)
-    # names are what users see; astropy takes the IDs of fields
     if form == "votable":
-        options = {"use_names_over_ids": True}
-    else:
-        options = {}
-    return Table.read(path, format=form, **options)
+        document = votable.parse(path)
+        tables = list(document.iter_tables())
+        if len(tables) == 1:
+            check_names_differ([field.name for field in tables[0].fields])
+        # names are what users see; astropy takes the IDs of fields
+        return Table.read(document, format=form, use_names_over_ids=True)
+    return Table.read(path, format=form)
 
 
 def _unmark_first_name(table):
@@ -411,7 +446,7 @@ def _numbers_among_words(table, id_names):
         table[name] = MaskedColumn(values, mask=missing, unit=column.unit)
 
 
-def _ids_as_written(table, path, source, form, names):
+def _ids_as_written(table, path, source, layout, names):
     """Put the ids of a text file in place that stand there, 0007 or 18446744073709551615."""
     for name in names:
         column = MaskedColumn(table[name])
@@ -421,7 +456,9 @@ def _ids_as_written(table, path, source, form, names):
             texts = np.asarray(column)
         else:
             options = {"converters": {name: [convert_numpy(str)]}, "include_names": [name]}
-            texts = Table.read(source, format=form, fast_reader=False, **options)[name]
+            if layout["format"] != "ascii.sextractor":
+                options["fast_reader"] = False
+            texts = Table.read(source, **layout, **options)[name]
             texts = np.asarray(texts).astype(str)
         texts = np.char.strip(texts)
         missing = column.mask | is_missing_word(texts)
@@ -553,6 +590,11 @@ def _table_format(path):
     if suffix in TABLE_FORMATS:
         return TABLE_FORMATS[suffix]
     named = first.startswith("#") and any(map(is_id_name, first.strip("# \r").split()))
+    if is_sextractor(start):
+        return "ascii.sextractor"
     if named:
         return "ascii.commented_header"
+    # which astropy does not try
+    if ";" in first:
+        return "ascii.csv"
     return "ascii"

@@ -30,6 +30,20 @@ _MAGGY_NAMES = {
     "nanomaggy": 1e-9, "nanomaggies": 1e-9, "nmgy": 1e-9, "nanomgy": 1e-9, "nmggy": 1e-9, "nanomaggie": 1e-9,
     "micromaggy": 1e-6, "micromaggies": 1e-6,
 }  # fmt: skip
+#: Spellings of Jansky that leave no choice, in lower case ("mjy" may be millijansky or megajansky).
+_JANSKY_NAMES = {
+    "jy": u.Jy, "jansky": u.Jy, "janskys": u.Jy,
+    "millijy": u.mJy, "millijansky": u.mJy, "millijanskys": u.mJy,
+    "ujy": u.uJy, "mujy": u.uJy, "microjy": u.uJy, "microjansky": u.uJy, "microjanskys": u.uJy,
+    "\u00b5jy": u.uJy, "\u03bcjy": u.uJy, "micro-jansky": u.uJy, "micro-jy": u.uJy,
+    "njy": u.nJy, "nanojy": u.nJy, "nanojansky": u.nJy, "nanojanskys": u.nJy,
+}  # fmt: skip
+#: Degrees and hours of right ascension by the names of headers and of VizieR, in lower case without blanks.
+_ANGLE_NAMES = {
+    "deg": u.deg, "degs": u.deg, "degree": u.deg, "degrees": u.deg, "deg.": u.deg, "d:m:s": u.deg,
+    "h": u.hourangle, "hr": u.hourangle, "hrs": u.hourangle, "hour": u.hourangle, "hours": u.hourangle,
+    "h:m:s": u.hourangle, "hourangle": u.hourangle,
+}  # fmt: skip
 #: Names of AB magnitudes as a unit, in lower case without blanks.
 _AB_NAMES = ("abmag", "mag(ab)", "ab", "mag_ab", "magab", "ab_mag", "abmags")
 
@@ -42,7 +56,8 @@ def flux_unit(unit):
     ----------
     unit : `~astropy.units.Unit` or str
         ``"nanomaggies"``, ``"nmgy"``, ``"maggies"`` (AB, 3631 Jy for 1) and ``u.mgy`` are units of flux density,
-        ``"ABmag"``, ``"mag(AB)"``, ``"AB mag"`` AB magnitudes.
+        ``"ABmag"``, ``"mag(AB)"``, ``"AB mag"`` AB magnitudes. Of Jansky any spelling that leaves no choice is
+        taken, such as ``"UJY"`` or ``"microjansky"``, in brackets or not.
 
     Returns
     -------
@@ -58,6 +73,9 @@ def flux_unit(unit):
     Unit("mag(AB)")
     """
     text = re.sub(r"\s+", "", str(unit)).lower()
+    text = re.sub(r"^[\[(](.*)[\])]$", r"\1", text)
+    if text in _JANSKY_NAMES:
+        return _JANSKY_NAMES[text]
     if text in _AB_NAMES:
         return u.ABmag
     if text in _MAGGY_NAMES:
@@ -65,6 +83,24 @@ def flux_unit(unit):
     if isinstance(unit, u.UnitBase) and u.mgy in unit.bases and unit.is_equivalent(u.mgy):
         return u.Unit(unit.to(u.mgy) * _MAGGY.to(u.uJy))
     return None
+
+
+def angle_unit(unit):
+    """
+    Return the unit of an angle on the sky that a name means, beyond those of astropy.
+
+    Parameters
+    ----------
+    unit : `~astropy.units.Unit` or str
+        Such as ``"degrees"``, ``"[deg]"`` or, of right ascensions, ``"h"``.
+
+    Returns
+    -------
+    unit : `~astropy.units.UnitBase`
+        The unit itself for any other name.
+    """
+    text = re.sub(r"[\s\"'\[\]]+", "", str(unit)).lower()
+    return _ANGLE_NAMES.get(text, unit)
 
 
 def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):

@@ -395,3 +395,26 @@ def test_codes_are_told_from_noise_and_from_limits():
     assert np.flatnonzero(out["wfc3.f160w_limit"]).tolist() == [5]
     assert np.isnan(coded["wfc3.f160w"]).tolist() == kept.tolist()
     assert np.isnan(codes_of(table, ["wfc3.f160w"])["wfc3.f160w"]).tolist() == kept.tolist()
+
+
+def test_a_unit_in_the_name_of_a_column_counts():
+    table = Table({"id": [1], "H [nJy]": [2500.0], "dH [nJy]": [500.0]})
+    out, _ = CatalogMap({BAND: "H [nJy]", f"{BAND}_err": "dH [nJy]"}).convert(table)
+    assert out[BAND].to_value(u.uJy).tolist() == [2.5]
+    assert out[f"{BAND}_err"].to_value(u.uJy).tolist() == [0.5]
+
+
+@pytest.mark.parametrize("column", [np.ones((2, 3)), np.ones((2, 1))])
+def test_several_numbers_in_a_row_are_refused(column):
+    for columns in ({BAND: column}, {BAND: [1.0, 2.0], f"{BAND}_err": column}):
+        message = f"one number in a row of '{list(columns)[-1]}', got shape"
+        refuses(message, convert, {"id": [1, 2]} | columns, units={"flux": "uJy"})
+    columns = {"id": [1, 2], BAND: [1.0, 2.0], "total": column}
+    message = "one number in a row of 'total', got shape"
+    refuses(message, convert, columns, units={"flux": "uJy"}, factor="total")
+
+
+@pytest.mark.parametrize("column", [[True, False], [1j, 2j], np.array(["2024-01-01"] * 2, "M8[D]")])
+def test_truth_values_dates_and_complex_numbers_are_no_fluxes(column):
+    message = f"numbers in '{BAND}', got values of the type"
+    refuses(message, convert, {"id": [1, 2], BAND: column}, units={"flux": "uJy"})

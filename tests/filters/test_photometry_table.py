@@ -182,3 +182,42 @@ def test_text_and_nullable_ids_of_a_table_are_kept_by_the_rule_of_all_readers():
     table.rename_column("TARGETID", "CATAID")
     with pytest.warns(CatalogWarning, match="'CATAID' looks like ids"):
         assert as_photometry(table, ["miri.f770w"])["id"].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("flux", "error", "factor"),
+    [
+        ("{}[uJy]", "{}_err[uJy]", 1.0),
+        ("flux_{} (mJy)", "err_{} (mJy)", 1e3),
+        ("f_{}_nJy", "e_{}_nJy", 1e-3),
+        ("{} [10^-29 erg/s/cm2/Hz]", "{}_err [UJY]", 1.0),
+    ],
+)
+def test_a_unit_may_end_the_name_of_a_column(catalog, flux, error, factor):
+    table = Table({"id": catalog["id"]})
+    for ours, theirs in {"miri.f770w": "F770W", "wfc3.f160w": "f160w"}.items():
+        table[flux.format(theirs)] = catalog[ours].value / factor
+        table[error.format(theirs)] = catalog[f"{ours}_err"].value / factor
+    same(as_photometry(table, BANDS), catalog)
+    # what the caller says is of columns without one
+    same(as_photometry(table, BANDS, units="Jy"), catalog)
+
+
+def test_a_magnitude_may_have_its_unit_in_its_name():
+    table = {"id": [1], "mag_F770W [mag]": [23.9], "magerr_F770W [mag]": [0.1]}
+    assert as_photometry(table, BANDS[:1])["miri.f770w"].to_value(u.uJy) == pytest.approx(1)
+    table = {"id": [1], "F770W (AB)": [21.4], "F770W_err (mag)": [0.1]}
+    assert as_photometry(table, BANDS[:1])["miri.f770w"].to_value(u.uJy) == pytest.approx(10)
+
+
+def test_names_that_differ_in_case_alone_are_refused(catalog):
+    catalog["MIRI.F770W"] = catalog["miri.f770w"]
+    message = "one column for 'miri.f770w', got .*'MIRI.F770W'"
+    refuses(f"'photometry' must be a table with {message}", as_photometry, catalog, BANDS)
+
+
+def test_a_unit_that_is_said_is_that_of_errors_without_one(catalog):
+    table = Table({name: catalog[name] for name in catalog.colnames})
+    for name in BANDS:
+        table[f"{name}_err"] = catalog[f"{name}_err"].value / 1e3
+    same(as_photometry(table, BANDS, units="mJy"), catalog)

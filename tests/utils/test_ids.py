@@ -74,6 +74,12 @@ def test_ids_are_whole_numbers_or_text(column, expected):
     assert ids.dtype.kind in "iuU"
 
 
+@pytest.mark.parametrize("column", [[True, False], [1j, 2j], np.array(["2024-01-01"], "M8[D]")])
+def test_truth_values_dates_and_complex_numbers_are_no_ids(column):
+    refuses("'photometry' must be a table with ids as integers or text, got the type", read_ids,
+            Table({"id": column}))  # fmt: skip
+
+
 @pytest.mark.parametrize(
     "column",
     [

@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
-from astropy.table import QTable
+from astropy.table import QTable, Table
 from astropy.time import Time
 from erfa import ErfaWarning
 from numpy.testing import assert_allclose, assert_array_equal
@@ -127,3 +127,63 @@ def test_columns_of_motions_that_cannot_be_used():
     motions = dict.fromkeys(("pmra", "pmdec"), [np.nan] * 4 * u.mas / u.yr)
     galaxies = as_columns(**motions, ref_epoch=[np.nan] * 4)
     assert_allclose(as_positions(galaxies, "c", **options).dec.deg, moving().dec.deg, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("ra", "dec"),
+    [
+        (["03:32:30.6", "--"], ["-00:30:36", "--"]),
+        (["3h32m30.6s", ""], ["-0d30m36s", ""]),
+        (["03 32 30.6", "nan"], ["-00 30 36", "nan"]),
+        (["53.1275", "NA"], ["-0.51", "NA"]),
+        (["53.1275d", "NA"], ["-0.51d", "NA"]),
+    ],
+)
+def test_text_is_hours_and_degrees(ra, dec):
+    sky = as_positions(QTable({"RA": ra, "Dec": dec}), "catalog", missing=True)
+    assert_allclose(sky.ra.deg, [53.1275, np.nan], rtol=1e-12)
+    assert_allclose(sky.dec.deg, [-0.51, np.nan], rtol=1e-12)
+
+
+@pytest.mark.parametrize("unit", ["h", "hours", "hourangle", '"h:m:s"'])
+def test_units_of_right_ascension_have_many_names(unit):
+    table = Table({"ra": [3.5], "dec": [-27.8]})
+    table["ra"].unit = unit
+    table["dec"].unit = "Degrees"
+    sky = as_positions(table, "catalog")
+    assert_allclose([sky.ra.deg[0], sky.dec.deg[0]], [52.5, -27.8], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"ra": [1.0, 2.0], "dec": [5.0, 95.0]}, "-90 to 90 deg in 'dec', got 95 in row 1"),
+        ({"ra": [191160.0], "dec": [5.0]}, "-360 to 720 deg in 'ra', got 191160 in row 0"),
+        ({"ra": [1.0], "RA": [2.0], "dec": [5.0]}, "one column 'ra', got"),
+        ({"ra": ["03:61:00"], "dec": ["1:00:00"]}, "angles in 'ra', got 03:61:00 in row 0"),
+        ({"ra": ["03:01:00"], "dec": ["a:b"]}, "numbers in 'dec', got a:b in row 0"),
+    ],
+)
+def test_positions_that_are_none_are_refused_by_column_and_row(columns, message):
+    refuses(
+        f"'mine.csv' must be a table with .*{message}", as_positions, QTable(columns), "mine.csv"
+    )
+
+
+def test_right_ascensions_may_go_once_around():
+    sky = as_positions(QTable({"ra": [-10.0, 360.5], "dec": [0.0, 0.0]}), "catalog")
+    assert_allclose(sky.ra.deg, [350.0, 0.5])
+
+
+def test_positions_in_single_precision_have_a_word():
+    table = QTable({"ra": np.array([150.12345678], np.float32), "dec": [2.0]})
+    with pytest.warns(CatalogWarning, match="'ra' has floats of 32 bits.* up to 0.027 arcsec"):
+        as_positions(table, "catalog")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        as_positions(QTable({"ra": [150.12345678], "dec": np.array([2.0], np.float32)}), "catalog")
+
+
+def test_positions_may_be_cartesian():
+    sky = SkyCoord(x=[1.0], y=[1.0], z=[0.0], representation_type="cartesian")
+    assert_allclose(as_positions(QTable({"sky": sky}), "catalog").ra.deg, [45.0])

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.utils.units import frozen_array, frozen_quantity, to_array
+from miricigale.utils.units import flux_unit, frozen_array, frozen_quantity, to_array
 
 
 def test_converts():
@@ -52,3 +52,22 @@ def test_frozen_copies():
 )
 def test_refuses_what_is_no_linear_quantity(value, error, message):
     refuses(message, to_array, value, u.uJy, "x", error=error)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [
+        ("UJY", 1),
+        ("microjansky", 1),
+        ("[uJy]", 1),
+        ("JY", 1e6),
+        ("njy", 1e-3),
+        ("millijansky", 1e3),
+    ],
+)
+def test_spellings_of_jansky_that_leave_no_choice(name, factor):
+    assert flux_unit(name).to(u.uJy) == pytest.approx(factor)
+
+
+def test_mjy_may_be_two_units():
+    assert flux_unit("mjy") is None

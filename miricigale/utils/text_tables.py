@@ -1,0 +1,157 @@
+"""Layout of tables in text files: comments, separators, and names of columns that stand twice."""
+
+import csv
+import re
+
+import numpy as np
+
+from miricigale.utils.exceptions import CatalogWarning, warn
+from miricigale.utils.files import packed_open
+from miricigale.utils.ids import is_id_name
+from miricigale.utils.missing_values import is_missing_word
+
+_BOM = "\ufeff"
+#: Between the cells of files that are called .csv; the comma is the first choice.
+_SEPARATORS = (",", ";", "\t", "|")
+#: Text in which the names of the columns are looked for.
+_HEAD = 1 << 20
+#: First line of a catalog of SExtractor: number, name and meaning of the first column.
+_SEXTRACTOR = re.compile(rb"#\s*1\s+[A-Za-z]\w*(?:\s|$)")
+
+
+def is_sextractor(start):
+    """Whether a file that begins with these bytes has a line of comment for each column, as of SExtractor."""
+    return _SEXTRACTOR.match(start) is not None
+
+
+def csv_layout(path):
+    """
+    Find out how a file of comma-separated values is written.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, packed or not.
+
+    Returns
+    -------
+    separator : str
+        The comma, or a semicolon, tab, bar or blank where the names of the columns have none.
+    n_comments : int
+        Lines before the names of the columns, all of which begin with ``#``. The names may stand in such a line
+        themselves, the last one, if the next line has numbers.
+    """
+    with packed_open(path) as stream:
+        head = stream.read(_HEAD).decode("utf-8", "replace").removeprefix(_BOM)
+    lines = head.splitlines()
+    n_comments = 0
+    while n_comments < len(lines) and _is_comment(lines[n_comments]):
+        n_comments += 1
+    if n_comments == len(lines):
+        return ",", 0
+    header = lines[n_comments]
+    separator = _separator(lines[n_comments:])
+    if n_comments and _holds_names(lines[n_comments - 1], header, separator):
+        n_comments -= 1
+    return separator, n_comments
+
+
+def _is_comment(line):
+    """Whether a line is empty or begins with the mark of a comment."""
+    return not line.strip() or line.startswith("#")
+
+
+def _separator(lines):
+    """What stands between the cells of a table: the comma, or what its first line has in place of it."""
+    header = lines[0]
+    for mark in _SEPARATORS:
+        if mark in header:
+            return mark
+    n_words = len(header.split())
+    if n_words > 1 and len(lines) > 1 and len(lines[1].split()) == n_words:
+        return " "
+    return ","
+
+
+def _holds_names(comment, line, separator):
+    """Whether the names of the columns stand in a comment, for the line after it has values."""
+    cells = next(csv.reader([line], delimiter=separator))
+    names = next(csv.reader([comment.lstrip("# ")], delimiter=separator))
+    if len(names) == len(cells) and any(map(is_id_name, names)):
+        return True
+    return any(is_missing_word(cell) or _is_number(cell) for cell in cells)
+
+
+def _is_number(cell):
+    """Whether a cell is a number, which no name of a column is."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def drop_repeated(table, path):
+    """
+    Refuse columns of one name, of which astropy calls the second ``NAME_1``; leave copies out.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        As astropy read it; changed in place.
+    path : path-like
+        The text file, which tells such a name from one that stands there.
+
+    Raises
+    ------
+    ValueError
+        If two columns of one name differ.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.CatalogWarning`
+        Of columns that are the same twice, of which the first is kept.
+    """
+    suspects = []
+    for name in table.colnames:
+        first, _, count = name.rpartition("_")
+        if count.isdigit() and first in table.colnames:
+            suspects.append((first, name))
+    if not suspects:
+        return
+    with packed_open(path) as stream:
+        head = stream.read(_HEAD).decode("utf-8", "replace")
+    repeated = {}
+    for first, name in suspects:
+        stands_there = re.search(rf"(?<![\w.]){re.escape(name)}(?![\w.])", head)
+        if not stands_there:
+            repeated[name] = first
+    for name, first in repeated.items():
+        if not same_values(table[first], table[name]):
+            raise ValueError(differ(first))
+    table.remove_columns(list(repeated))
+    warn_of_copies(repeated.values(), path)
+
+
+def same_values(first, second):
+    """Whether two columns hold the same, missing values included."""
+    masks = [np.ma.getmaskarray(np.ma.asarray(column)) for column in (first, second)]
+    values = [np.ma.getdata(np.ma.asarray(column)) for column in (first, second)]
+    if values[0].shape != values[1].shape or not np.array_equal(*masks):
+        return False
+    there = [array[~masks[0]] for array in values]
+    are_floats = all(array.dtype.kind == "f" for array in there)
+    return np.array_equal(*there, equal_nan=are_floats)
+
+
+def differ(name):
+    """Words for columns of one name that differ."""
+    return f"it has two columns {name!r} that differ: give each its own name"
+
+
+def warn_of_copies(names, place):
+    """Warn of columns that stand twice with the same values, if there are any."""
+    names = sorted(set(names))
+    if names:
+        listed = ", ".join(map(repr, names))
+        warn(f"{place}: columns that stand there twice are read once: {listed}", CatalogWarning)

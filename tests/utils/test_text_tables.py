@@ -1,0 +1,131 @@
+"""Tables in text, as programs and people lay them out, and names of columns that stand twice."""
+
+import zipfile
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from helpers.errors import refuses
+from miricigale.utils.exceptions import CatalogWarning, DataError
+from miricigale.utils.row_files import open_rows
+from miricigale.utils.table_files import read_table
+from miricigale.utils.tables import as_table
+
+SEXTRACTOR = """#   1 NUMBER       Running object number
+#   2 ALPHA_J2000  Right ascension of barycenter (J2000)  [deg]
+#   3 FLUX_AUTO    Flux within a Kron-like aperture       [uJy]
+#   4 FLUX_APER    Fluxes within circular apertures       [uJy]
+#   6 FLAGS        Extraction flags
+  7 53.1 2.5 1.0 2.0 0
+  9 53.2 3.5 1.5 3.0 0
+"""
+
+ECSV = """# %ECSV 1.0
+# ---
+# datatype:
+# - {name: id, datatype: int64}
+# - {name: f, datatype: float64}
+# - {name: f, datatype: float64}
+id f f
+1 5 6
+"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "id,f\n7,2.5\n9,3.5\n",
+        "id;f\n7;2.5\n9;3.5\n",
+        "id\tf\n7\t2.5\n9\t3.5\n",
+        "id f\n7 2.5\n9 3.5\n",
+        "# made by a program, of one field\n# id: its number\nid,f\n7,2.5\n9,3.5\n",
+        "# made by a program\n#id,f\n7,2.5\n9,3.5\n",
+        "#id,f\n7,2.5\n9,3.5\n",
+        "\ufeff# made by a program\nid,f\r\n7,2.5\r\n9,3.5\r\n",
+    ],
+)
+@pytest.mark.parametrize("name", ["c.csv", "c.csv.zip"])
+def test_csv_is_read_however_it_is_laid_out(text, name, tmp_path):
+    path = tmp_path / name
+    if name.endswith(".zip"):
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("c.csv", text)
+    else:
+        path.write_text(text, encoding="utf-8")
+    table = read_table(path, wanted="a catalog")
+    assert table.colnames == ["id", "f"]
+    assert table["id"].tolist() == [7, 9]
+    assert table["f"].tolist() == [2.5, 3.5]
+
+
+def test_semicolons_are_no_part_of_names_in_other_text(tmp_path):
+    path = tmp_path / "c.txt"
+    path.write_text("id;f\n0007;2.5\n9;3.5\n")
+    table = read_table(path, wanted="a catalog")
+    assert table["id"].tolist() == ["0007", "9"]
+    assert table["f"].tolist() == [2.5, 3.5]
+
+
+def test_a_catalog_of_sextractor_is_read(tmp_path):
+    path = tmp_path / "c.cat"
+    path.write_text(SEXTRACTOR)
+    table = read_table(path, wanted="a catalog")
+    assert table["NUMBER"].tolist() == [7, 9]
+    assert table["FLUX_AUTO"].to_value("uJy").tolist() == [2.5, 3.5]
+    # two apertures, in two columns
+    assert table["FLUX_APER_1"].to_value("uJy").tolist() == [2, 3]
+
+
+def test_text_without_a_layout_is_refused_in_a_sentence(tmp_path):
+    path = tmp_path / "c.dat"
+    path.write_text("just one\n1 2 3\n\n4\n")
+    with pytest.raises(DataError, match=r"c\.dat cannot be read as a catalog: no usual layout"):
+        read_table(path, wanted="a catalog")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("c.csv", "id,f,f\n1,5,6\n"),
+        ("c.txt", "id f f\n1 5 6\n"),
+        ("c.ecsv", ECSV),
+    ],
+)
+def test_two_columns_of_one_name_are_refused_unless_they_are_the_same(name, text, tmp_path):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(DataError, match=rf"{name} .* two columns 'f' that differ: give each"):
+        read_table(path, wanted="a catalog")
+    path.write_text(text.replace("5", "6"))
+    with pytest.warns(CatalogWarning, match="twice are read once: 'f'"):
+        table = read_table(path, wanted="a catalog")
+    assert table.colnames == ["id", "f"]
+    # names that stand in the file are none of astropy's making
+    path.write_text("id,f,f_1\n1,5,6\n" if name == "c.csv" else "id f f_1\n1 5 6\n")
+    assert read_table(path, wanted="a catalog", form="ascii").colnames == ["id", "f", "f_1"]
+
+
+def test_two_columns_of_one_name_are_refused_in_fits_and_votable(tmp_path):
+    path = tmp_path / "c.fits"
+    columns = [fits.Column(name, "E", array=np.ones(2)) for name in ("id", "flux", "longname")]
+    fits.BinTableHDU.from_columns(columns).writeto(path)
+    path.write_bytes(path.read_bytes().replace(b"'longname'", b"'flux    '"))
+    for read in (lambda: read_table(path, wanted="a catalog"), lambda: open_rows(path, 10)):
+        with pytest.raises(
+            DataError, match=r"c\.fits .* two columns 'flux': give each its own name"
+        ):
+            read()
+    path = tmp_path / "c.xml"
+    Table({"id": [1.0], "flux": [2.0], "other": [3.0]}).write(path, format="votable")
+    path.write_text(path.read_text().replace('name="other"', 'name="flux"'))
+    with pytest.raises(DataError, match=r"c\.xml .* two columns 'flux'"):
+        read_table(path, wanted="a catalog")
+
+
+def test_two_columns_of_one_name_are_refused_in_frames():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame([[1, 5.0, 6.0]], columns=["id", "f", "f"])
+    refuses("'photometry' must be a frame whose columns have different names, got .*'f'", as_table,
+            frame, "photometry")  # fmt: skip
