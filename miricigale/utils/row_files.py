@@ -20,6 +20,7 @@ from miricigale.utils.table_files import (
     LDAC_HEADER,
     arrow_table,
     check_names_differ,
+    fits_ready,
     in_units,
     mask_scaled_nulls,
     names_in_header,
@@ -325,6 +326,7 @@ def _fits_rows(table):
         else:
             table.meta[key] = json.dumps(value, default=plain_value)
     file = io.BytesIO()
+    table = fits_ready(table)
     with warnings.catch_warnings():
         # FITS does not know dex; astropy does when it reads the table
         warnings.filterwarnings("ignore", "The unit 'dex' could not be saved in native FITS")

@@ -523,8 +523,21 @@ TABLE_FORMATS = {
     ".hdf5": "hdf5",
     ".parquet": "parquet",
 }
-#: What astropy must know further to write a format.
-_OPTIONS = {"hdf5": {"path": "table", "serialize_meta": True}}
+#: What astropy must know further to write a format; VOTables in binary, for its writer of text is not safe.
+_OPTIONS = {
+    "hdf5": {"path": "table", "serialize_meta": True},
+    "votable": {"tabledata_format": "binary2"},
+}
+#: Types that FITS does not have, or takes for truth values, by what stands for them.
+_FITS_TYPES = {np.dtype(np.int8): np.int16, np.dtype(np.float16): np.float32}
+#: The same of VOTables.
+_VOTABLE_TYPES = _FITS_TYPES | {
+    np.dtype(np.uint16): np.int32,
+    np.dtype(np.uint32): np.int64,
+    np.dtype(np.uint64): np.int64,
+}
+#: What astropy writes for a missing integer, if the column has no such number.
+_NULL = 999999
 
 
 def write_table(table, path, *, overwrite=False):
@@ -557,15 +570,41 @@ def write_table(table, path, *, overwrite=False):
             hdus.writeto(partial)
         else:
             if form == "votable":
-                plain_table = sky_as_angles(table)
+                plain_table = _for_votable(sky_as_angles(table))
             else:
                 plain_table = table
             plain_table.write(partial, format=form, **_OPTIONS.get(form, {}))
 
 
+def _for_votable(table):
+    """Table with what VOTables have: no unsigned integers, none above 2^63, and no masks of text."""
+    table = table.copy(copy_data=False)
+    for name in table.colnames:
+        column = table[name]
+        if getattr(column, "dtype", None) == np.uint64:
+            largest = max(map(int, np.ma.compressed(np.ma.asarray(column))), default=0)
+            wanted = f"a file of another format for unsigned integers such as those of {name!r}"
+            check_that(largest < 2**63, "path", wanted, "a VOTable, which has none above 2^63")
+        _change_type(table, name, _VOTABLE_TYPES)
+        if isinstance(column, MaskedColumn) and column.dtype.kind in "US":
+            # text has no mask there
+            table.replace_column(name, Column(column.filled(""), name=name))
+    return table
+
+
+def _change_type(table, name, types):
+    """Give a column of a table the type that stands for its own in a format."""
+    column = table[name]
+    dtype = getattr(column, "dtype", np.dtype(object)).newbyteorder("=")
+    if dtype in types:
+        changed = column.astype(types[dtype])
+        changed.info = column.info
+        table.replace_column(name, changed)
+
+
 def table_hdu(table):
     """Binary table of a table with any columns that astropy has; its meta as `fits_meta` has it."""
-    table = table.copy(copy_data=False)
+    table = fits_ready(table)
     table.meta = fits_meta(table.meta)
     stream = io.BytesIO()
     with warnings.catch_warnings():
@@ -574,6 +613,56 @@ def table_hdu(table):
         table.write(stream, format="fits")
     stream.seek(0)
     return fits.open(stream)[1]
+
+
+def fits_ready(table):
+    """
+    Prepare a table for FITS, whose missing integers are a number and whose truth values are never missing.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Any.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        A copy with the same data. Integers of 8 bits and floats of 16 have 16 and 32. Masked integers have a null
+        value that does not occur among them, which is not so in astropy 8.0; truth values with missing ones are 0
+        and 1 in bytes, as true and false cannot be missing.
+    """
+    table = table.copy(copy_data=False)
+    for name in table.colnames:
+        _change_type(table, name, _FITS_TYPES)
+        column = table[name]
+        if not isinstance(column, MaskedColumn) or not column.mask.any():
+            continue
+        if column.dtype.kind == "b":
+            column = MaskedColumn(column.astype(np.uint8), mask=column.mask, copy=False)
+        elif column.dtype.kind in "iu":
+            column = MaskedColumn(column, copy=True)
+        else:
+            continue
+        column.info = table[name].info
+        column.fill_value = _unused_number(column)
+        table.replace_column(name, column)
+    return table
+
+
+def _unused_number(column):
+    """A number that no row of a column of integers has, as the null value of FITS."""
+    values = column.compressed()
+    limits = np.iinfo(column.dtype)
+    for number in (_NULL, limits.min, limits.max):
+        if limits.min <= number <= limits.max and number not in values:
+            return number
+    # a gap between neighbors, whose difference their own type may not hold
+    ordered = np.unique(values).astype(object)
+    gaps = np.flatnonzero(np.diff(ordered) > 1)
+    if not gaps.size:
+        msg = f"the column {column.name!r} has all numbers of its type, and missing ones: FITS has no null value"
+        raise ValueError(msg)
+    return int(ordered[gaps[0]]) + 1
 
 
 def _table_format(path):

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.io.votable import from_table
-from astropy.table import Table
+from astropy.table import MaskedColumn, Table
 
+from helpers.errors import refuses
 from miricigale.utils.exceptions import CatalogWarning, DataError
-from miricigale.utils.row_files import open_rows
-from miricigale.utils.table_files import read_table
+from miricigale.utils.row_files import open_rows, write_rows
+from miricigale.utils.table_files import read_table, write_table
 
 
 def scaled_table(path, *, ragged=True):
@@ -86,3 +87,67 @@ def test_columns_of_votables_have_the_names_that_users_see(tmp_path):
     document.get_first_table().fields[1].ID = "col2"
     document.to_xml(str(tmp_path / "catalog.xml"))
     assert read_table(tmp_path / "catalog.xml", wanted="a catalog").colnames == table.colnames
+
+
+def nullable():
+    """Columns with missing values, each of which has the numbers that writers take for none."""
+    here = [False, False, True]
+    return Table(
+        {
+            "id": [1, 2, 3],
+            "whole": MaskedColumn([999999, -(2**63), 5], mask=here),
+            "byte": MaskedColumn(np.array([0, 255, 7], np.uint8), mask=here),
+            "short": MaskedColumn(np.array([-(2**15), 2**15 - 1, 7], np.int16), mask=here),
+            "unsigned": MaskedColumn(np.array([0, 2**16 - 1, 7], np.uint16), mask=here),
+            "true": MaskedColumn([True, False, False], mask=here),
+            "text": MaskedColumn(["a", "b", "c"], mask=here),
+            "flux": MaskedColumn([1.0, 2.0, 3.0], mask=here),
+        }
+    )
+
+
+@pytest.mark.parametrize("name", ["c.fits", "c.xml", "c.ecsv", "rows.fits"])
+def test_missing_values_are_missing_after_writing_and_no_others(name, tmp_path):
+    table = nullable()
+    if name == "rows.fits":
+        write_rows(tmp_path / name, [table], len(table))
+    else:
+        write_table(table, tmp_path / name)
+    back = read_table(tmp_path / name, wanted="a catalog", cls=Table)
+    for column in table.itercols():
+        read = back[column.name]
+        assert read[:2].tolist() == column[:2].tolist()
+        if column.dtype.kind == "f":
+            assert not np.isfinite(np.ma.filled(read, np.nan)[2])
+        elif column.dtype.kind == "U":
+            # FITS and VOTables have no missing text
+            assert np.ma.filled(read, "")[2] == ""
+        elif column.name != "id":
+            assert np.ma.getmaskarray(read).tolist() == [False, False, True]
+    # what is written is a copy
+    assert table["true"].dtype == bool
+    assert table["whole"][0] == 999999
+
+
+def test_a_column_of_all_bytes_has_no_null_value(tmp_path):
+    every = MaskedColumn(np.append(np.arange(256), 0).astype(np.uint8))
+    every.mask[-1] = True
+    refuses("'every' has all numbers of its type", write_table, Table({"every": every}),
+            tmp_path / "c.fits")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["c.fits", "c.xml"])
+def test_small_numbers_are_no_truth_values(name, tmp_path):
+    table = Table({"i": np.array([-1, 1, 0], np.int8), "f": np.array([1.5, 2, 3], np.float16)})
+    write_table(table, tmp_path / name)
+    back = read_table(tmp_path / name, wanted="a catalog")
+    assert back["i"].tolist() == [-1, 1, 0]
+    assert back["f"].tolist() == [1.5, 2.0, 3.0]
+
+
+def test_votables_have_no_integers_above_2_to_63(tmp_path):
+    table = Table({"TARGETID": np.array([2**63 + 1], np.uint64)})
+    refuses("'path' must be a file of another format .* 'TARGETID'", write_table, table,
+            tmp_path / "c.xml")  # fmt: skip
+    write_table(Table({"TARGETID": np.array([2**63 - 1], np.uint64)}), tmp_path / "c.xml")
+    assert read_table(tmp_path / "c.xml", wanted="a catalog")["TARGETID"].tolist() == [2**63 - 1]
