@@ -42,6 +42,11 @@ def header_wcs(header, hdus=None, *, where):
     wcs : `~astropy.wcs.WCS` or None
         None without celestial axes.
 
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If they have no solution, such as a matrix of zeros.
+
     Warns
     -----
     `~miricigale.utils.exceptions.PhotometryWarning`
@@ -51,7 +56,7 @@ def header_wcs(header, hdus=None, *, where):
     ----------
     Shupe et al. 2005, ASP Conf. 347, 491 (SIP).
     """
-    from astropy.wcs import WCS, FITSFixedWarning
+    from astropy.wcs import WCS, FITSFixedWarning, WcsError
 
     kinds = [str(header.get(f"CTYPE{axis}", "")).strip() for axis in (1, 2)]
     stray = [key for key in header if _SIP.fullmatch(key)]
@@ -68,8 +73,14 @@ def header_wcs(header, hdus=None, *, where):
     with warnings.catch_warnings():
         # dates and the like that are written in another way
         warnings.simplefilter("ignore", FITSFixedWarning)
-        wcs = WCS(header, hdus, naxis=2)
-    if not wcs.has_celestial:
+        try:
+            wcs = WCS(header, hdus, naxis=2)
+            is_celestial = wcs.has_celestial
+        except WcsError as err:
+            reason = str(err).strip().splitlines()[-1]
+            problem = f"has world coordinates that cannot be used: {reason}"
+            raise data_error(where, problem) from None
+    if not is_celestial:
         return None
     if header.get("NAXIS", 2) > 2:
         # parts are cut by it, and of two axes it must have two

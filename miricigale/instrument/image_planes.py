@@ -14,6 +14,12 @@ NOISE_MAPS = {
 }
 #: Parts of the variance in files of JWST.
 VARIANCE_PARTS = ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT")
+#: Extensions that belong to an image, and are none: noise, flags, times and weights.
+PLANES = (
+    *(name for names in NOISE_MAPS.values() for name in names),
+    *VARIANCE_PARTS,
+    *("DQ", "MASK", "CON", "CTX", "EXP", "EXPTIME", "AREA", "NSAMP"),
+)
 #: What astropy states in UTYPE.
 _UTYPES = {
     "STDDEVUNCERTAINTY": "error",

@@ -249,6 +249,35 @@ def test_an_image_without_data_is_refused(write):
     refuses("has no data in its extension SCI", read_mosaic, write(None), error=DataError)
 
 
+def test_a_map_beside_a_cube_is_not_taken_for_the_image(write):
+    header = fits.Header(tan().to_header())
+    path = write(np.array([noise(), noise()]), [("ERR", 1, plane(0.1), header)])
+    refuses(r"has the shape \(2, 60, 80\) in its extension SCI", read_mosaic, path, error=DataError)
+    with fits.open(path, mode="update") as hdus:
+        hdus["SCI"].name = "TIMES"
+    refuses("has no two-dimensional image", read_mosaic, path, error=DataError)
+    header["BUNIT"] = "MJy/sr"
+    fits.ImageHDU(noise(), header, name="ERR").writeto(path, overwrite=True)
+    with pytest.warns(PhotometryWarning, match="no map of the noise"):
+        assert read_mosaic(f"{path}[ERR]").shape == SHAPE
+
+
+def test_coordinates_without_a_solution_are_refused(write):
+    wcs = tan()
+    path = write(noise(), wcs=wcs, PC1_1=0.0, PC1_2=0.0, PC2_1=0.0, PC2_2=0.0)
+    match = "has world coordinates that cannot be used: .*singular"
+    refuses(match, read_mosaic, path, error=DataError)
+
+
+@pytest.mark.parametrize("unit", ["nanomaggies", "nmgy", "UJY"])
+def test_units_of_images_have_many_names(unit, write):
+    image = read_mosaic(write(noise(), [("ERR", 1, plane(0.1))], BUNIT=unit))
+    size = 1.0 if unit == "UJY" else 3.630780547701013
+    # a flux in each pixel
+    expected = 0.1 * size * 1e-12 / AREA
+    assert np.median(image.uncertainty.array) == pytest.approx(expected, rel=1e-3)
+
+
 @pytest.mark.parametrize("empty", [plane(0.0), plane(np.nan), None])
 def test_weights_stand_in_for_errors_that_hold_none(empty, write):
     path = write(noise(), [("ERR", 1, empty), ("WHT", 1, plane(4.0))])

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.options import check_data, check_that
-from miricigale.utils.units import SURFACE_BRIGHTNESS, ab_quantity
+from miricigale.utils.units import SURFACE_BRIGHTNESS, ab_quantity, flux_unit
 
 #: Names of count rates in headers that are no units of astropy.
 _COUNTS = (
@@ -30,6 +30,10 @@ def parsed_unit(text):
 
     Without pixels, as values are of one; None if it means none.
     """
+    # nanomaggies, which astropy ties to no flux
+    flux = flux_unit(text) if text else None
+    if isinstance(flux, u.UnitBase):
+        return flux
     plain = text
     for pattern, name in _COUNTS:
         plain = re.sub(pattern, name, plain, flags=re.IGNORECASE)

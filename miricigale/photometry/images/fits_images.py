@@ -120,7 +120,7 @@ def extension_index(hdus, extension, path):
         raise data_error(path, f"has no such extension, only {known}") from None
 
 
-def find_image(hdus, extension, path, names):
+def find_image(hdus, extension, path, names, *, no_images=()):
     """
     Index of the extension with the image.
 
@@ -134,11 +134,13 @@ def find_image(hdus, extension, path, names):
         The file, for messages.
     names : iterable of str
         Names of extensions that are preferred to the first image.
+    no_images : iterable of str, optional
+        Names of extensions that are never taken for the first image.
 
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If there is no image, or more than one of these names.
+        If there is no image, more than one of these names, or one that is a cube.
     """
     images = [k for k, hdu in enumerate(hdus) if plane_shape(hdu) is not None]
     if extension is not None:
@@ -151,6 +153,9 @@ def find_image(hdus, extension, path, names):
         if hdu.name in names and hdu.is_image and not hdu.shape and plane_shape(hdu) is None:
             raise data_error(path, f"has no data in its extension {hdu.name} (NAXIS = 0)")
     named = [k for k in images if hdus[k].name in names]
+    if not named:
+        _check_no_cube(hdus, path, names)
+        images = [k for k in images if hdus[k].name not in no_images]
     found = named or images[:1]
     shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
     check_data(found, path, f"has no two-dimensional image, only {shapes}")
@@ -159,6 +164,14 @@ def find_image(hdus, extension, path, names):
     what = f"has {count} extensions {name}; say which as {path}[{name},2] or {path}[NUMBER]"
     check_data(count <= 1, path, what)
     return found[0]
+
+
+def _check_no_cube(hdus, path, names):
+    """Refuse a file whose image has more than two axes, before a map beside it is taken for the image."""
+    for hdu in hdus:
+        if hdu.name in names and hdu.is_image and len(hdu.shape) > 2:
+            problem = f"has the shape {hdu.shape} in its extension {hdu.name}, wanted is an image: cut a plane"
+            raise data_error(path, problem)
 
 
 @contextlib.contextmanager

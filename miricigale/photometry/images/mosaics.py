@@ -19,6 +19,7 @@ from miricigale.instrument.header_wcs import check_kind_of_exposure, image_wcs, 
 from miricigale.instrument.image import Image
 from miricigale.instrument.image_planes import (
     NOISE_MAPS,
+    PLANES,
     VARIANCE_PARTS,
     check_plane,
     companion,
@@ -215,7 +216,7 @@ class MosaicFile:
             If the header states another filter or angle than ``filter`` and ``pa_aper``.
         """
         with open_image(self.path, "an image") as (hdus, extension):
-            index = find_image(hdus, extension, self.path, ("SCI",))
+            index = find_image(hdus, extension, self.path, ("SCI",), no_images=PLANES)
             header, first = hdus[index].header, hdus[0].header
             wcs = image_wcs(header, hdus)
             shape = plane_shape(hdus[index])
