@@ -311,7 +311,8 @@ class Ramp(Interactive, NDData):
         OSError
             If the file exists and ``overwrite`` is False.
         ValueError
-            If the data are not counts (uint16).
+            If the data are not counts (uint16), or the name is one of another product of JWST, such as
+            ``x_cal.fits``.
 
         Notes
         -----

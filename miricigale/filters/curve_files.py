@@ -136,6 +136,9 @@ def _not_negative(throughput, path):
 
 def _of_table(path, unit):
     table = read_table(path, wanted="a filter")
+    if path.suffix.lower() == ".csv" and any(map(_is_number, table.colnames)):
+        # without names of columns
+        return _of_text(path, unit)
     columns = [table[name] for name in table.colnames[:2]]
     if columns:
         column_unit = getattr(columns[0], "unit", None)

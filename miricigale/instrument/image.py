@@ -21,14 +21,14 @@ from miricigale.utils.units import ANGLE
 
 #: How files of products of JWST are called.
 _PRODUCT = re.compile(
-    r"_(?:uncal|ramp|rate|rateints|cal|calints|crf|crfints|i2d|blot|median)\.fits(?:\.gz)?$"
+    r"_(uncal|ramp|rate|rateints|cal|calints|crf|crfints|i2d|blot|median)\.fits(?:\.gz)?$"
 )
 
 #: What writes files in their layout.
 WRITER = "miricigale.reduction.write_image(image, path)"
 
 
-def check_product_name(path, writer):
+def check_product_name(path, writer, own=()):
     """
     Refuse a name of a product of JWST, whose tools would not find the image in another layout.
 
@@ -38,13 +38,18 @@ def check_product_name(path, writer):
         Where an image is written; what is no path has no name.
     writer : str
         What writes JWST's layout, for the message.
+    own : iterable of str, optional
+        Products whose layout the caller writes, such as ``"uncal"``.
 
     Raises
     ------
     ValueError
         If the name is one of a product.
     """
-    if isinstance(path, (str, os.PathLike)) and _PRODUCT.search(os.fspath(path).lower()):
+    if not isinstance(path, (str, os.PathLike)):
+        return
+    product = _PRODUCT.search(os.fspath(path).lower())
+    if product is not None and product[1] not in own:
         wanted = f"a name that is not one of JWST's products, whose layout {writer} writes"
         raise argument_error("path", wanted, repr(os.fspath(path)))
 

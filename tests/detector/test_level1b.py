@@ -73,6 +73,11 @@ def test_a_file_that_is_renamed_later_has_its_later_name(ramp, tmp_path):
         assert fits.getheader(path)["FILENAME"] == name
 
 
+@pytest.mark.parametrize("name", ["x_rate.fits", "x_cal.fits", "x_ramp.fits"])
+def test_names_of_other_products_are_refused(ramp, tmp_path, name):
+    refuses("'path' must be a name that is not one of JWST's products", ramp.write, tmp_path / name)
+
+
 def test_only_counts_are_written(make_exposure, tmp_path):
     exposure = make_exposure(n_groups=2)
     floats = Ramp(np.zeros((1, 2, 64, 72), np.float32), exposure)

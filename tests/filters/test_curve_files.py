@@ -179,3 +179,12 @@ def test_files_of_cigale_say_what_they_count(tmp_path, mark, kind, power):
     response = np.clip(value, 0.0, None) * wave**power
     weighed = np.trapezoid(response * wave, wave) / np.trapezoid(response / wave, wave)
     assert band.pivot.to_value(u.AA) == pytest.approx(np.sqrt(weighed), rel=1e-5)
+
+
+def test_csv_without_names_keeps_its_first_sample(tmp_path):
+    path = tmp_path / "c.csv"
+    path.write_text("7.0,0.2\n7.5,1.0\n8.0,0.4\n8.1,0\n")
+    curve = Filter.read(path, unit="um")
+    # after the vertical edge that a filter begins with
+    assert_allclose(curve.wave.value[1:], [7.0, 7.5, 8.0, 8.1])
+    assert_allclose(curve.throughput, [0.0, 0.2, 1.0, 0.4, 0.0])

@@ -13,6 +13,7 @@ from miricigale.instrument import Image, pixel_area_map, read_image, write_image
 from miricigale.instrument.sky_axes import grid_angle, pixel_to_radec, radec_axes
 from miricigale.photometry import MosaicFile, read_mosaic
 from miricigale.reduction import pixel_map, read_images
+from miricigale.reduction import write_image as write_jwst_image
 from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.exceptions import DataError, PhotometryWarning
 
@@ -322,6 +323,10 @@ def test_names_of_products_of_jwst_are_left_to_their_layout(name, tmp_path):
     refuses("whose layout miricigale.reduction.write_image", image.write, tmp_path / name)
     refuses("whose layout miricigale.reduction.write_image", write_image, image, tmp_path / name)
     assert not list(tmp_path.iterdir())
+    # ramps have another layout than images
+    refuses(
+        "whose layout miricigale.detector.Ramp", write_jwst_image, image, tmp_path / "x_uncal.fits"
+    )
     image.write(tmp_path / "calibrated.fits")
     np.testing.assert_array_equal(CCDData.read(tmp_path / "calibrated.fits").data, noise())
 

@@ -19,6 +19,7 @@ from miricigale.instrument import (
     placed_keywords,
 )
 from miricigale.instrument.asdf_extension import asdf_extension
+from miricigale.instrument.image import check_product_name
 from miricigale.instrument.image_files import json_meta
 from miricigale.instrument.sky_axes import pixel_to_radec
 from miricigale.reduction.images.files import PLANES, ImageFile, shared_meta
@@ -27,6 +28,9 @@ from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing, write_fits
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
+
+#: Products of JWST that are images, or cubes of them.
+_PRODUCTS = ("rate", "rateints", "cal", "calints", "crf", "crfints", "i2d", "blot", "median")
 
 
 def write_image(image, path, *, planes=None, overwrite=False):
@@ -56,7 +60,8 @@ def write_image(image, path, *, planes=None, overwrite=False):
     OSError
         If the file exists and ``overwrite`` is False.
     ValueError
-        If a plane has another name or shape, or integrations do not belong together.
+        If a plane has another name or shape, integrations do not belong together, or the name is one of ramps
+        (``x_uncal.fits``).
 
     Examples
     --------
@@ -71,6 +76,7 @@ def write_image(image, path, *, planes=None, overwrite=False):
     >>> path = write_image(rates, "sub64_rateints.fits")  # doctest: +SKIP
     """
     path = Path(path)
+    check_product_name(path, "miricigale.detector.Ramp.write(path)", own=_PRODUCTS)
     image, planes, wcs = _joined(image, planes or {})
     meta = image.meta
     cal = image.unit.is_equivalent(SURFACE_BRIGHTNESS)
