@@ -364,6 +364,8 @@ class CatalogMap:
         ab = _is_ab(unit)
         missing, no_error = without_codes(values, errors, magnitudes=ab, further=self.missing)
         if errors is not None and not self.limits and not ab:
+            # -99 nJy of both is -0.099 uJy of both
+            missing |= (errors < 0) & (errors == values)
             no_error |= ~missing & negative_codes(values, errors)
         code = np.where(missing, values, np.nan)
         if ab:

@@ -32,6 +32,8 @@ _WAVE_WORD = re.compile(r"wave|lambda|λ|\bwl\b", re.IGNORECASE)
 #: What counts the light, in comments and in the parameters of a VOTable.
 _DETECTOR = re.compile(r"detector[\s_]*(?:type)?\s*[:=\t ]\s*(energy|photon|[01])\b", re.IGNORECASE)
 _ENERGY = ("0", "energy")
+#: Two numbers with a comma in place of the point, such as "7,5 0,1".
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+[\s;]+[+-]?\d+,\d+\s*$")
 #: Part of the peak down to which a negative throughput is noise.
 _NOISE = 0.05
 #: Relative width of a vertical edge, a wavelength that is there twice.
@@ -79,8 +81,8 @@ def read_curve(path, unit=None):
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the file is no curve, its unit is not known or not the only one that is named, a wavelength is there
-        more than twice, or a throughput is below -5 % of the peak.
+        If the file is no curve, its numbers have commas in place of points, its unit is not known or not the only
+        one that is named, a wavelength is there more than twice, or a throughput is below -5 % of the peak.
     """
     path = Path(path).expanduser()
     if path.suffix.lower() in TABLE_FORMATS:
@@ -187,6 +189,8 @@ def _of_text(path, unit):
     rows = []
     for line in lines:
         if not line.startswith("#"):
+            problem = f"has commas within its numbers, such as {line[:40]!r}: write points"
+            check_data(not _DECIMAL_COMMA.match(line), path, problem)
             rows.append(line.partition("#")[0].replace(",", " ").split())
     if len(rows) > 2 and not (len(rows[0]) > 1 and all(map(_is_number, rows[0][:2]))):
         # names of columns without a mark, or what LePhare has there: a number of rows and a name

@@ -2,13 +2,15 @@
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable, vstack
+from astropy.table import vstack
 
 from miricigale.refdata import resources
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error, config_error
+from miricigale.utils.missing_values import plain_floats
 from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
+from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import require_columns
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages.inputs import bright_sources, fit_seds, study_catalog
@@ -155,13 +157,19 @@ def _by_luminosity(sources, options, rng):
     """
     model = SEDModel.yang2021()
     try:
-        table = QTable.read(options.luminosity_function)
+        table = read_table(options.luminosity_function, wanted="a luminosity function")
     except OSError as err:
         where = f"[sample] luminosity_function = {options.luminosity_function!r}"
         raise config_error(where, f"cannot be read: {err}") from err
     names = ("log_luminosity", "redshift", "phi")
     require_columns(table, names, "luminosity_function")
-    log_luminosity, redshift, phi = (np.asarray(u.Quantity(table[n]).value, float) for n in names)
+    log_luminosity, redshift, phi = (
+        plain_floats(table[name], name, "luminosity_function") for name in names
+    )
+    for name, numbers in zip(names, (log_luminosity, redshift, phi), strict=True):
+        n_bad = np.count_nonzero(~np.isfinite(numbers))
+        wanted = f"a table of finite numbers in {name!r}"
+        check_that(not n_bad, "luminosity_function", wanted, f"{n_bad} that are not")
     levels, steps = np.unique(log_luminosity), np.unique(redshift)
     if len(levels) < 2 or len(steps) < 2 or len(table) != len(levels) * len(steps):
         wanted = "a grid of at least two luminosities and two redshifts, a row for each pair"

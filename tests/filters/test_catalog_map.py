@@ -113,6 +113,8 @@ def test_negative_errors_stand_for_nothing_unless_they_may_be_limits():
     table, coded = convert(columns, units={"flux": "mJy"})
     assert np.isnan(table[f"{BAND}_err"].value).tolist() == [True, True, True, False, False]
     assert table[f"{BAND}_err"][3].value == -1000
+    # the same code twice is no flux either
+    assert np.isnan(table[BAND].value).tolist() == [False, False, True, False, False]
     assert coded[BAND][:3].tolist() == [-0.099, -1, -0.0999]
     assert np.isnan(coded[BAND][3:]).all()
     limits, _ = convert(columns, units={"flux": "mJy"}, limits=True)

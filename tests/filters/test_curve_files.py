@@ -181,6 +181,14 @@ def test_files_of_cigale_say_what_they_count(tmp_path, mark, kind, power):
     assert band.pivot.to_value(u.AA) == pytest.approx(np.sqrt(weighed), rel=1e-5)
 
 
+@pytest.mark.parametrize("row", ["7,5 0,9", "7,5;0,9", "7,5\t0,9"])
+def test_commas_in_place_of_points_are_refused(tmp_path, row):
+    path = tmp_path / "c.dat"
+    path.write_text(f"7,0 0,1\n{row}\n8,0 0,1\n")
+    message = r"c\.dat has commas within its numbers, such as '7,0 0,1'"
+    refuses(message, Filter.read, path, unit="um", error=DataError)
+
+
 def test_csv_without_names_keeps_its_first_sample(tmp_path):
     path = tmp_path / "c.csv"
     path.write_text("7.0,0.2\n7.5,1.0\n8.0,0.4\n8.1,0\n")

@@ -203,6 +203,11 @@ def test_a_luminosity_function_gives_the_sample(tmp_path):
     volume = cosmology.comoving_volume(1.1) - cosmology.comoving_volume(1.0)
     sky = (4 * np.pi * u.sr).to_value(u.arcmin**2)
     assert planner.density == pytest.approx(1e-3 * 0.2 * volume.to_value(u.Mpc**3) / sky, rel=1e-3)
+    # a missing number is none of the function
+    table["phi"][1] = np.nan
+    table.write(tmp_path / "lf.ecsv", overwrite=True)
+    match = "'luminosity_function' must be a table of finite numbers in 'phi', got 1 that are not"
+    refuses(match, lambda: Planner(planner.config).sources)
 
 
 @pytest.mark.slow
