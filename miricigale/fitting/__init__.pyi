@@ -6,6 +6,7 @@ from .catalogs.checks import mock_analysis as mock_analysis
 from .catalogs.classification import compare_classes as compare_classes
 from .catalogs.from_files import fit_catalog as fit_catalog
 from .catalogs.streaming import fit_file as fit_file
+from .data.agn_bins import AGNBins as AGNBins
 from .data.likelihood import FitFlags as FitFlags
 from .data.settings import GridSettings as GridSettings
 from .data.settings import SamplerSettings as SamplerSettings

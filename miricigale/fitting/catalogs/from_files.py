@@ -27,6 +27,7 @@ def fit_catalog(
     ebv=0.0,
     interpolate=600,
     agn_error=0.0,
+    agn_bins=None,
     hdu=None,
     chunk_rows=10000,
     **options,
@@ -76,9 +77,9 @@ def fit_catalog(
         Color excess E(B-V) of the Milky Way, in mag, behind which all models but given grids are put
         (`~miricigale.sed.components.GalacticExtinction`, law of Gordon et al. 2023, none beyond 32 um). For one
         that differs from source to source see `~miricigale.sed.foreground.deredden`.
-    interpolate, agn_error : optional
-        Models between the nodes for each object (0: nodes alone), and the error of the light of AGN, as in
-        `miricigale.fitting.GridSettings`.
+    interpolate, agn_error, agn_bins : optional
+        Models between the nodes for each object (0: nodes alone), the error of the light of AGN, and bins in
+        which posteriors of AGN are kept, as in `miricigale.fitting.GridSettings`.
     hdu, chunk_rows, **options
         As for `miricigale.fitting.fit_file`, such as ``redshift``, a column of known redshifts, and
         ``resume``.
@@ -135,7 +136,7 @@ def fit_catalog(
         model_error=model_error,
         outliers=outliers,
         calibration=known,
-        settings=GridSettings(interpolate=interpolate, agn_error=agn_error),
+        settings=GridSettings(interpolate=interpolate, agn_error=agn_error, agn_bins=agn_bins),
     )
     calibrate = calibrates_itself(calibrate, calibration, axes, models, model_error)
     fitter = calibrated(fitter, rows, calibrate, Path(output), options | {"hdu": hdu})

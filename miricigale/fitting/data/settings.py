@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from miricigale.fitting.data.agn_bins import AGNBins
 from miricigale.sed import SEDModel
 from miricigale.utils.options import check_that
 from miricigale.utils.units import check_count, is_number
@@ -54,6 +55,9 @@ class GridSettings:
         the AGN has of a model, of the measured flux, beside all other errors, in the choice of the best model and
         in evidences too; ``chi2`` is without it, and so are grids of templates, which have no AGN. The shapes of
         tori are known less well than those of galaxies: 0.3 where AGN outshine them.
+    agn_bins : `~miricigale.fitting.AGNBins`, optional
+        With ``interpolate``: bins in which the joint posterior of redshift, AGN fraction and luminosity is kept,
+        ``agn_weights`` of the results.
 
     Raises
     ------
@@ -75,6 +79,7 @@ class GridSettings:
     interpolate: int = 600
     finer: SEDModel | None = None
     agn_error: float = 0.0
+    agn_bins: object = None
 
     def __post_init__(self):
         def check(name, good, wanted):
@@ -87,6 +92,7 @@ class GridSettings:
         check("interpolate", most <= _MOST_MODELS, f"at most {_MOST_MODELS}")
         good = is_number(error) and error >= 0 and (most or not error)
         check("agn_error", good, "0 or more, and 0 without 'interpolate'")
+        check("agn_bins", isinstance(self.agn_bins, AGNBins | None), "AGNBins or None")
         wanted = "an SEDModel" if most else "None without 'interpolate'"
         check("finer", finer is None or (most and isinstance(finer, SEDModel)), wanted)
 

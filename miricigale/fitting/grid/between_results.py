@@ -55,6 +55,10 @@ def between_results(fit, data, posteriors, pairs):
         wrong = np.array([posterior.wrong for posterior in posteriors])
         used = np.isfinite(data.sigma) | data.limit
         outlier = np.where(used, wrong, np.nan)
+    bins = fit.given.agn_bins
+    agn_weights = None
+    if bins is not None:
+        agn_weights = np.array([bins(posterior) for posterior in posteriors], np.float32)
     return FitResults(
         **data.columns,
         **arrays,
@@ -71,6 +75,7 @@ def between_results(fit, data, posteriors, pairs):
         model_flux_std=flux[:, 1],
         best_flux=_column(posteriors, "best_flux"),
         outlier=outlier,
+        agn_weights=agn_weights,
     )
 
 

@@ -184,6 +184,8 @@ class GridFit:
             out["sfr_prior"] = {"scatter": scatter, "sfr": rates}
         if between is not None:
             out["tables"] = between.models.sizes
+        if self.given.agn_bins is not None:
+            out["agn_bins"] = repr(self.given.agn_bins)
         return out
 
     def provenance(self):
@@ -382,7 +384,15 @@ class GridFit:
             model_flux_std=out.band[:, 1],
             best_flux=out.best_flux,
             outlier=None if self.engine.mixture is None else out.outlier,
+            agn_weights=self._no_agn_weights(len(data)),
         )
+
+    def _no_agn_weights(self, n):
+        """NaN for the weights in bins of objects without models between nodes; None where none are asked for."""
+        bins = self.given.agn_bins
+        if bins is None:
+            return None
+        return np.full((n, *bins.shape), np.nan, np.float32)
 
     def log_errors(self, data):
         """Ln of the product of the errors that likelihoods are divided by, shape (n,)."""

@@ -109,6 +109,8 @@ class FitResults(FitRows):
         where they are.
     outlier : `~numpy.ndarray`, shape (n, nb), optional
         How likely each band is wrong, of a fit with ``outliers``; NaN in bands not used.
+    agn_weights : `~numpy.ndarray`, shape (n, n_z, n_fractions, n_luminosities), optional
+        Joint posterior of redshift, AGN fraction and luminosity in ``agn_bins`` of `GridSettings`.
     least_std : float, optional
         Part of the mean below which no standard deviation is given (CIGALE: 0.05).
     model : `~miricigale.sed.SEDModel`, optional
@@ -173,6 +175,7 @@ class FitResults(FitRows):
     redshift_fixed: bool = False
     distance: PerObject = None
     outlier: PerObject = None
+    agn_weights: PerObject = None
     constants: dict = field(default_factory=dict)
     least_std: float = 0.0
     model: object = None

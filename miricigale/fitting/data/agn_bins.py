@@ -1,0 +1,128 @@
+"""Joint posteriors of redshift, AGN fraction and AGN luminosity, in bins."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
+from miricigale.utils.units import LUMINOSITY
+
+#: erg/s in the unit of luminosities.
+_ERG_PER_S = LUMINOSITY.to("erg / s")
+
+
+@dataclass(frozen=True)
+class AGNBins:
+    """
+    Bins of redshift, AGN fraction and AGN luminosity, for ``agn_bins`` of `GridSettings`.
+
+    Parameters
+    ----------
+    redshift : tuple of float
+        Ascending edges of bins of redshift, n_z of them. What lies outside all bins has another one, the last.
+    log_luminosity : tuple of float
+        Ascending edges: log10 of the luminosity in erg/s. The first bin is that of AGN below the first edge, and
+        the last one has no upper end: as many bins as edges, and one.
+    frac_agn : tuple of float, optional
+        Ascending edges of bins of the AGN fraction, from 0 to 1. Besides, the first bin is that of no AGN.
+    quantity : str, optional
+        Derived quantity of the models that is the luminosity: by default that of the accretion disk over all
+        directions, which does not depend on the angle at which the AGN is seen.
+
+    Raises
+    ------
+    ValueError
+        If edges do not ascend, or those of the fraction do not reach from 0 to 1.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import AGNBins
+    >>> AGNBins(redshift=(0.0, 1.0, 2.0), log_luminosity=(43.0, 44.0, 45.0)).shape
+    (3, 7, 4)
+    """
+
+    redshift: tuple
+    log_luminosity: tuple
+    frac_agn: tuple = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+    quantity: str = "accretion_power"
+
+    def __post_init__(self):
+        least = {"redshift": 2, "log_luminosity": 1, "frac_agn": 2}
+        for name, n_least in least.items():
+            edges = floats(getattr(self, name))
+            wanted = f"{n_least} or more ascending edges"
+            if edges.ndim != 1 or edges.size < n_least or not np.all(np.diff(edges) > 0):
+                raise argument_error(name, wanted, f"{getattr(self, name)}")
+            if not np.all(np.isfinite(edges)):
+                raise argument_error(name, "finite edges", f"{getattr(self, name)}")
+            object.__setattr__(self, name, tuple(edges.tolist()))
+        if self.frac_agn[0] != 0 or self.frac_agn[-1] != 1:
+            raise argument_error("frac_agn", "edges from 0 to 1", f"{self.frac_agn}")
+
+    @property
+    def shape(self):
+        """Numbers of bins of redshift, AGN fraction and luminosity."""
+        return len(self.redshift), len(self.frac_agn), len(self.log_luminosity) + 1
+
+    def place(self, redshift, frac_agn, luminosity):
+        """
+        Bins of models.
+
+        Parameters
+        ----------
+        redshift, frac_agn, luminosity : `~numpy.ndarray`, shape (n,)
+            Their values; the luminosity in erg/s.
+
+        Returns
+        -------
+        place : tuple of `~numpy.ndarray` of int, shape (n,)
+            Bin of each axis. Without an AGN the luminosity is in the first.
+        """
+        frac_agn = np.asarray(frac_agn, float)
+        n_z = len(self.redshift) - 1
+        z_bin = np.searchsorted(self.redshift, redshift, side="right") - 1
+        z_bin = np.where((z_bin < 0) | (z_bin >= n_z), n_z, z_bin)
+        frac_bin = np.searchsorted(self.frac_agn[1:-1], frac_agn, side="right") + 1
+        frac_bin = np.where(frac_agn > 0, frac_bin, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_l = np.log10(luminosity)
+        l_bin = np.searchsorted(self.log_luminosity, log_l, side="right")
+        l_bin = np.where(np.isfinite(log_l) & (frac_bin > 0), l_bin, 0)
+        return z_bin, frac_bin, l_bin
+
+    def __call__(self, posterior):
+        """Weights of a `~miricigale.fitting.grid.continuation.BetweenPosterior` in the bins, of `shape`."""
+        # models without AGN have no such quantity
+        none = np.zeros(posterior.weight.size)
+        luminosity = posterior.derived.get(self.quantity, none)
+        values = posterior.values
+        place = self.place(values["redshift"], values["frac_agn"], luminosity * _ERG_PER_S)
+        flat = np.ravel_multi_index(place, self.shape)
+        return np.bincount(flat, posterior.weight, np.prod(self.shape)).reshape(self.shape)
+
+    def prior(self, axis):
+        """
+        Prior of the bins of the AGN fraction.
+
+        Parameters
+        ----------
+        axis : `~miricigale.fitting.posterior.priors.GridAxis`
+            AGN fractions of a fit between nodes, with their prior: flat within each cell.
+
+        Returns
+        -------
+        weights : `~numpy.ndarray`, shape (n_fractions,)
+            They sum to 1.
+        """
+        low, high = np.clip(axis.cells(), axis.values[0], axis.values[-1])
+        weights = np.zeros(len(self.frac_agn))
+        for first, last, weight in zip(low, high, axis.weights, strict=True):
+            if last == first:
+                weights[0 if first == 0 else self.place([0.0], first, [1.0])[1]] += weight
+                continue
+            for j, (begin, end) in enumerate(itertools.pairwise(self.frac_agn), start=1):
+                inside = max(min(end, last) - max(begin, first), 0.0)
+                weights[j] += weight * inside / (last - first)
+        return weights
