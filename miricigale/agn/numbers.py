@@ -1,0 +1,217 @@
+"""Tables of a survey of AGN: numbers by redshift and luminosity, totals, and the prior of the AGN fraction."""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.evaluation import Estimate
+from miricigale.evaluation.classes import CLASS_LIMITS
+from miricigale.sed.spectrum import COSMOLOGY
+from miricigale.utils.package_tables import declared
+from miricigale.utils.random import stream
+from miricigale.utils.tables import described_rows
+
+#: AGN fraction from which AGN are counted by luminosity: smaller ones look like none.
+FLOOR = CLASS_LIMITS[0]
+#: Percentiles of intervals.
+_INTERVAL = (15.865, 84.135)
+#: Pseudo-counts of the prior of a rate: Jeffreys's, of a Poisson distribution.
+_JEFFREYS = 0.5
+#: Least share of the injected AGN of a bin whose fraction is above the floor: of fewer the rest is a guess.
+LEAST_ABOVE = 0.5
+
+
+def _texts(name):
+    return declared("miricigale.agn", "columns.toml")[name]
+
+
+def _summary(draws, name):
+    """Median and 68 % interval of draws, by name."""
+    if not np.all(np.isfinite(draws)):
+        return dict.fromkeys((name, f"{name}_low", f"{name}_high"), np.nan)
+    low, high = np.percentile(draws, _INTERVAL)
+    return {name: float(np.median(draws)), f"{name}_low": float(low), f"{name}_high": float(high)}
+
+
+@dataclass(frozen=True, eq=False)
+class SampleNumbers:
+    """
+    What the numbers of a survey are made of.
+
+    Parameters
+    ----------
+    bins : `~miricigale.fitting.AGNBins`
+        The bins.
+    limit, floor : float
+        AGN fractions from which an object is selected, and from which AGN are counted by luminosity.
+    draws : `~miricigale.agn.ShareDraws`
+        Shares and numbers by the measured prior.
+    shipped : dict of str to `~numpy.ndarray`, shape (n_z, n_frac, n_lum)
+        Sums of the posteriors as they were fitted, by class.
+    area : float
+        Area in square degrees.
+    n_all, n_used : int
+        Objects of the catalog, and those whose posteriors are in the sums.
+    selected : `~numpy.ndarray`, shape (n_z, n_lum)
+        Selected objects by fitted redshift and luminosity.
+    pure : `~numpy.ndarray`, shape (n_z, n_lum)
+        Sum of their probabilities to have an AGN fraction of at least the limit, by the measured prior.
+    injected : dict of str to `~numpy.ndarray` of int, shape (n_z, n_lum)
+        Injected AGN by true redshift and luminosity: ``all``; ``above`` the floor; the ``selected`` ones; and of
+        these the ``right`` ones, above the limit.
+    seed : int
+        Of the errors of rates.
+    """
+
+    bins: object
+    limit: float
+    floor: float
+    draws: object
+    shipped: dict
+    area: float
+    n_all: int
+    n_used: int
+    selected: np.ndarray
+    pure: np.ndarray
+    injected: dict
+    seed: int
+
+    def volume(self, i):
+        """Comoving volume of a bin of redshift in Mpc3."""
+        low, high = (COSMOLOGY.comoving_volume(z).to_value(u.Mpc**3) for z in self._edges(i))
+        return (high - low) * self.area / (4.0 * np.pi * u.sr).to_value(u.deg**2)
+
+    def _edges(self, i):
+        return self.bins.redshift[i], self.bins.redshift[i + 1]
+
+    def by_luminosity(self):
+        """
+        Numbers of AGN by redshift and luminosity.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            A row for each bin; the last of the luminosity has no upper end, and so no density.
+        """
+        rows = []
+        n_z = len(self.bins.redshift) - 1
+        for i in range(n_z):
+            for k in range(1, self.bins.shape[2]):
+                rows.append(self._row(i, k))
+        table = described_rows(rows, _texts("numbers"))
+        for name in [one for one in table.colnames if one.startswith("density")]:
+            table[name].unit = 1 / u.Mpc**3 / u.dex
+        return table
+
+    def _first(self, fraction):
+        """First bin of the AGN fraction from one of its edges on."""
+        return self.bins.frac_agn.index(fraction) + 1
+
+    def _row(self, i, k):
+        edges = (*self.bins.log_luminosity, np.inf)
+        low, high = edges[k - 1], edges[k]
+        z_low, z_high = self._edges(i)
+        row = {"redshift_low": z_low, "redshift_high": z_high}
+        row |= {"log_luminosity_low": low, "log_luminosity_high": high}
+        part = np.s_[i, self._first(self.floor) :, k]
+        by_class = {
+            name: counts[(slice(None), *part)].sum(axis=1)
+            for name, counts in self.draws.counts.items()
+        }
+        number = sum(by_class.values())
+        row |= _summary(number, "n")
+        row["n_shipped"] = float(sum(shipped[part].sum() for shipped in self.shipped.values()))
+        injected = {name: int(counts[i, k]) for name, counts in self.injected.items()}
+        row["n_injected"] = injected["all"]
+        for name, kind in (("completeness", "selected"), ("above", "above")):
+            share = Estimate.of_fraction(injected[kind], injected["all"])
+            row |= {name: share.value, f"{name}_low": share.low, f"{name}_high": share.high}
+        n_selected = self.selected[i, k]
+        row["n_selected"] = int(n_selected)
+        row["purity"] = self.pure[i, k] / n_selected if n_selected else np.nan
+        row["n_corrected"] = np.nan
+        if injected["right"]:
+            row["n_corrected"] = self.pure[i, k] * injected["all"] / injected["right"]
+        row["constrained"] = bool(row["above"] >= LEAST_ABOVE)
+        row |= self._density(number, row["n_shipped"], injected, i, k)
+        return row | self._obscured(by_class, i, k)
+
+    def _density(self, number, n_shipped, injected, i, k):
+        """Luminosity function of all AGN of a bin, also those below the floor, which injected ones tell."""
+        width = np.diff((*self.bins.log_luminosity, np.inf))[k - 1]
+        if not injected["all"] or not injected["above"] or np.isinf(width):
+            return _summary(np.full(1, np.nan), "density") | {"density_shipped": np.nan}
+        rng = stream(self.seed, "agn", "rates", i, k)
+        # of a field of this size others have more or fewer, and objects without a fit are like the rest
+        per_object = self.n_all / self.n_used / (self.volume(i) * width)
+        n_below = injected["all"] - injected["above"]
+        above = rng.beta(injected["above"] + _JEFFREYS, n_below + _JEFFREYS, number.size)
+        rate = rng.standard_gamma(number + _JEFFREYS) * per_object / above
+        shipped = n_shipped * per_object * injected["all"] / injected["above"]
+        return _summary(rate, "density") | {"density_shipped": shipped}
+
+    def _obscured(self, by_class, i, k):
+        """Share of the AGN that is obscured: those in fits as a galaxy, whose torus hides the disk."""
+        if "quasar" not in by_class:
+            return _summary(np.full(1, np.nan), "obscured")
+        rng = stream(self.seed, "agn", "obscured", i, k)
+        hidden = rng.standard_gamma(by_class["galaxy"] + _JEFFREYS)
+        seen = rng.standard_gamma(by_class["quasar"] + _JEFFREYS)
+        return _summary(hidden / (hidden + seen), "obscured")
+
+    def totals(self):
+        """
+        Numbers of all AGN from the floor of the AGN fraction on, and from the limit of selected ones on.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            A row for each of the two.
+        """
+        n_z = len(self.bins.redshift) - 1
+        rows = []
+        for fraction in sorted({self.floor, self.limit}):
+            part = np.s_[:n_z, self._first(fraction) :, :]
+            counts = self.draws.counts.values()
+            number = sum(one[(slice(None), *part)].sum(axis=(1, 2, 3)) for one in counts)
+            row = {"frac_agn": fraction} | _summary(number, "n")
+            row["n_shipped"] = float(sum(one[part].sum() for one in self.shipped.values()))
+            row["n_selected"] = int(self.selected[:n_z].sum())
+            rows.append(row)
+        return described_rows(rows, _texts("totals"))
+
+
+def prior_table(bins, prior, draws, every):
+    """
+    Prior of the AGN fraction as shipped, and as measured on the sample.
+
+    Parameters
+    ----------
+    bins : `~miricigale.fitting.AGNBins`
+        The bins.
+    prior : `~numpy.ndarray`, shape (n_frac,)
+        Prior of the fits.
+    draws, every : `~miricigale.agn.ShareDraws`
+        Measured for each bin of redshift, and for all redshifts together.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each bin of the fraction, first for all redshifts.
+    """
+    edges = (0.0, *bins.frac_agn)
+    rows = []
+    samples = [(bins.redshift[0], bins.redshift[-1], every.shares[:, 0])]
+    for i in range(len(bins.redshift) - 1):
+        samples.append((bins.redshift[i], bins.redshift[i + 1], draws.shares[:, i]))
+    for z_low, z_high, shares in samples:
+        for j, shipped in enumerate(prior):
+            row = {"redshift_low": z_low, "redshift_high": z_high}
+            row |= {
+                "frac_agn_low": edges[j],
+                "frac_agn_high": edges[j + 1],
+                "shipped": float(shipped),
+            }
+            rows.append(row | _summary(shares[:, j], "measured"))
+    return described_rows(rows, _texts("prior"))

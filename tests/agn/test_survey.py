@@ -1,0 +1,217 @@
+"""AGN added to photometry, and counted again."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from helpers.commands import command
+from helpers.errors import refuses
+from miricigale import BayesFitter, ErrorModel, SEDModel
+from miricigale.agn import AGNSurvey, NoiseCurve, add_light, agn_light
+from miricigale.utils.parallel import threads
+
+BANDS = [
+    "acs.f814w",
+    "wfc3.f160w",
+    "irac.ch1",
+    "miri.f770w",
+    "miri.f1000w",
+    "miri.f1500w",
+    "miri.f2100w",
+]
+AXES = {
+    "redshift": [0.9, 1.0, 1.1],
+    "age": [1.0, 3.0],
+    "ebv": [0.1, 0.3],
+    "frac_agn": [0.0, 0.3, 0.6, 0.9],
+    "tau97": [3.0, 7.0],
+}
+#: Deep enough for no doubt.
+DEPTH = 29.0
+N, N_AGN = 24, 8
+OPTIONS = {
+    "calibration": None,
+    "calibrate": False,
+    "model_error": 0.02,
+    "interpolate": 60,
+}
+
+
+@pytest.fixture(scope="module")
+def model():
+    return SEDModel.yang2021(libraries="bundled")
+
+
+@pytest.fixture(scope="module")
+def truth(model):
+    rng = np.random.default_rng(5)
+    table = QTable({"id": np.arange(N) + 1, "redshift": rng.uniform(0.93, 1.07, N)})
+    table["age"] = rng.uniform(1.1, 2.9, N)
+    table["ebv"] = rng.uniform(0.12, 0.28, N)
+    table["mass"] = 10 ** rng.uniform(10.0, 11.0, N)
+    table["tau97"] = rng.uniform(3.2, 6.8, N)
+    table["frac_agn"] = np.where(np.arange(N) < N_AGN, rng.uniform(0.5, 0.8, N), 0.0)
+    return table
+
+
+@pytest.fixture(scope="module")
+def photometry(model, truth):
+    errors = ErrorModel.from_depths(dict.fromkeys(BANDS, DEPTH), fractional=0.02)
+    return errors.perturb(model.fluxes(truth, BANDS)[["id", *BANDS]], seed=1)
+
+
+@pytest.fixture(scope="module")
+def run(model, photometry, tmp_path_factory):
+    """Function that runs a survey in a folder of its own: the result and the folder."""
+    folder = tmp_path_factory.mktemp("agn")
+    catalog = folder / "catalog.ecsv"
+    photometry.meta = {}
+    photometry.write(catalog)
+
+    def run_survey(name, executor=None):
+        survey = AGNSurvey(
+            20 * u.arcmin**2,
+            redshift=(0.5, 1.5),
+            log_luminosity=(43.5, 44.5),
+            n_injections=8,
+            seed=1,
+        )
+        output = folder / name
+        options = OPTIONS | {"executor": executor, "models": lambda _: (model, AXES)}
+        return survey.run(catalog, output, **options), output
+
+    return run_survey
+
+
+@pytest.fixture(scope="module")
+def result(run):
+    return run("first")
+
+
+def test_no_light_leaves_the_photometry_as_it_is(photometry):
+    curves = {band: NoiseCurve(np.array([1.0, 2.0]), np.array([0.1, 0.2])) for band in BANDS}
+    none = dict.fromkeys(BANDS, np.zeros(N) * u.uJy)
+    same = add_light(photometry, none, curves=curves, seed=1)
+    for name in photometry.colnames:
+        assert np.array_equal(np.asarray(same[name]), np.asarray(photometry[name]))
+
+
+def test_light_brings_the_noise_of_sources_as_bright():
+    n = 4000
+    table = QTable({"id": np.arange(n)})
+    table["miri.f770w"] = np.full(n, 1.0) * u.uJy
+    table["miri.f770w_err"] = np.full(n, 0.1) * u.uJy
+    table["miri.f770w_limit"] = np.arange(n) == 0
+    # the error is a tenth of the flux
+    curves = {"miri.f770w": NoiseCurve(np.array([1.0, 10.0]), np.array([0.1, 1.0]))}
+    bright = add_light(table, {"miri.f770w": np.full(n, 4.0) * u.uJy}, curves=curves, seed=2)
+    assert bright["miri.f770w"][0].value == 1.0
+    flux, error = bright["miri.f770w"].value[1:], bright["miri.f770w_err"].value[1:]
+    np.testing.assert_allclose(error, 0.5)
+    # the noise of the flux itself was not drawn
+    assert flux.mean() == pytest.approx(5.0, abs=0.03)
+    assert flux.std() == pytest.approx(np.sqrt(0.5**2 - 0.1**2), rel=0.05)
+
+
+def test_noise_curve_is_that_of_the_catalog():
+    flux = np.linspace(0.0, 100.0, 2001)
+    curve = NoiseCurve.of_band(flux, 1.0 + 0.1 * flux)
+    assert curve.ratio(20.0, 40.0) == pytest.approx(7.0 / 3.0, rel=0.01)
+    assert NoiseCurve.of_band(np.array([np.nan]), np.array([1.0])) is None
+
+
+def test_light_of_an_agn_is_that_of_the_model(model, truth, photometry):
+    fitter = BayesFitter(model, BANDS, axes=AXES, model_error=0.02)
+    hosts = fitter.fit(photometry[:3])
+    table = QTable({"redshift": hosts.best["redshift"], "mass": hosts.best["mass"]})
+    for name in ("age", "ebv"):
+        table[name] = hosts.best[name]
+    for name, value in hosts.constants.items():
+        table[name] = np.full(3, value)
+    table["tau97"] = [3.0, 5.0, 7.0]
+    table["frac_agn"] = [0.2, 0.5, 0.9]
+    whole = model.fluxes(table, BANDS)
+    table["frac_agn"] = 0.0
+    galaxy = model.fluxes(table, BANDS)
+    light, fraction = agn_light(
+        model, hosts, whole["accretion_power"], {"tau97": table["tau97"]}, BANDS
+    )
+    np.testing.assert_allclose(fraction, [0.2, 0.5, 0.9])
+    for band in BANDS:
+        np.testing.assert_allclose((galaxy[band] + light[band]).value, whole[band].value, rtol=1e-9)
+    none, fraction = agn_light(
+        model, hosts, [0.0, 0.0, 0.0] * u.W, {"tau97": table["tau97"]}, BANDS
+    )
+    assert all(np.all(none[band].value == 0) for band in BANDS)
+    assert np.all(fraction == 0)
+
+
+def test_all_agn_are_counted_where_there_is_no_doubt(result, truth):
+    survey, _ = result
+    above = survey.totals[survey.totals["frac_agn"] == 0.4]
+    assert above["n_selected"][0] == N_AGN
+    assert above["n"][0] == pytest.approx(N_AGN, abs=0.5)
+    # the prior of the fits has three AGN in four
+    measured = survey.prior[0]
+    assert measured["shipped"] == pytest.approx(0.25)
+    assert measured["measured"] == pytest.approx(1.0 - N_AGN / N, abs=0.12)
+    assert np.array_equal(survey.sources["selected"], truth["frac_agn"] > 0)
+    number = survey.numbers["n"].sum()
+    assert number == pytest.approx(N_AGN, abs=1)
+
+
+def test_bright_agn_are_complete_and_others_are_pure(result):
+    survey, _ = result
+    bright = survey.numbers[-1]
+    assert bright["n_injected"] == 4
+    assert bright["completeness"] >= 0.75
+    assert bright["above"] == 1.0
+    some = survey.numbers["n_selected"] > 0
+    np.testing.assert_allclose(survey.numbers["purity"][some], 1.0, atol=0.02)
+
+
+def test_injected_agn_are_found_at_their_luminosities(result):
+    injected = result[0].injected
+    good = (injected["frac_agn"] > 0.3) & (injected["frac_agn"] < 0.85)
+    apart = (injected["log_luminosity_fitted"] - injected["log_luminosity"])[good]
+    assert good.sum() >= 2
+    assert np.all(np.abs(apart) < 0.15)
+
+
+def test_workers_and_a_second_call_change_no_byte(result, run):
+    _, first = result
+    with threads(2) as executor:
+        _, second = run("second", executor)
+    names = sorted(path.name for path in first.glob("*.ecsv"))
+    assert len(names) == 5
+    before = {name: (first / name).read_bytes() for name in names}
+    assert before == {name: (second / name).read_bytes() for name in names}
+    states = {path: path.stat().st_mtime_ns for path in first.glob("*/part-*.fits")}
+    run("first")
+    assert before == {name: (first / name).read_bytes() for name in names}
+    assert states == {path: path.stat().st_mtime_ns for path in states}
+    page = (first / "page.html").read_text()
+    for words in ("Luminosity function", "Selection function", "Prior of fracAGN"):
+        assert words in page
+
+
+def test_refusals(run, tmp_path):
+    area = 20 * u.arcmin**2
+    refuses("'limit' must be from 0.1 to below 1, got 0.05", AGNSurvey, area, limit=0.05)
+    refuses("'area' must be", AGNSurvey, 0 * u.arcmin**2)
+    refuses("'n_injections' must be", AGNSurvey, area, n_injections=-1)
+    survey = AGNSurvey(area)
+    refuses("'interpolate' must be above 0", survey.run, "no.fits", tmp_path, interpolate=0)
+
+
+def test_command_states_its_plan_and_names_its_options(photometry, tmp_path, capsys):
+    catalog = tmp_path / "catalog.ecsv"
+    photometry.write(catalog)
+    arguments = ["agn", catalog, "--area", 20, "--injections", 76, "-o", tmp_path / "agn"]
+    said = command(capsys, *arguments, "--classes", "quasars", "--plan").out
+    assert "24 objects and 76 injected AGN in 2 classes: 200 fits" in said
+    assert not (tmp_path / "agn").exists()
+    assert "--limit must be from 0.1" in command(capsys, *arguments, "--limit", 0, status=2).err
+    said = command(capsys, *arguments, "--interpolate", 0, status=2).err
+    assert "--interpolate must be above 0" in said
