@@ -27,7 +27,7 @@ def fit(args):
                 args.photometry,
                 args.output,
                 **chosen(args, "classes quasars red_dots stars axes redshift model_error outliers"),
-                **chosen(args, "calibrate interpolate agn_error pairs"),
+                **chosen(args, "calibrate interpolate agn_error pairs nuclei nuclear_stars"),
                 **({} if args.calibration is None else {"calibration": args.calibration}),
                 **chosen(args, "flux_unit catalog_map ebv chunk_rows resume"),
                 hdu=hdu,

@@ -18,6 +18,12 @@ from miricigale.fitting.data.likelihood import (
     per_band,
     unused_bands,
 )
+from miricigale.fitting.data.nuclei import (
+    NucleusColumns,
+    nucleus_columns,
+    read_nuclei,
+    with_units,
+)
 from miricigale.fitting.data.settings import GridSettings, SamplerSettings
 from miricigale.fitting.grid.grid_fit import GridFit
 from miricigale.fitting.posterior.priors import known_redshifts
@@ -51,7 +57,7 @@ logger = logging.getLogger(__name__)
 #: Arguments of `BayesFitter`.
 _OPTIONS = (
     "model", "filters", "priors", "engine", "axes", "model_error", "error_floor", "template_error", "outliers",
-    "calibration", "scale_error", "n_bands_min", "compat", "settings",
+    "calibration", "scale_error", "n_bands_min", "compat", "nuclei", "settings",
 )  # fmt: skip
 #: Arguments of its method fit.
 _OF_FIT = (
@@ -157,6 +163,11 @@ class BayesFitter(Interactive):
         Reproduce choices of CIGALE that are not ours: no ``scale_error``, nodes alone, no result where the best
         chi2 is above 1417 (its weights, from which the best chi2 is not subtracted, all vanish;
         flagged ``NO_LIKELIHOOD``), and no standard deviation below 5 % of the mean.
+    nuclei : bool, optional
+        Of a grid: whether fluxes of the point in the center of galaxies are fitted as those of the AGN, beside the
+        total fluxes and with their covariance (`miricigale.fitting.grid.nuclei`). They are columns
+        ``<name>_flux_point`` (or ``<name>_nucleus``) with ``..._err``, ``..._corr`` (correlation with the total; 0
+        without it) and ``..._limit``, as `~miricigale.photometry.ForcedPhotometryResult.to_table` writes them.
     settings : `GridSettings` or `SamplerSettings`, optional
         More settings of the engine.
 
@@ -235,6 +246,7 @@ class BayesFitter(Interactive):
         scale_error=None,
         n_bands_min=2,
         compat=None,
+        nuclei=False,
         settings=None,
     ):
         on_grid = engine == "grid"
@@ -273,6 +285,9 @@ class BayesFitter(Interactive):
             if settings.mass_function is None:
                 settings = replace(settings, mass_function=calibration.mass_function)
         self.engine, self.calibration = engine, calibration
+        check_that(isinstance(nuclei, bool), "nuclei", "True or False", repr(nuclei))
+        check_that(on_grid or not nuclei, "nuclei", "False with a sampler", repr(nuclei))
+        self.nuclei = nuclei
         self.template_error = of_grid["template_error"]
         self.model = None if isinstance(model, ModelGrid) else model
         self.filters, self.n_bands_min = names, check_count(n_bands_min, "n_bands_min")
@@ -513,6 +528,8 @@ class BayesFitter(Interactive):
         A band of ``filters`` that it lacks is a missing one of all objects.
         """
         table = as_photometry(photometry, self.filters or self.bands, units=unit)
+        if self.nuclei:
+            table = with_units(table, unit)
         lost = [name for name in self.filters or () if name not in table.colnames]
         if lost and len(lost) < len(self.filters):
             text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
@@ -532,8 +549,21 @@ class BayesFitter(Interactive):
         zero = dict.fromkeys(bands, 0.0)
         return PhotometryReader(bands, bands, zero, zero, 1, self.zero_points).read(photometry)
 
+    def _nucleus_columns(self, photometry):
+        """`NucleusColumns` of a catalog, one band at least."""
+        columns = NucleusColumns.of_table(
+            photometry.colnames, self.filters or self._reader.fitted(photometry)
+        )
+        wanted = "a table with columns <filter>_flux_point and <filter>_flux_point_err for 'nuclei'"
+        check_that(columns.bands, "photometry", wanted, f"columns {photometry.colnames}")
+        return columns
+
     def _warn_of_bands(self, photometry):
         """Warn of bands that are not fitted, if the fitter does not name those that are."""
+        nuclei = nucleus_columns(photometry.colnames)
+        if nuclei and not self.nuclei:
+            text = "fluxes of nuclei are not fitted (nuclei=True does)"
+            warn(f"{text}: {', '.join(nuclei)}", FitWarning)
         unused = unused_bands(photometry, self._reader.fitted(photometry))
         if unused and self.filters is None:
             text = "bands of the photometry that the grid lacks are not fitted"
@@ -547,7 +577,15 @@ class BayesFitter(Interactive):
         size = check_count(size, "chunk_size")
         seed = None if self.engine == "grid" else check_seed(seed)
         data, known, settings = self._prepare(photometry, **known, repeated=repeated)
-        task = self.backend.task(pairs, seed, known)
+        backend = self.backend
+        if self.nuclei:
+            columns = self._nucleus_columns(photometry)
+            backend = backend.with_nuclei(columns.bands)
+            values, left_out = read_nuclei(photometry, columns, data, self._reader)
+            flags = data.flags | np.where(left_out, int(FitFlags.NUCLEUS_LEFT_OUT), 0)
+            data = data._changed(nuclei=values, flags=flags)
+            settings |= backend.settings()
+        task = backend.task(pairs, seed, known)
         # the measured errors take no part, and what goes to other processes is kept small
         sent = data._changed(flux_err=None)
         rows = list(chunks(len(data), size)) or [slice(0, 0)]
@@ -629,6 +667,9 @@ class BayesFitter(Interactive):
         if self.engine != "grid":
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
+        if self.nuclei:
+            msg = "draws of nodes are without nuclei: fitter.replace(nuclei=False).sample(...)"
+            raise ValueError(msg)
         n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
         data, known, settings = self._prepare(
             self._table_of(photometry, unit), redshift, redshift_prior
@@ -645,6 +686,9 @@ class BayesFitter(Interactive):
         if calibration is not None:
             known = {"calibration": calibration.name, "zero_point": self.zero_points}
             known["error_factor"] = self._reader.error_factor
+        if self.nuclei:
+            known["nuclei"] = True
+            known["nuclear_stars"] = float(self.backend.given.nuclear_stars)
         return {
             "engine": self._engine_name,
             "filters": list(filters or self.filters or self.bands),

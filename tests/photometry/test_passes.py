@@ -245,3 +245,8 @@ def test_covariance_of_two_components_is_that_of_least_squares(tools):
     assert_allclose(result.flux_err.value**2, expected.sum(), rtol=0.01)
     joint = result.joint_covariance.toarray()
     assert_allclose(joint[0, 1], expected[0, 1] + expected[1, 1], rtol=0.01)
+    correlation = (expected[0, 1] + expected[1, 1]) / np.sqrt(expected.sum() * expected[1, 1])
+    assert_allclose(result.flux_point_corr, correlation, rtol=0.01)
+    assert_allclose(
+        result.to_table("miri.f770w")["miri.f770w_flux_point_corr"], correlation, rtol=0.01
+    )

@@ -6,8 +6,8 @@ model that can matter are listed by their bounds (`pairs`, down to those of `flo
 (`batched_pairs`, `single` in single precision, `limits` with upper limits) and summed up (`sums`, `histogram`);
 `summarize` turns the sums into moments and quantiles. `weigh_masses` (`masses`) puts a prior of mass in,
 `find_models` (`mixture`) finds wrong bands. `interpolate_light` (`interpolation`) and `evaluate_places`
-(`population`, `importance`) are of models between nodes. `structs` says what the kernels take and where it stands
-there, `workspace` makes it.
+(`population`, `nuclei`, `importance`) are of models between nodes. `structs` says what the kernels take and where
+it stands there, `workspace` makes it.
 """
 
 from miricigale.fitting._core.evaluate import sum_up
@@ -40,6 +40,7 @@ from miricigale.fitting._core.interpolation import (
 )
 from miricigale.fitting._core.masses import weigh_masses
 from miricigale.fitting._core.mixture import find_models
+from miricigale.fitting._core.nuclei import Nuclei
 from miricigale.fitting._core.population import NEVER, Masses, Mixture, Object, Space
 from miricigale.fitting._core.structs import BLOCK, Request, Tables
 from miricigale.fitting._core.workspace import (

@@ -6,6 +6,7 @@ from collections import namedtuple
 from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.interpolation import galaxy_light, with_agn
 from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.nuclei import with_nuclei
 from miricigale.fitting._core.structs import NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
@@ -19,8 +20,8 @@ NEVER, _NONE = -1e300, -1e200
 #: ``n_galaxy`` axes; and the `Light` between whose nodes models are interpolated.
 Space = namedtuple("Space", "size low high log_prior cells n_galaxy light")
 #: An object: `Target`, `Limits` or None, `Mixture` or None, 2 ln(prior) of galaxies, (nz, nG), `Masses`, its
-#: redshift, 0 if that is free, and error of AGN light as a part of it.
-Object = namedtuple("Object", "target limits mixture log_usable masses redshift agn_error")
+#: redshift, 0 if that is free, error of AGN light as a part of it, and `Nuclei` or None.
+Object = namedtuple("Object", "target limits mixture log_usable masses redshift agn_error nuclei")
 #: Prior of stellar mass: ln of it, (nz, n), at log10 of masses 0, 1 / per_dex, 2 / per_dex, ...; log10 of the
 #: stellar mass of each galaxy for each solar mass formed, (nG,). Without one there are two values of 0.
 Masses = namedtuple("Masses", "table log_stars per_dex")
@@ -80,16 +81,16 @@ def _widen(flux, agn, z, target, agn_error, weight):
 
 
 @njit(**PART)
-def _likelihood(one, limits, mixture, z, work):
+def _likelihood(one, limits, mixture, z, fluxes):
     """
     Best scale of a model, ln of the likelihood there but for a constant, and the variance of the scale.
 
     All that is known of the data is in here: ``z`` is the redshift that errors are of. With bands that may be
-    wrong the scale follows from how likely each of them is, and that from the scale. ``work.flux`` are the fluxes
-    of the model and of its AGN, and memory for weights; ``limits`` and ``mixture``, those of the object, are
+    wrong the scale follows from how likely each of them is, and that from the scale. ``fluxes`` are those of the
+    model and of its AGN, and memory for weights; ``limits`` and ``mixture``, those of the object, are
     arguments so that kernels without them are compiled.
     """
-    flux, agn, scratch = work.flux[0], work.flux[1], work.flux[2]
+    flux, agn, scratch = fluxes[0], fluxes[1], fluxes[2]
     target, agn_error = one.target, one.agn_error
     more = _widen(flux, agn, z, target, agn_error, scratch)
     s, r, variance, chi2 = _best_scale(flux, scratch, target, limits)
@@ -178,12 +179,21 @@ def _model(space, x, redshift, work):
 
 
 @njit(**PART)
+def _likelihood_of_data(one, nuclei, z, work):
+    """As `_likelihood` of all data; ``nuclei``, those of the object, are an argument as there."""
+    if nuclei is None:
+        return _likelihood(one, one.limits, one.mixture, z, work.flux)
+    with_nuclei(nuclei, work.flux)
+    return _likelihood(one, one.limits, one.mixture, z, nuclei.flux)
+
+
+@njit(**PART)
 def _evaluate(space, one, x, work):
     """Ln of the prior and of the likelihood of a place, its scale and the variance of that."""
     z, g, prior = _model(space, x, one.redshift, work)
     log, z = _prior(one, z, g)
     if log < _NONE:
         return NEVER, 0.0, 0.0, 0.0
-    s, like, variance = _likelihood(one, one.limits, one.mixture, z, work)
+    s, like, variance = _likelihood_of_data(one, one.nuclei, z, work)
     log += _mass_prior(one.masses, z, g, s)
     return prior + log, like, s, variance

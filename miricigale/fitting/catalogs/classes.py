@@ -15,6 +15,7 @@ from miricigale.fitting.catalogs.page_numbers import thinned
 from miricigale.fitting.results.pulls import without_warnings
 from miricigale.pages import number
 from miricigale.plotting.axes import WIDTH, new_figure
+from miricigale.utils.options import check_that
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.tables import described_table
 
@@ -62,6 +63,9 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
         What `~miricigale.fitting.fit_catalog` warns of, once for all classes.
     """
     names = chosen_classes(classes, quasars=quasars, red_dots=red_dots, stars=stars)
+    # evidences of classes are compared for the same data
+    has_nuclei = bool(options.get("nuclei")) and bool(names)
+    check_that(not has_nuclei, "nuclei", "False with other classes than galaxies", "True")
     spectra = None
     if "stars" in names:
         from miricigale.sed import read_spectra

@@ -7,6 +7,7 @@ from pathlib import Path
 from miricigale.fitting.catalogs.catalog_rows import open_catalog
 from miricigale.fitting.data.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.data.likelihood import unused_bands
+from miricigale.fitting.data.nuclei import nucleus_columns
 from miricigale.utils.options import check_that
 
 log = logging.getLogger(__name__)
@@ -28,6 +29,8 @@ def fit_catalog(
     interpolate=600,
     agn_error=0.0,
     agn_bins=None,
+    nuclei=False,
+    nuclear_stars=0.1,
     hdu=None,
     chunk_rows=10000,
     **options,
@@ -80,6 +83,11 @@ def fit_catalog(
     interpolate, agn_error, agn_bins : optional
         Models between the nodes for each object (0: nodes alone), the error of the light of AGN, and bins in
         which posteriors of AGN are kept, as in `miricigale.fitting.GridSettings`.
+    nuclei : bool, optional
+        Whether fluxes of the point in the center of galaxies (columns ``<filter>_flux_point`` or
+        ``<filter>_nucleus``) are fitted as those of AGN, as with `~miricigale.fitting.BayesFitter`.
+    nuclear_stars : float, optional
+        With these: part of the light of hosts that may be such a point, as in `miricigale.fitting.GridSettings`.
     hdu, chunk_rows, **options
         As for `miricigale.fitting.fit_file`, such as ``redshift``, a column of known redshifts, and
         ``resume``.
@@ -109,6 +117,8 @@ def fit_catalog(
     unit = options.get("flux_unit")
     rows = open_catalog(path, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
     bands = bands_with_errors(rows.colnames, "path")
+    wanted = "a catalog with columns <filter>_flux_point and <filter>_flux_point_err for 'nuclei'"
+    check_that(not nuclei or nucleus_columns(rows.colnames), "path", wanted, f"{rows.colnames}")
     # heavy imports only after the file was checked
     from miricigale.fitting import BayesFitter, GridSettings, fit_file
     from miricigale.fitting.survey.defaults import statement
@@ -136,7 +146,13 @@ def fit_catalog(
         model_error=model_error,
         outliers=outliers,
         calibration=known,
-        settings=GridSettings(interpolate=interpolate, agn_error=agn_error, agn_bins=agn_bins),
+        nuclei=nuclei,
+        settings=GridSettings(
+            interpolate=interpolate,
+            agn_error=agn_error,
+            agn_bins=agn_bins,
+            nuclear_stars=nuclear_stars,
+        ),
     )
     calibrate = calibrates_itself(calibrate, calibration, axes, models, model_error)
     fitter = calibrated(fitter, rows, calibrate, Path(output), options | {"hdu": hdu})

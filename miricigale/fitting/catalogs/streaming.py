@@ -17,6 +17,7 @@ from miricigale.filters.photometry_table import unit_of_fluxes
 from miricigale.fitting.catalogs.catalog_rows import give_units, open_catalog
 from miricigale.fitting.data.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.data.likelihood import HIGH_CHI2, unused_bands
+from miricigale.fitting.data.nuclei import nucleus_columns
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.results.io import (
     FORMAT,
@@ -158,7 +159,8 @@ def fit_file(
     else:
         for text in rows.messages():
             warn(f"{rows.path.name}: {text}", CatalogWarning)
-    fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
+    named = [*fitter.bands, *nucleus_columns(rows.colnames)]
+    fluxes = {c for name in named for c in (name, error_column(name))}
     take = row_pieces(rows, options, unit, fluxes)
     kinds = set()
     for i in range(rows.n_chunks):

@@ -25,6 +25,8 @@ _SMALL, _LARGE = 1e-60, 1e60
 _DARK = 1e-8
 #: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
 _NO_SIGNAL = 1e-280
+#: What follows the name of a band in columns of fluxes of nuclei: as of forced photometry, and another one.
+NUCLEUS_SUFFIXES = ("_flux_point", "_nucleus")
 _TRUE = ("true", "t", "1", "1.0")
 _FALSE = ("false", "f", "0", "0.0", "-0.0", "")
 _KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers"}
@@ -145,6 +147,13 @@ class FitFlags(Flags):
             "fit as one, at its redshift, ``redshift_p50_galaxy``."
         ),
     )
+    NUCLEUS_LEFT_OUT = (
+        2097152,
+        (
+            "The flux of a nucleus was left out: its error or correlation cannot be used, or the "
+            "band has no total flux."
+        ),
+    )
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192, "Bits with which a row has no result."
 
 
@@ -168,6 +177,8 @@ class FitData(ObjectRows):
         `FitFlags`.
     redshift : `~numpy.ndarray`, shape (n,), optional
         Known redshifts; NaN where one is missing.
+    nuclei : `~numpy.ndarray`, shape (n, n_nuclei, 4), optional
+        Fluxes of nuclei, as of `~miricigale.fitting.data.nuclei.read_nuclei`.
     """
 
     ids: PerObject
@@ -177,6 +188,7 @@ class FitData(ObjectRows):
     limit: PerObject
     flags: PerObject
     redshift: PerObject = None
+    nuclei: PerObject = None
 
     @property
     def used(self):
@@ -328,8 +340,13 @@ def unused_bands(table, filters):
         pair = (name, error_column(name))
         return columns.issuperset(pair) and all(_is_flux(table[column]) for column in pair)
 
-    others = (name for name in table.colnames if name not in filters)
+    others = (name for name in table.colnames if name not in filters and not is_nucleus(name))
     return [name for name in others if is_filter(name) or measured(name)]
+
+
+def is_nucleus(name):
+    """Whether a column is called as fluxes of nuclei are."""
+    return name.endswith(NUCLEUS_SUFFIXES)
 
 
 def is_filter(name):

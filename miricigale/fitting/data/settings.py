@@ -58,6 +58,10 @@ class GridSettings:
     agn_bins : `~miricigale.fitting.AGNBins`, optional
         With ``interpolate``: bins in which the joint posterior of redshift, AGN fraction and luminosity is kept,
         ``agn_weights`` of the results.
+    nuclear_stars : float, optional
+        With fluxes of nuclei: standard deviation of the part of the light of a host, with its color, that is a
+        point in the center and not in the template that the total was measured with, such as a bulge redder than
+        the disk.
 
     Raises
     ------
@@ -80,6 +84,7 @@ class GridSettings:
     finer: SEDModel | None = None
     agn_error: float = 0.0
     agn_bins: object = None
+    nuclear_stars: float = 0.1
 
     def __post_init__(self):
         def check(name, good, wanted):
@@ -93,6 +98,8 @@ class GridSettings:
         good = is_number(error) and error >= 0 and (most or not error)
         check("agn_error", good, "0 or more, and 0 without 'interpolate'")
         check("agn_bins", isinstance(self.agn_bins, AGNBins | None), "AGNBins or None")
+        stars = self.nuclear_stars
+        check("nuclear_stars", is_number(stars) and 0 <= stars < 10, "in [0, 10)")
         wanted = "an SEDModel" if most else "None without 'interpolate'"
         check("finer", finer is None or (most and isinstance(finer, SEDModel)), wanted)
 

@@ -177,7 +177,7 @@ class Continuation(Frozen):
             return _core.Masses(np.zeros((n_z, 2)), np.zeros(n_galaxies), 0.0)
         return _core.Masses(density.table, density.log_stars, density.per_dex)
 
-    def place(self, n_effective, posteriors, node, redshift, known):
+    def place(self, n_effective, posteriors, node, redshift, known, nuclei=None):
         """
         Put models between the nodes, with the weights of the posterior of an object.
 
@@ -193,9 +193,14 @@ class Continuation(Frozen):
             Redshift of the object; 0 if it is free.
         known : `~miricigale.fitting.grid.grid.ObjectOnNodes`
             What is known of the object.
+        nuclei : `~miricigale.fitting.grid.nuclei.ObjectNuclei`, optional
+            Its nuclei, with which the data in ``known`` are extended.
         """
         start = known.start
-        mixture = known.wrong and self._mixture(*known.wrong)
+        bands = self.engine.mixture
+        if nuclei is not None:
+            bands = nuclei.mixture(bands)
+        mixture = known.wrong and self._mixture(bands, *known.wrong)
         log_usable = known.log_usable
         masses = self._masses
         if log_usable is None:
@@ -208,7 +213,14 @@ class Continuation(Frozen):
             if known.log_usable is None:
                 log_usable = log_usable[node : node + 1]
         one = _core.Object(
-            known.target, known.limits, mixture, log_usable, masses, redshift, self.agn_error
+            known.target,
+            known.limits,
+            mixture,
+            log_usable,
+            masses,
+            redshift,
+            self.agn_error,
+            nuclei and nuclei.kernel(),
         )
         if redshift:
             labels, borders, weights = self.labels_at_redshift, np.zeros(0), np.ones(1)
@@ -222,7 +234,7 @@ class Continuation(Frozen):
         label, score = labels.of_nodes(self._cells_of(start.index))
         peak = np.searchsorted(borders, self.engine.grid.redshift[start.index[:, 0]])
         models = sampler.run(label, score, peak)
-        posteriors[known.row] = models and self._describe(models, one, known)
+        posteriors[known.row] = models and self._describe(models, one, known, nuclei)
 
     def _cells_of(self, drawn):
         """Nodes of the axes of draws from the posterior on nodes: (n, n_axes)."""
@@ -236,9 +248,9 @@ class Continuation(Frozen):
                 columns.append(node[g if axis.kind == "galaxy" else np.maximum(k, 0)])
         return np.stack(columns, axis=1)
 
-    def _mixture(self, stated, sigma, broad):
-        """`_core.Mixture` of an object."""
-        used, part = stated.bands, self.engine.mixture.part[stated.bands]
+    def _mixture(self, bands, stated, sigma, broad):
+        """`_core.Mixture` of an object, of bands that may be wrong (`BandMixture`)."""
+        used, part = stated.bands, bands.part[stated.bands]
         narrow, wide = np.take(stated.weight, used, axis=1), broad[used]
         odds = part / (1.0 - part) / np.sqrt(narrow) / wide
         # of fluxes in units of the errors without that of templates
@@ -262,7 +274,7 @@ class Continuation(Frozen):
         index[without_agn, 2] = -1
         return index
 
-    def _describe(self, models, one, known):
+    def _describe(self, models, one, known, nuclei):
         """`BetweenPosterior` of models."""
         values = {}
         node = {}
@@ -276,11 +288,18 @@ class Continuation(Frozen):
         flux, _ = self.models.fluxes(values, values["redshift"], values["frac_agn"])
         scale = self.engine.drawn_scale(models.scale, models.variance, models.uniform)
         drawn_flux = flux * scale[:, None]
+        data_flux = flux
+        bands = self.engine.mixture
+        if nuclei is not None:
+            data_flux = self._with_nuclei(nuclei, flux, values, models.power)
+            bands = nuclei.mixture(bands)
         share = None
         if known.wrong:
             stated, _, broad = known.wrong
-            given = drawn_flux, stated, broad, one.limits, z, weight
-            share = self.engine.mixture.shares(*given)
+            given = data_flux * scale[:, None], stated, broad, one.limits, z, weight
+            share = bands.shares(*given)
+            if nuclei is not None:
+                share = nuclei.of_bands(share)
         mean = weight @ drawn_flux
         variance = weight @ np.square(drawn_flux - mean)
         # the best model is that of the highest likelihood, at its own scale
@@ -298,10 +317,20 @@ class Continuation(Frozen):
             best_node=np.array([node[name][best] for name in self.axes]),
             best_scale=models.scale[best],
             best_flux=best_flux,
-            chi2=_chi2(stated, one.limits, z[best], best_flux),
+            chi2=_chi2(stated, one.limits, z[best], data_flux[best] * models.scale[best]),
             log_sum=models.log_evidence + known.zero + known.log_norm,
             converged=models.converged,
         )
+
+    def _with_nuclei(self, nuclei, flux, values, power):
+        """Fluxes of models, (n, nb), with those of nuclei; ``power``, (n,), is that of their AGN."""
+        agn = np.zeros(flux.shape)
+        present = power > 0.0
+        if present.any():
+            rows = {name: value[present] for name, value in values.items()}
+            light = self.models.agn_fluxes(rows, rows["redshift"])
+            agn[present] = power[present, None] * light
+        return nuclei.extended(flux, agn)
 
     def _derived(self, values, models, scale):
         """Derived quantities by name, shape (n,), of models with scales (n,)."""

@@ -14,6 +14,7 @@ from miricigale.fitting.grid.continuation import N_START, Continuation
 from miricigale.fitting.grid.grid import GridEngine
 from miricigale.fitting.grid.interpolation import InterpolatedModels
 from miricigale.fitting.grid.mixture import BandMixture
+from miricigale.fitting.grid.nuclei import NuclearGrid, fit_with_nuclei
 from miricigale.fitting.posterior.populations import MassPrior, expected_sfr, sfr_log_prior
 from miricigale.fitting.posterior.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.posterior.priors import (
@@ -53,6 +54,7 @@ class GridFit:
     compat: str | None
     template_error: TemplateError | None = None
     between: Continuation | None = None
+    nuclei: NuclearGrid | None = None
 
     #: Weight of the first or last redshift above which an object is flagged.
     edge_weight = 0.01
@@ -123,6 +125,28 @@ class GridFit:
             models = InterpolatedModels.of_model(finer, grid, bands, out.constants, priors.axes)
         return replace(out, between=Continuation(engine, models, float(settings.agn_error)))
 
+    def with_nuclei(self, bands):
+        """
+        The same for data with nuclei.
+
+        Parameters
+        ----------
+        bands : list of str
+            Bands that have them.
+
+        Raises
+        ------
+        ValueError
+            If the models have no AGN.
+        """
+        has_agn = self.grid.n_agn > 0 and np.any(self.grid.frac_agn > 0)
+        wanted = "False for models without AGN, whose fluxes those of nuclei are"
+        check_that(has_agn, "nuclei", wanted, "True")
+        index = tuple(self.filters.index(band) for band in bands)
+        error = 0.0 if self.between is None else self.between.agn_error
+        stars = float(self.given.nuclear_stars)
+        return replace(self, nuclei=NuclearGrid(self.engine, index, stars, error))
+
     @property
     def chunk_size(self):
         """Objects in a piece of the catalog."""
@@ -168,6 +192,9 @@ class GridFit:
             "agn_error": 0.0 if between is None else between.agn_error,
             "constants": self.constants,
         }
+        if self.nuclei is not None:
+            out["nuclei"] = [self.filters[i] for i in self.nuclei.bands]
+            out["nuclear_stars"] = self.nuclei.stars
         if error is not None:
             wave = error.wave.value.tolist()
             out["template_error"] = {"wave": wave, "error": error.error.tolist()}
@@ -235,11 +262,13 @@ class GridFit:
 
     def task(self, pairs, _seed, _log_prior):
         """Function that fits a piece of the catalog; nothing is drawn, and the prior comes with it."""
-        return partial(self._fit_piece, self.check_pairs(pairs))
+        return partial(self.fit_piece, self.check_pairs(pairs))
 
-    def _fit_piece(self, pairs, piece):
+    def fit_piece(self, pairs, piece):
         """`FitResults` of a piece: its photometry and priors of redshift."""
         data, log_prior = piece
+        if data.nuclei is not None:
+            return fit_with_nuclei(self, data, log_prior, pairs)
         if self.between is not None:
             return self._between_nodes(data, log_prior, pairs)
         return self._on_nodes(data, log_prior, pairs)
@@ -259,7 +288,7 @@ class GridFit:
         for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
             some = data[rows]
             out = self.engine.fit(**some.of_engine(log_prior[rows]), **options)
-            parts.append(self._results(some, out, pairs))
+            parts.append(self.results_on_nodes(some, out, pairs))
         return FitResults.concatenate(parts)
 
     def _between_nodes(self, data, log_prior, pairs):
@@ -321,7 +350,7 @@ class GridFit:
 
     def _at_redshift(self, data, log_prior, pairs):
         """Results on nodes of an object at its own redshift, which stand at the nearest node."""
-        z, n_z = float(data.redshift[0]), log_prior.shape[1]
+        z = float(data.redshift[0])
         fitted = np.isfinite(log_prior).any()
         node = int(np.argmax(log_prior[0]))
         engine = self.between.at_redshift(z if fitted else self.grid.redshift[0], node)
@@ -329,7 +358,14 @@ class GridFit:
         workspace = engine.workspace(joint=joint)
         photometry = data.of_engine(log_prior[:, node : node + 1])
         out = engine.fit(**photometry, joint=joint, workspace=workspace)
-        if fitted:
+        return self.results_at_redshift(data, out, log_prior, pairs)
+
+    def results_at_redshift(self, data, out, log_prior, pairs):
+        """From models at the redshift of one object to results, which stand at the nearest node."""
+        z = float(data.redshift[0])
+        n_z = log_prior.shape[1]
+        node = int(np.argmax(log_prior[0]))
+        if np.isfinite(log_prior).any():
             out.index[:, 0] = node
         here = (np.arange(n_z) == node)[:, None]
 
@@ -338,11 +374,11 @@ class GridFit:
 
         joint = {k: all_redshifts(v) if k[0] == "z" else v for k, v in out.joint.items()}
         out = out._replace(zf=all_redshifts(out.zf), joint=joint)
-        results = self._results(data, out, pairs)
+        results = self.results_on_nodes(data, out, pairs)
         best = results.best | {"redshift": 0.0 * results.best["redshift"] + z}
         return results._changed(best=best)
 
-    def _results(self, data, out, pairs):
+    def results_on_nodes(self, data, out, pairs):
         """From models to parameters and derived quantities."""
         flags = np.array(data.flags)
         if self.compat == "cigale":

@@ -382,7 +382,7 @@ def _score(fits, true):
 def on_nodes(fitter):
     """Return a fitter of the nodes of the grid alone: errors and priors are of what these leave."""
     settings = dataclasses.replace(fitter.backend.given, interpolate=0, finer=None, agn_error=0.0)
-    return fitter.replace(settings=settings)
+    return fitter.replace(settings=settings, nuclei=False)
 
 
 def _measure(fitter, table, z, name, reference, priors, options):

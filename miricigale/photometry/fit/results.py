@@ -240,6 +240,22 @@ class ForcedPhotometryResult(Tabular):
         return np.asarray((self.flux / self.flux_err).value)
 
     @functools.cached_property
+    def flux_point_corr(self):
+        """
+        Correlation of the errors of ``flux`` and ``flux_point``, shape (n,); None without second components.
+
+        It is that of ``joint_covariance``, and NaN for sources of one component.
+        """
+        if self.joint_covariance is None:
+            return None
+        n = len(self)
+        variance = self.joint_covariance.diagonal()
+        joint = self.joint_covariance.diagonal(n)
+        size = np.sqrt(variance[:n] * variance[n:])
+        correlation = np.divide(joint, size, out=np.full(n, np.nan), where=size > 0)
+        return np.where(np.isfinite(self.flux_point.value), correlation, np.nan)
+
+    @functools.cached_property
     def chi2_image(self):
         """
         Goodness of fit over the image: (residual / sigma)^2, averaged over the PSF.

@@ -1,0 +1,202 @@
+"""Fluxes of the point in the center of galaxies, by band, as a catalog has them beside the total fluxes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.filters.band_names import find_filter
+from miricigale.filters.photometry_table import unit_of_fluxes
+from miricigale.fitting.data.likelihood import NUCLEUS_SUFFIXES, flux_column, limits
+from miricigale.utils.exceptions import units_error
+from miricigale.utils.options import check_that
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU, flux_unit
+
+_CORRELATION = "_corr"
+#: Values of a nucleus in `read_nuclei`.
+FLUX, SIGMA, COVARIANCE, LIMIT = range(4)
+
+
+@dataclass(frozen=True)
+class NucleusColumns:
+    """
+    Columns of a catalog with the fluxes of nuclei.
+
+    Parameters
+    ----------
+    bands : tuple of str
+        Bands that have one and are fitted, by our names.
+    columns : tuple of str
+        Columns of their fluxes; ``<column>_err``, ``<column>_corr`` and ``<column>_limit`` belong to them.
+    """
+
+    bands: tuple
+    columns: tuple
+
+    @classmethod
+    def of_table(cls, colnames, bands):
+        """
+        Find the columns of nuclei.
+
+        Parameters
+        ----------
+        colnames : list of str
+            Columns of the catalog.
+        bands : iterable of str
+            Bands that are fitted, by our names.
+
+        Returns
+        -------
+        columns : `NucleusColumns`
+            Without bands if there are none.
+
+        Raises
+        ------
+        ValueError
+            If two columns are of the same band.
+        """
+        bands = tuple(bands)
+        found = {}
+        for column, band in nucleus_columns(colnames).items():
+            if band not in bands:
+                continue
+            wanted = f"a table with one flux of nuclei in {band!r}"
+            check_that(
+                band not in found, "photometry", wanted, f"{found.get(band)!r} and {column!r}"
+            )
+            found[band] = column
+        ordered = [band for band in bands if band in found]
+        return cls(tuple(ordered), tuple(found[band] for band in ordered))
+
+
+def nucleus_columns(colnames):
+    """Columns that hold fluxes of nuclei and have errors: dict of band, by our names, by column."""
+    found = {}
+    for column in colnames:
+        for suffix in NUCLEUS_SUFFIXES:
+            if not column.endswith(suffix) or error_column(column) not in colnames:
+                continue
+            name = column.removesuffix(suffix)
+            band = find_filter(name) or name
+            found[column] = band
+    return found
+
+
+def with_units(table, unit):
+    """
+    Catalog whose fluxes of nuclei without a unit have that of the fluxes of bands.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        The catalog.
+    unit : unit-like, dict of str to unit-like or None
+        As for `~miricigale.filters.as_photometry`; AB magnitudes are left out.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        Itself, or a copy.
+    """
+    known = {}
+    for column, band in nucleus_columns(table.colnames).items():
+        of_band = unit.get(band, unit.get("flux")) if isinstance(unit, Mapping) else unit
+        if of_band is None:
+            continue
+        parsed = unit_of_fluxes(of_band)
+        for name in (column, error_column(column)):
+            if getattr(table[name], "unit", None) is None and parsed != u.ABmag:
+                known[name] = parsed
+    if not known:
+        return table
+    out = table.copy(copy_data=False)
+    for name, parsed in known.items():
+        out[name] = out[name] * parsed
+    return out
+
+
+def read_nuclei(table, columns, data, reader):
+    """
+    Take fluxes of nuclei from a catalog.
+
+    Zero points, the factors of errors and the part of the flux that is added to errors are those of the bands.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        The catalog.
+    columns : `NucleusColumns`
+        Its columns of nuclei.
+    data : `~miricigale.fitting.data.likelihood.FitData`
+        Its photometry of n objects.
+    reader : `~miricigale.fitting.data.likelihood.PhotometryReader`
+        How that was read.
+
+    Returns
+    -------
+    values : `~numpy.ndarray`, shape (n, n_nuclei, 4)
+        Of each band: flux and error in uJy, covariance with the total flux in uJy^2, and 1 where the flux is an
+        upper limit. The error is infinite where there is none that can be used.
+    left_out : `~numpy.ndarray` of bool, shape (n,)
+        Objects of which a flux was left out: its error or correlation cannot be used, or the band has no total.
+
+    Raises
+    ------
+    ValueError
+        If a column holds something else than numbers.
+    `~astropy.units.UnitsError`
+        If a flux has no unit of flux density.
+    """
+    n = len(table)
+    values = np.zeros((n, len(columns.bands), 4))
+    values[:, :, SIGMA] = np.inf
+    left_out = np.zeros(n, bool)
+    for j, (band, column) in enumerate(zip(columns.bands, columns.columns, strict=True)):
+        i = reader.bands.index(band)
+        point = reader.zero_point.get(band, 1.0)
+        factor = point * reader.error_factor.get(band, 1.0)
+        flux = point * _fluxes(table, column)
+        error = factor * _fluxes(table, error_column(column))
+        correlation = np.zeros(n)
+        if column + _CORRELATION in table.colnames:
+            correlation = _numbers(table, column + _CORRELATION)
+        limited = limits(table, column)
+        # no point was fitted where both are missing
+        present = np.isfinite(flux) | np.isfinite(error)
+        usable = np.isfinite(flux) & np.isfinite(error) & (error > 0) & data.used[:, i]
+        usable &= limited | (np.abs(correlation) < 1.0)
+        left_out |= present & ~usable
+        sigma = np.hypot(error, reader.model_error[band] * np.abs(flux))
+        sigma = np.where(limited, error, sigma)
+        covariance = correlation * error * data.flux_err[:, i]
+        paired = usable & ~limited & data.measured[:, i]
+        values[:, j, FLUX] = np.where(usable, flux, 0.0)
+        values[:, j, SIGMA] = np.where(usable, sigma, np.inf)
+        values[:, j, COVARIANCE] = np.where(paired, covariance, 0.0)
+        values[:, j, LIMIT] = usable & limited
+    return values, left_out
+
+
+def _fluxes(table, name):
+    """Fluxes or errors of a column in uJy, NaN where masked."""
+    unit = getattr(table[name], "unit", None)
+    parsed = None if unit is None else flux_unit(unit) or unit
+    if parsed is None or not parsed.is_equivalent(FNU):
+        stated = "no unit" if unit is None else repr(str(unit))
+        raise units_error("photometry", f"convertible to {FNU}", stated, column=name)
+    return flux_column(table, name)
+
+
+def _numbers(table, name):
+    """Numbers of a column without unit, NaN where masked."""
+    column = table[name]
+    mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), (len(table),))
+    try:
+        numbers = np.array(getattr(column, "unmasked", column), float)
+    except (TypeError, ValueError):
+        wanted = f"a table with numbers in column {name!r}"
+        check_that(False, "photometry", wanted, str(column.dtype))
+    numbers[mask] = np.nan
+    return numbers

@@ -1,0 +1,402 @@
+"""
+Fits to the flux of the nucleus of a galaxy beside its total flux, by band.
+
+In band b the galaxy has the total T = G + A and the point in its center P = A + u H, with A the flux of the AGN, G
+that of its host, and u H the light of stars and dust in the center that the template of the galaxy does not
+show. It has the color of the host: H is the measured smooth light T - P, and u, the same in all bands, has a
+normal prior of mean 0. Integrated over u the points of all bands have the covariance
+C = D + sigma_u^2 H H^T, with D their own variances. T and P of a band have the measured covariance c.
+
+Fits take data without covariance. The points become L^-1 P with C = L L^T, and totals become T - K P with
+K = c C^-1, whose errors do not depend on P. (What u does to the covariance of T - K P between bands is left out:
+it is of second order in the correlation of T and P, and 0 with one band, sigma_u = 0 or c = 0.) Models are the
+same linear combinations of their fluxes: galaxies have none of the points, so that only the few fluxes of AGN
+differ from object to object.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from miricigale.fitting import _core
+from miricigale.fitting.data.likelihood import FitData
+from miricigale.fitting.data.nuclei import COVARIANCE, FLUX, LIMIT, SIGMA
+from miricigale.fitting.grid.between_results import between_results, with_axis_summaries
+from miricigale.fitting.grid.continuation import N_START
+from miricigale.fitting.grid.grid import GridEngine
+from miricigale.fitting.grid.mixture import BandMixture
+from miricigale.fitting.posterior.posterior import joint_names
+from miricigale.fitting.results.results import FitResults
+from miricigale.utils.units import Frozen
+
+#: Least rest of a total as a part of it: errors of templates are parts of what is there.
+_LEAST_REST = 1e-9
+#: Width of the broad part of a nucleus that may be wrong, in units of its error.
+_WIDE = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class NuclearMixture(BandMixture):
+    """
+    `BandMixture` of bands, of the rests of their totals, and of nuclei.
+
+    Parameters
+    ----------
+    bands : `~numpy.ndarray` of int, shape (n_nuclei,)
+        Bands of the nuclei.
+    """
+
+    bands: np.ndarray
+
+    @classmethod
+    def of_mixture(cls, mixture, bands):
+        """Nuclei are wrong as often as the fluxes of their bands; None without a mixture."""
+        if mixture is None:
+            return None
+        part = np.concatenate([mixture.part, mixture.part[bands], mixture.part[bands]])
+        return cls(part, mixture.order, bands)
+
+    def broad(self, flux, sigma):
+        """Widths of the broad parts; see `BandMixture.broad`."""
+        n_bands = len(self.order)
+        end = n_bands + len(self.bands)
+        out = np.full(np.shape(flux), np.inf)
+        total = np.array(flux[:, :n_bands])
+        error = np.array(sigma[:, :n_bands])
+        rest = sigma[:, n_bands:end]
+        paired = np.isfinite(rest)
+        total[:, self.bands] = np.where(paired, flux[:, n_bands:end], total[:, self.bands])
+        error[:, self.bands] = np.where(paired, rest, error[:, self.bands])
+        width = super().broad(total, error)
+        out[:, :n_bands] = np.where(np.isfinite(sigma[:, :n_bands]), width, np.inf)
+        out[:, n_bands:end] = np.where(paired, width[:, self.bands], np.inf)
+        wide = np.hypot(_WIDE * sigma[:, end:], flux[:, end:])
+        out[:, end:] = np.where(np.isfinite(sigma[:, end:]), wide, np.inf)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectNuclei:
+    """
+    Nuclei of one object, and the data and models without covariance that they make.
+
+    Such data are the nb bands, the rests T - K P of the n bands with nuclei, in place of the total where K is not
+    0, and the points L^-1 P; a point that is an upper limit stays as it is.
+
+    Parameters
+    ----------
+    bands : `~numpy.ndarray` of int, shape (n,)
+        Bands of the nuclei.
+    mix, root : `~numpy.ndarray`, shape (n, n)
+        K, and the inverse of L.
+    paired : `~numpy.ndarray` of bool, shape (n,)
+        Bands whose total is replaced by its rest.
+    flux, sigma, limit : `~numpy.ndarray`, shape (nb + 2 n,)
+        Fluxes, errors (infinite where there is none) and whether fluxes are limits.
+    total : `~numpy.ndarray`, shape (n,)
+        Total fluxes of the bands.
+    log_errors : float
+        Ln of the product of the errors of the nuclei and rests over that of the totals.
+    n_used : int
+        Number of nuclei with data.
+    """
+
+    bands: np.ndarray
+    mix: np.ndarray
+    root: np.ndarray
+    paired: np.ndarray
+    flux: np.ndarray
+    sigma: np.ndarray
+    limit: np.ndarray
+    total: np.ndarray
+    log_errors: float
+    n_used: int
+
+    @classmethod
+    def of_values(cls, bands, values, data, stars, agn_error=0.0):
+        """
+        Nuclei of an object.
+
+        Parameters
+        ----------
+        bands : `~numpy.ndarray` of int, shape (n,)
+            Bands of the nuclei.
+        values : `~numpy.ndarray`, shape (n, 4)
+            As of `~miricigale.fitting.data.nuclei.read_nuclei`.
+        data : `~miricigale.fitting.data.likelihood.FitData`
+            Photometry of the object, as of one row.
+        stars : float
+            Standard deviation of u.
+        agn_error : float, optional
+            Error of the AGN's light as a part of it.
+        """
+        n = len(bands)
+        flux, sigma, limit = data.flux, data.sigma, data.limit
+        point = values[:, FLUX]
+        limited = values[:, LIMIT] > 0
+        usable = np.isfinite(values[:, SIGMA])
+        index = np.flatnonzero(usable & ~limited)
+        total = flux[bands]
+        mix = np.zeros((n, n))
+        root = np.diag(np.where(usable & limited, 1.0, 0.0))
+        covariance = values[index, COVARIANCE]
+        own = np.square(values[index, SIGMA]) + np.square(agn_error * point[index])
+        host = np.clip(total[index] - point[index], 0.0, np.maximum(total[index], 0.0))
+        of_points = np.diag(own) + stars**2 * np.outer(host, host)
+        lower = np.linalg.cholesky(of_points)
+        block = np.ix_(index, index)
+        root[block] = solve_triangular(lower, np.eye(len(index)), lower=True)
+        mix[block] = covariance[:, None] * (root[block].T @ root[block])
+        paired = np.any(mix != 0.0, axis=1)
+        rest = total - mix @ np.where(usable, point, 0.0)
+        # not 0, for errors of templates are parts of what is there
+        small = np.abs(rest) < _LEAST_REST * np.abs(total)
+        rest = np.where(small, _LEAST_REST * total, rest)
+        of_totals = np.square(sigma[bands[index]])
+        of_rests = of_totals - np.diag(mix)[index] * covariance
+        rest_sigma = np.full(n, np.inf)
+        rest_sigma[index] = np.sqrt(of_rests)
+        rest_sigma[~paired] = np.inf
+        own_sigma = np.array(sigma)
+        own_sigma[bands[paired]] = np.inf
+        point_sigma = np.where(limited, values[:, SIGMA], np.where(usable, 1.0, np.inf))
+        log_errors = np.log(np.diag(lower)).sum() + 0.5 * len(index) * np.log(2.0 * np.pi)
+        log_errors += 0.5 * np.log(of_rests / of_totals)[paired[index]].sum()
+        return cls(
+            bands=bands,
+            mix=mix,
+            root=root,
+            paired=paired,
+            flux=np.concatenate([flux, rest, root @ point]),
+            sigma=np.concatenate([own_sigma, rest_sigma, point_sigma]),
+            limit=np.concatenate([limit, np.zeros(n, bool), usable & limited]),
+            total=total,
+            log_errors=float(log_errors),
+            n_used=int(usable.sum()),
+        )
+
+    @property
+    def n_bands(self):
+        """Number of bands."""
+        return len(self.flux) - 2 * len(self.bands)
+
+    def extended(self, flux, agn):
+        """Fluxes of models with AGN of fluxes ``agn``, both (..., nb), in all data: (..., nb + 2 n)."""
+        light = agn[..., self.bands]
+        # not matrix products, whose last digits depend on how many rows there are
+        rest = flux[..., self.bands] - np.einsum("...k,jk->...j", light, self.mix)
+        nuclei = np.einsum("...k,jk->...j", light, self.root)
+        return np.concatenate([flux, rest, nuclei], axis=-1)
+
+    def template_errors(self, errors):
+        """Errors of templates, (nz, nb), as parts of all data: those of the totals in the rests."""
+        n = len(self.bands)
+        rest = self.flux[self.n_bands : self.n_bands + n]
+        ratio = np.divide(np.abs(self.total), np.abs(rest), out=np.ones(n), where=rest != 0.0)
+        nuclei = np.zeros((len(errors), n))
+        return np.concatenate([errors, errors[:, self.bands] * ratio, nuclei], axis=1)
+
+    def photometry(self, data, log_prior):
+        """Keywords of `GridEngine.fit` for the object, the one row of ``data``."""
+        row = {"flux": self.flux, "sigma": self.sigma, "limit": self.limit}
+        arrays = {name: value[None] for name, value in row.items()}
+        extended = FitData(data.ids, flux_err=None, flags=data.flags, **arrays)
+        return extended.of_engine(log_prior)
+
+    def mixture(self, mixture):
+        """`NuclearMixture` of the `BandMixture` of the bands; None without."""
+        return NuclearMixture.of_mixture(mixture, self.bands)
+
+    def kernel(self):
+        """`_core.Nuclei` with memory."""
+        memory = np.zeros((3, len(self.flux) + 1))
+        return _core.Nuclei(self.bands, self.mix, self.root, memory)
+
+    def of_bands(self, values):
+        """Values of all data, (..., nb + 2 n), for the bands: of rests where these replace totals."""
+        n_bands = self.n_bands
+        out = np.array(values[..., :n_bands])
+        rest = values[..., n_bands : n_bands + len(self.bands)]
+        out[..., self.bands[self.paired]] = rest[..., self.paired]
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class NuclearGrid(Frozen):
+    """
+    A grid for data with nuclei; picklable.
+
+    Parameters
+    ----------
+    engine : `~miricigale.fitting.grid.grid.GridEngine`
+        The grid.
+    bands : tuple of int
+        Bands of the nuclei.
+    stars : float
+        Standard deviation of the part u of the host's light.
+    agn_error : float
+        Error of the AGN's light as a part of it.
+    """
+
+    engine: GridEngine
+    bands: tuple
+    stars: float
+    agn_error: float = 0.0
+
+    @property
+    def index(self):
+        """The bands as an array of int, shape (n,)."""
+        return np.array(self.bands, np.int64)
+
+    @cached_property
+    def extended(self):
+        """`GridEngine` with places for rests and nuclei, the rests being totals yet."""
+        return extended_engine(self.engine, self.index)
+
+    def of_object(self, data):
+        """`ObjectNuclei` of the object in the one row of ``data``."""
+        return ObjectNuclei.of_values(
+            self.index, data.nuclei[0], data[0], self.stars, self.agn_error
+        )
+
+
+def extended_engine(engine, bands):
+    """Engine with places for the rests of totals and for nuclei of bands, (n,), the nuclei being 0 yet."""
+
+    def with_places(flux):
+        return np.concatenate([flux, flux[..., bands], 0.0 * flux[..., bands]], axis=-1)
+
+    errors = engine.template_error
+    return replace(
+        engine,
+        galaxy=with_places(engine.galaxy),
+        agn=with_places(engine.agn),
+        template_error=with_places(errors),
+        mixture=NuclearMixture.of_mixture(engine.mixture, bands),
+    )
+
+
+def object_engine(extended, nuclei):
+    """
+    Engine for one object.
+
+    Parameters
+    ----------
+    extended : `~miricigale.fitting.grid.grid.GridEngine`
+        As of `extended_engine`; the tables of galaxies are shared with it.
+    nuclei : `ObjectNuclei`
+        Nuclei of the object.
+
+    Returns
+    -------
+    engine : `~miricigale.fitting.grid.grid.GridEngine`
+    """
+    n_bands = nuclei.n_bands
+    of_bands = extended.agn[..., :n_bands]
+    agn = nuclei.extended(of_bands, of_bands)
+    tables = extended._tables
+    unit = tables.agn_unit[:, : agn.shape[1], None]
+    tables = tables._replace(agn=agn, agn32=(agn / unit).astype(np.float32, order="C"))
+    errors = nuclei.template_errors(extended.template_error[:, :n_bands])
+    new = {"agn": agn, "template_error": errors, "_tables": tables}
+    if extended.mixture is not None:
+        new["_tangents"] = replace(extended._tangents, tables=tables)
+    engine = object.__new__(type(extended))
+    # what else is worked out once is shared
+    engine.__dict__.update(extended.__dict__ | new)
+    return engine
+
+
+def fit_with_nuclei(fit, data, log_prior, pairs):
+    """
+    Fit a piece of a catalog with nuclei; objects without any are fitted as they are without this.
+
+    Parameters
+    ----------
+    fit : `~miricigale.fitting.grid.grid_fit.GridFit`
+        The fit, with its `NuclearGrid`.
+    data : `~miricigale.fitting.data.likelihood.FitData`
+        Photometry of n objects with nuclei.
+    log_prior : `~numpy.ndarray`, shape (n, nz)
+        Priors of redshift.
+    pairs : tuple of tuple of str
+        Parameters whose joint posteriors are asked for.
+
+    Returns
+    -------
+    results : `~miricigale.fitting.FitResults`
+    """
+    some = np.isfinite(data.nuclei[:, :, SIGMA]).any(axis=1)
+    some &= np.isfinite(log_prior).any(axis=1)
+    rows = np.flatnonzero(some)
+    others = np.flatnonzero(~some)
+    parts = []
+    if others.size or not rows.size:
+        plain = data._changed(nuclei=None)[others]
+        parts.append(fit.fit_piece(pairs, (plain, log_prior[others])))
+    workspaces = {}
+    for i in rows:
+        row = slice(i, i + 1)
+        parts.append(_fit_object(fit, data[row], log_prior[row], pairs, workspaces))
+    order = np.argsort(np.concatenate([others, rows]), kind="stable")
+    return FitResults.concatenate(parts)[order]
+
+
+def _fit_object(fit, data, log_prior, pairs, workspaces):
+    """Results of one object; ``workspaces`` keeps memory for the next."""
+    grid = fit.nuclei
+    nuclei = grid.of_object(data)
+    plain = data._changed(nuclei=None)
+    z = 0.0
+    node = None
+    at_redshift = fit.between is not None and data.redshift is not None
+    if at_redshift and fit.grid.redshift.size > 1:
+        z = float(data.redshift[0])
+        node = int(np.argmax(log_prior[0]))
+        extended = extended_engine(fit.between.at_redshift(z, node), grid.index)
+        photometry = nuclei.photometry(plain, log_prior[:, node : node + 1])
+    else:
+        extended = grid.extended
+        photometry = nuclei.photometry(plain, log_prior)
+    engine = object_engine(extended, nuclei)
+
+    def memory(kind, **options):
+        key = kind, node is None
+        if node is not None:
+            return engine.workspace(**options)
+        if key not in workspaces:
+            workspaces[key] = engine.workspace(**options)
+        return workspaces[key]
+
+    results = None
+    if fit.between is not None:
+        posteriors = {}
+        place = partial(fit.between.place, fit.given.interpolate, posteriors, node, z)
+        engine.fit(
+            **photometry,
+            n_draws=N_START,
+            each=partial(place, nuclei=nuclei),
+            workspace=memory("draws", n_draws=N_START),
+        )
+        if posteriors.get(0) is not None:
+            results = between_results(fit, plain, [posteriors[0]], pairs)
+    if results is None:
+        joint = joint_names(pairs, fit.priors.axes)
+        out = engine.fit(**photometry, joint=joint, workspace=memory("joint", joint=joint))
+        out = out._replace(
+            best_flux=out.best_flux[:, : nuclei.n_bands],
+            band=out.band[:, :, : nuclei.n_bands],
+            outlier=nuclei.of_bands(out.outlier),
+        )
+        if node is not None:
+            results = fit.results_at_redshift(plain, out, log_prior, pairs)
+        else:
+            results = fit.results_on_nodes(plain, out, pairs)
+        if fit.between is not None:
+            results = with_axis_summaries(results)
+    return results._changed(
+        n_bands=results.n_bands + nuclei.n_used,
+        log_evidence=results.log_evidence - nuclei.log_errors,
+    )

@@ -1,0 +1,221 @@
+"""Fits to fluxes of nuclei beside total fluxes, against joint Gaussian likelihoods of all models."""
+
+from functools import partial
+
+import astropy.units as u
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from helpers import grids
+from helpers.errors import refuses
+from miricigale.fitting import BayesFitter, FitFlags, GridSettings
+from miricigale.utils.exceptions import FitWarning
+
+N = 5
+#: Correlation of the nucleus with the total, by band.
+CORRELATION = {"band1": 0.5, "band3": -0.7, "band5": 0.0}
+NAMES = tuple(CORRELATION)
+
+
+@pytest.fixture(scope="module")
+def catalog(grid):
+    """Totals, nuclei and their correlated errors, of AGN fractions 0 to 0.9; all in uJy."""
+    rng = np.random.default_rng(3)
+    places = [grid.filters.index(name) for name in NAMES]
+    table, truth = grids.draw_photometry(grid, N, seed=4)
+    for name, place in zip(NAMES, places, strict=True):
+        point = np.empty(N)
+        for i, (z, g, k, f, scale) in enumerate(truth):
+            frac = grid.frac_agn[f]
+            power = scale * grid.dust_luminosity[g] * frac / (1.0 - frac)
+            point[i] = power * grid.agn[z, k, place]
+        error = 2.0 * table[f"{name}_err"].value
+        table[f"{name}_flux_point"] = (point + error * rng.normal(size=N)) * u.uJy
+        table[f"{name}_flux_point_err"] = error * u.uJy
+        table[f"{name}_flux_point_corr"] = np.full(N, CORRELATION[name])
+    return table
+
+
+def without(table, *names):
+    """The catalog without nuclei in some bands."""
+    columns = [f"{name}_flux_point{end}" for name in names for end in ("", "_err", "_corr")]
+    out = table.copy()
+    out.remove_columns(columns)
+    return out
+
+
+def data_of(table, row, bands, names, stars):
+    """Totals and then nuclei of an object, and their covariance."""
+    flux = [table[name][row].value for name in bands]
+    point = np.array([table[f"{name}_flux_point"][row].value for name in names])
+    sigma = np.array([table[f"{name}_err"][row].value for name in bands])
+    error = [table[f"{name}_flux_point_err"][row].value for name in names]
+    covariance = np.diag(np.square([*sigma, *error]))
+    n = len(bands)
+    for j, name in enumerate(names):
+        i = bands.index(name)
+        covariance[n + j, i] = CORRELATION[name] * error[j] * sigma[i]
+        covariance[i, n + j] = covariance[n + j, i]
+    total = np.array([table[name][row].value for name in names])
+    host = np.clip(total - point, 0.0, np.maximum(total, 0.0))
+    covariance[n:, n:] += stars**2 * np.outer(host, host)
+    return np.array([*flux, *point]), covariance
+
+
+def best_chi2(data, covariance, model):
+    """Chi2 of models (..., nd) at their best scales, which are not negative."""
+    inverse = np.linalg.inv(covariance)
+    cross = model @ inverse @ data
+    norm = np.einsum("...i,ij,...j", model, inverse, model)
+    return data @ inverse @ data - np.square(np.maximum(cross, 0.0)) / norm
+
+
+def on_nodes(fitter, data, covariance, names):
+    """Posterior of redshift and AGN fraction, best chi2 and ln of the evidence by all models."""
+    grid = fitter.grid
+    priors = fitter.priors
+    places = [grid.filters.index(name) for name in names]
+    ratio = grid.frac_agn / (1.0 - grid.frac_agn)
+    power = grid.dust_luminosity[:, None, None] * ratio
+    light = power[None, ..., None] * grid.agn[:, None, :, None, :]
+    total = grid.galaxy[:, :, None, None, :] + light
+    chi2 = best_chi2(data, covariance, np.concatenate([total, light[..., places]], axis=-1))
+    prior = priors.redshift[:, None] * grid.allowed * priors.galaxy / priors.galaxy.sum()
+    prior = prior[:, :, None] * priors.agn / priors.agn.sum()
+    prior = prior[..., None] * priors.frac / priors.frac.sum()
+    weight = prior * np.exp(-0.5 * chi2)
+    log_evidence = np.log(weight.sum()) - 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
+    posterior = weight.sum(axis=(1, 2)) / weight.sum()
+    return posterior, chi2[prior > 0].min(), log_evidence
+
+
+CASES = [(("band1",), 0.0), (("band1",), 0.3), (NAMES, 0.0), (("band3", "band5"), 0.2)]
+
+
+@pytest.mark.parametrize(("names", "stars"), CASES)
+def test_posterior_is_that_of_correlated_data(grid, catalog, names, stars):
+    table = without(catalog, *(set(NAMES) - set(names)))
+    # only one of two bands is correlated with its total, so that nothing is left out
+    settings = GridSettings(interpolate=0, nuclear_stars=stars)
+    if len(names) == 2:
+        table["band3_flux_point_corr"] = 0.0
+    fitter = BayesFitter(grid, model_error=0.0, nuclei=True, settings=settings)
+    results = fitter.fit(table)
+    assert results.meta["fit"]["nuclei"] == list(names)
+    bands = list(grid.filters)
+    for i in range(N):
+        data, covariance = data_of(table, i, bands, names, stars)
+        if len(names) == 2:
+            n = len(bands) + names.index("band3")
+            covariance[n, : len(bands)] = covariance[: len(bands), n] = 0.0
+        posterior, chi2, log_evidence = on_nodes(fitter, data, covariance, names)
+        assert_allclose(results.pdf_2d[i], posterior, atol=1e-6)
+        assert_allclose(results.chi2[i], chi2, rtol=1e-8)
+        assert_allclose(results.log_evidence[i], log_evidence, rtol=1e-6)
+        assert results.n_bands[i] == len(bands) + len(names)
+
+
+def test_likelihoods_between_nodes_are_those_of_correlated_data(grid, catalog, monkeypatch):
+    names = ("band1", "band3")
+    settings = GridSettings(interpolate=50, nuclear_stars=0.0)
+    fitter = BayesFitter(grid, model_error=0.0, nuclei=True, settings=settings)
+    between = fitter.backend.between
+    describe = type(between)._describe
+    kept = []
+
+    def keep(self, models, *args):
+        posterior = describe(self, models, *args)
+        kept.append((models, posterior.values))
+        return posterior
+
+    monkeypatch.setattr(type(between), "_describe", keep)
+    results = fitter.fit(without(catalog, "band5")[:2])
+    bands = list(grid.filters)
+    places = [bands.index(name) for name in names]
+    for i, (sampled, values) in enumerate(kept):
+        flux, power = between.models.fluxes(values, values["redshift"], values["frac_agn"])
+        agn = between.models.agn_fluxes(values, values["redshift"])
+        agn = np.where(power[:, None] > 0.0, power[:, None] * agn, 0.0)
+        data, covariance = data_of(catalog, i, bands, names, 0.0)
+        chi2 = best_chi2(data, covariance, np.concatenate([flux, agn[:, places]], axis=1))
+        constant = sampled.log_likelihood + 0.5 * chi2
+        assert_allclose(constant, constant[0], atol=1e-6)
+        assert_allclose(results.chi2[i], chi2.min(), rtol=1e-6)
+        # of fluxes in uJy: the mean likelihood of the models over the prior
+        log_evidence = sampled.log_evidence - constant[0]
+        log_evidence -= 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
+        assert_allclose(results.log_evidence[i], log_evidence, rtol=1e-6)
+
+
+@pytest.mark.parametrize("interpolate", [0, 30])
+def test_without_nuclei_nothing_changes(grid, catalog, interpolate):
+    settings = GridSettings(interpolate=interpolate)
+    fitter = BayesFitter(grid, nuclei=True, settings=settings)
+    table = catalog.copy()
+    for name in NAMES:
+        table[f"{name}_flux_point"][:] = np.nan
+        table[f"{name}_flux_point_err"][:] = np.nan
+    plain = fitter.replace(nuclei=False).fit(without(catalog, *NAMES))
+    results = fitter.fit(table)
+    for name in ("flags", "chi2", "log_evidence", "pdf_2d", "moments", "model_flux", "n_bands"):
+        assert_array_equal(getattr(results, name), getattr(plain, name))
+    # a nucleus of which next to nothing is known, in one object
+    table["band5_flux_point"][1], table["band5_flux_point_err"][1] = 1.0 * u.uJy, 1e9 * u.uJy
+    results = fitter.fit(table)
+    assert_array_equal(results.chi2[2:], plain.chi2[2:])
+    assert_allclose(results.pdf_2d[1], plain.pdf_2d[1], atol=1e-5 if interpolate == 0 else 0.1)
+
+
+def test_redshifts_may_be_known(grid, catalog):
+    fitter = BayesFitter(grid, nuclei=True, settings=GridSettings(interpolate=30))
+    results = fitter.fit(catalog[:2], redshift="redshift")
+    assert_allclose(results.best["redshift"], catalog["redshift"][:2])
+    assert np.all(results.flags & FitFlags.UNFITTED == 0)
+
+
+def test_points_tell_agn_from_galaxies(grid, catalog):
+    fitter = BayesFitter(grid, nuclei=True, settings=GridSettings(interpolate=0))
+    table = catalog.copy()
+    for name in NAMES:
+        table[f"{name}_flux_point"] = 0.9 * table[name]
+        table[f"{name}_flux_point_err"] = 0.05 * table[name]
+    bright = fitter.fit(table).mean("frac_agn")
+    for name in NAMES:
+        table[f"{name}_flux_point"] = 0.0 * table[name]
+    faint = fitter.fit(table).mean("frac_agn")
+    # limits say the same
+    for name in NAMES:
+        table[f"{name}_flux_point"] = 0.01 * table[name]
+        table[f"{name}_flux_point_err"] = 0.005 * table[name]
+        table[f"{name}_flux_point_limit"] = True
+    limited = fitter.fit(table).mean("frac_agn")
+    assert np.all(faint < 0.5 * bright)
+    assert np.all(limited < 0.5 * bright)
+
+
+def test_unusable_fluxes_are_flagged(grid, catalog):
+    fitter = BayesFitter(grid, nuclei=True, settings=GridSettings(interpolate=0))
+    table = catalog.copy()
+    table["band1_flux_point_err"][0] = 0.0 * u.uJy
+    table["band3_flux_point_corr"][1] = 1.0
+    table["band5"][2] = np.nan * u.uJy
+    flags = fitter.fit(table).flags & FitFlags.NUCLEUS_LEFT_OUT
+    assert_array_equal(flags > 0, [True, True, True, False, False])
+
+
+def test_refuses(grid, catalog):
+    make = partial(BayesFitter, grid, settings=GridSettings(interpolate=0))
+    refuses("'nuclei' must be True or False", make, nuclei="yes")
+    fitter = make(nuclei=True)
+    refuses("<filter>_flux_point_err for 'nuclei'", fitter.fit, without(catalog, *NAMES))
+    refuses("draws of nodes are without nuclei", fitter.sample, catalog, 10, seed=1)
+    table = catalog.copy()
+    table["band1_nucleus"] = table["band1"]
+    table["band1_nucleus_err"] = table["band1_err"]
+    refuses("one flux of nuclei in 'band1'", fitter.fit, table)
+    with pytest.warns(FitWarning, match="fluxes of nuclei are not fitted"):
+        make().fit(catalog)
+    galaxies = grids.make_grid(frac=[0.0])
+    fitter = BayesFitter(galaxies, nuclei=True, settings=GridSettings(interpolate=0))
+    refuses("False for models without AGN", fitter.fit, catalog)
