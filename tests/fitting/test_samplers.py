@@ -92,6 +92,7 @@ def linear_fitter(priors, engine="nautilus", **settings):
 # ------------------------------------------------------------------------ posteriors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_linear_model_has_the_posterior_and_evidence_of_the_closed_form(engine):
     sigma = np.array([0.1, 0.2, 0.1, 0.1])
@@ -152,6 +153,7 @@ def test_joint_posteriors_are_those_of_the_closed_form(engine, tmp_path):
     refuses(r"'levels' must be from 0.001 to 0.999 for 'a'", results.percentile, "a", 1e-5)
 
 
+@pytest.mark.slow
 def test_prior_of_redshift_is_multiplied_in(engine):
     # all bands see 1 + z with one sigma: a Gaussian of width sigma / 2 times p(z)
     table = photometry(np.full((3, 4), 2.0), 0.4)
@@ -194,8 +196,9 @@ def test_upper_limits_give_the_posterior_of_the_integral(engine):
     assert_allclose(results.log_evidence[0], np.log(total / 10.0), atol=0.1)
 
 
-@pytest.mark.parametrize("limits", [(), ("wfc3.f160w", "miri.f1500w")])
-def test_real_model_agrees_with_the_grid_engine(engine, limits):
+@pytest.mark.slow
+def test_real_model_agrees_with_the_grid_engine(engine):
+    limits = ("wfc3.f160w", "miri.f1500w")
     model = SEDModel.yang2021(libraries="bundled")
     ebv, frac = 0.6 * (np.arange(48) + 0.5) / 48, 0.9 * (np.arange(48) + 0.5) / 48
     axes = {"redshift": [1.0], "ebv": ebv, "frac_agn": frac, "tau": [1.0], "age": [2.0]}
@@ -206,7 +209,7 @@ def test_real_model_agrees_with_the_grid_engine(engine, limits):
         table[f"{name}_limit"] = [True]
     grid = BayesFitter(model, REAL, axes=axes).fit(table)
     priors = {"ebv": (0.0, 0.6), "frac_agn": (0.0, 0.9), "tau": 1.0, "age": 2.0}
-    options = {"engine": engine, "settings": SamplerSettings(n_live=250)}
+    options = {"engine": engine, "settings": SamplerSettings(n_live=150)}
     results = BayesFitter(model, REAL, priors=priors, **options).fit(table, redshift=[1.0], seed=3)
     for name in ("ebv", "frac_agn", "frac_agn_ir", "mass", "accretion_power", "dust_luminosity"):
         mean, std = grid.mean(name)[0], grid.std(name)[0]
@@ -241,11 +244,12 @@ def test_choices_share_the_posterior_by_their_evidence(engine):
 # -------------------------------------------------------------------------- catalogs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_workers_order_and_company_change_nothing(engine):
     flux = np.array([[2.4, 2.2, 1.9, 1.5], [2.0, 2.1, 2.3, 2.2]])
     table = photometry(flux, 0.3, ids=["x", "y"])
-    fitter = linear_fitter({"a": (-2.0, 2.0), "b": (-2.0, 2.0)}, engine, n_live=100, n_effective=99)
+    fitter = linear_fitter({"a": (-2.0, 2.0), "b": (-2.0, 2.0)}, engine, n_live=60, n_effective=60)
     serial = fitter.fit(table, redshift=1.0, seed=7)
     with ThreadPoolExecutor(2) as pool:
         turned = fitter.fit(table[::-1], redshift=1.0, seed=7, executor=pool)
@@ -262,7 +266,7 @@ def test_processes_give_the_same_numbers(engine):
     model = SEDModel.yang2021(agn=False, libraries="bundled")
     flux = model_fluxes(model, redshift=[0.5, 1.0], age=[2.0, 3.0])
     table = photometry(flux, 0.3 * flux, names=REAL)
-    settings = SamplerSettings(n_live=100, n_effective=100, n_draws=50)
+    settings = SamplerSettings(n_live=60, n_effective=60, n_draws=50)
     priors = {"ebv": (0.0, 1.0), "redshift": (0.1, 2.0)}
     fitter = BayesFitter(model, REAL, priors=priors, engine=engine, settings=settings)
     serial = fitter.fit(table, seed=1)
@@ -485,7 +489,8 @@ def test_lockstep_answers_every_task_with_its_own_value():
 
 
 def test_fits_from_file_to_file_and_without_a_band(engine, tmp_path):
-    fitter = linear_fitter({"redshift": (0.5, 1.5), "a": (-0.5, 0.5)}, engine)
+    priors = {"redshift": (0.5, 1.5), "a": (-0.5, 0.5)}
+    fitter = linear_fitter(priors, engine, n_live=60, n_effective=60)
     model = 2.0 + 0.2 * SLOPES[0]
     table = photometry(np.array([5.0, 8.0, 3.0])[:, None] * model, 0.1)
     whole = fitter.fit(table, seed=3)

@@ -171,32 +171,29 @@ import astropy.units as u
 from miricigale.photometry import MosaicFile
 from miricigale.utils.parallel import process_pool
 from miricigale.workflow import measure_patches
-n, run, folder = int(sys.argv[1]), sys.argv[2], pathlib.Path(sys.argv[3])
+run, folder = sys.argv[1], pathlib.Path(sys.argv[2])
 image = MosaicFile(folder / "image-noisy.fits", filter={BAND!r})
-with process_pool(n) as executor:
+with process_pool(2) as executor:
     measure_patches(image, folder / "prior-noisy.fits", run, kernel=folder / "kernel.fits",
-                    patch_size=360, overlap=4 * u.arcsec, pages=False, executor=executor, n_threads=n)
+                    patch_size=360, overlap=4 * u.arcsec, pages=False, executor=executor, n_threads=2)
 """
 
 
 @pytest.mark.slow
 def test_killed_and_resumed_on_any_workers_to_the_same_bytes(mosaics, tmp_path):
-    def begin(n):
-        command = [sys.executable, "-c", SCRIPT, str(n), str(tmp_path / "killed"), mosaics.folder]
-        return subprocess.Popen(command, start_new_session=True)
-
-    run, patches = begin(2), tmp_path / "killed" / "patches"
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "killed"), mosaics.folder]
+    run = subprocess.Popen(command, start_new_session=True)
+    patches = tmp_path / "killed" / "patches"
     while run.poll() is None and len(list(patches.glob("y*.ecsv"))) < 2:
         time.sleep(0.02)
     os.killpg(run.pid, signal.SIGKILL)
     assert run.wait() == -signal.SIGKILL
     assert not (tmp_path / "killed" / "table.fits").exists()
-    assert begin(1).wait() == 0
+    files, kernel_file = mosaics.files("noisy"), mosaics.folder / "kernel.fits"
+    options = {"patch_size": 360, "overlap": 4 * u.arcsec, "kernel": kernel_file, "pages": False}
+    measure_patches(*files, tmp_path / "killed", n_threads=1, **options)
     with ThreadPoolExecutor(2) as executor:
-        measure_patches(
-            *mosaics.files("noisy"), tmp_path / "threads", patch_size=360, overlap=4 * u.arcsec,
-            kernel=mosaics.folder / "kernel.fits", pages=False, executor=executor, n_threads=2,
-        )  # fmt: skip
+        measure_patches(*files, tmp_path / "threads", executor=executor, n_threads=2, **options)
     made = [
         {path.name: path.read_bytes() for kind in ("*.fits", "*/*.ecsv") for path in run.glob(kind)}
         for run in (tmp_path / "killed", tmp_path / "threads")
