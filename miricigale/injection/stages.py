@@ -55,36 +55,31 @@ _FOREIGN = ("detection", "output", "page", "model", "residual", "overwrite")
 
 
 class RunSection(RunBasics):
-    """
-    How the run goes.
+    """How the run goes."""
 
-    Parameters
-    ----------
-    memory
-        Memory (GB) of trials side by side on a machine; 0 for half of all.
-    """
-
-    name: str = option("injection", folder=True)
-    memory: float = option(0.0, low=0.0, high=1e5)
+    name: str = option(
+        "injection", "Name of the run; its folder unless --output is given.", folder=True
+    )
+    memory: float = option(
+        0.0,
+        "Memory (GB) of trials side by side on a machine; 0 for half of all.",
+        low=0.0,
+        high=1e5,
+    )
 
 
 class InjectionSection(Section):
-    """
-    What is measured, and what is injected.
+    """What is measured, and what is injected."""
 
-    Parameters
-    ----------
-    inputs
-        Files and options of the photometry as JSON.
-    settings
-        Settings of the injection as JSON.
-    n_trials
-        How often sources are injected.
-    """
-
-    inputs: str = ""
-    settings: str = ""
-    n_trials: int = option(1, low=1)
+    inputs: str = option(
+        "",
+        "Files and options of the photometry as JSON.",
+    )
+    settings: str = option(
+        "",
+        "Settings of the injection as JSON.",
+    )
+    n_trials: int = option(1, "How often sources are injected.", low=1)
 
 
 @dataclasses.dataclass(frozen=True)

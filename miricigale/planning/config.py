@@ -13,65 +13,61 @@ from miricigale.workflow.sections import CatalogSection, RunBasics, SedSection
 
 
 class PlanSection(RunBasics):
-    """
-    What the plan is called and how it goes.
+    """What the plan is called and how it goes."""
 
-    Parameters
-    ----------
-    name
-        Name of the plan; its folder unless --output is given.
-    """
-
-    name: str = option("plan", folder=True)
+    name: str = option(
+        "plan", "Name of the plan; its folder unless --output is given.", folder=True
+    )
 
 
 class SampleSection(Section):
-    """
-    The galaxies of the mock photometry.
+    """The galaxies of the mock photometry."""
 
-    Parameters
-    ----------
-    n_sources
-        Sources drawn from the catalog; 0 for all. More than it has are galaxies of several skies, with other AGN
-        and noise.
-    redshift
-        Range of redshifts.
-    luminosity
-        Range of log10 of the dust's luminosity (Lsun).
-    area
-        Area of the catalog (square arcmin); 0 for the bundled one's.
-    luminosity_function
-        Table of log_luminosity, redshift, phi (per Mpc3 and dex) that the sample is drawn after.
-    """
-
-    n_sources: int = option(1000, low=0, high=1000000)
-    redshift: tuple[float, ...] = option((0.01, 6.0), low=0.0, high=20.0)
-    luminosity: tuple[float, ...] = option((0.0, 16.0), low=0.0, high=20.0)
-    area: float = option(0.0, low=0.0, high=1e5)
-    luminosity_function: str = ""
+    n_sources: int = option(
+        1000,
+        "Sources drawn from the catalog; 0 for all. More than it has are galaxies of "
+        "several skies, with other AGN and noise.",
+        low=0,
+        high=1000000,
+    )
+    redshift: tuple[float, ...] = option((0.01, 6.0), "Range of redshifts.", low=0.0, high=20.0)
+    luminosity: tuple[float, ...] = option(
+        (0.0, 16.0), "Range of log10 of the dust's luminosity (Lsun).", low=0.0, high=20.0
+    )
+    area: float = option(
+        0.0, "Area of the catalog (square arcmin); 0 for the bundled one's.", low=0.0, high=1e5
+    )
+    luminosity_function: str = option(
+        "",
+        "Table of log_luminosity, redshift, phi (per Mpc3 and dex) that the sample is drawn after.",
+    )
 
 
 class AgnSection(Section):
-    """
-    The mix of AGN, and how they are selected.
+    """The mix of AGN, and how they are selected."""
 
-    Parameters
-    ----------
-    frac_agn
-        fracAGN of a made-up mix; by default AGN are those of a column frac_agn of the catalog, or of a real field,
-        after an X-ray luminosity function.
-    shares
-        Share of the sources of each fracAGN of the mix; equal ones by default.
-    limit
-        fracAGN from which a source is an AGN.
-    threshold
-        Least probability of a fracAGN above the limit of a selected source.
-    """
-
-    frac_agn: tuple[float, ...] = option((), low=0.0, high=0.99, single=True)
-    shares: tuple[float, ...] = option((), low=0.0, high=1e6, single=True)
-    limit: float = option(0.4, low=0.01, high=0.99)
-    threshold: float = option(0.5, low=0.0, high=1.0)
+    frac_agn: tuple[float, ...] = option(
+        (),
+        "fracAGN of a made-up mix; by default AGN are those of a column frac_agn of "
+        "the catalog, or of a real field, after an X-ray luminosity function.",
+        low=0.0,
+        high=0.99,
+        single=True,
+    )
+    shares: tuple[float, ...] = option(
+        (),
+        "Share of the sources of each fracAGN of the mix; equal ones by default.",
+        low=0.0,
+        high=1e6,
+        single=True,
+    )
+    limit: float = option(0.4, "fracAGN from which a source is an AGN.", low=0.01, high=0.99)
+    threshold: float = option(
+        0.5,
+        "Least probability of a fracAGN above the limit of a selected source.",
+        low=0.0,
+        high=1.0,
+    )
 
 
 #: Exposure times and dithers of CEERS by band.
@@ -82,51 +78,51 @@ _CEERS = {
 
 
 class ExposureSection(Section):
-    """
-    The MIRI bands, and how long each is exposed.
+    """The MIRI bands, and how long each is exposed."""
 
-    Parameters
-    ----------
-    bands
-        MIRI filters.
-    time
-        Exposure time (s) of each band in a pointing, all dithers; one for all. By default that of CEERS, as the
-        dithers, and for bands that it does not have that of F770W.
-    depth
-        5-sigma AB depth of each band instead of a time.
-    hours
-        Budget of each set of bands in hours that are charged, with overheads: its times, in the ratio of time, are
-        as long as that allows; 0: times as they are.
-    dithers
-        Dithers of each band.
-    readout
-        Readout pattern.
-    max_fill
-        Largest share of the well that the sky fills.
-    max_groups
-        Largest number of groups in an integration.
-    photom
-        Photom reference of CRDS, for the response on a date (miricigale.reduction.imager_response).
-    date
-        That date.
-    sets
-        Sets of bands that are compared: all, or names joined by commas.
-    pointings
-        Pointings side by side.
-    """
-
-    bands: tuple[str, ...] = option(CEERS_FILTERS, choices=imager_filters(), unique=True)
-    time: tuple[float, ...] = option((), low=0.0, high=1e7, single=True)
-    depth: tuple[float, ...] = option((), low=10.0, high=40.0, single=True)
-    hours: float = option(0.0, low=0.0, high=1e4)
-    dithers: tuple[int, ...] = option((), low=1, high=500, single=True)
-    readout: str = option("FASTR1", choices=readout_patterns())
-    max_fill: float = option(0.6, low=0.05, high=0.95)
-    max_groups: int = option(100, low=2, high=10000)
-    photom: str = ""
-    date: str = ""
-    sets: tuple[str, ...] = ("all",)
-    pointings: int = option(1, low=1, high=10000)
+    bands: tuple[str, ...] = option(
+        CEERS_FILTERS, "MIRI filters.", choices=imager_filters(), unique=True
+    )
+    time: tuple[float, ...] = option(
+        (),
+        "Exposure time (s) of each band in a pointing, all dithers; one for all. By "
+        "default that of CEERS, as the dithers, and for bands that it does not have "
+        "that of F770W.",
+        low=0.0,
+        high=1e7,
+        single=True,
+    )
+    depth: tuple[float, ...] = option(
+        (), "5-sigma AB depth of each band instead of a time.", low=10.0, high=40.0, single=True
+    )
+    hours: float = option(
+        0.0,
+        "Budget of each set of bands in hours that are charged, with overheads: its "
+        "times, in the ratio of time, are as long as that allows; 0: times as they "
+        "are.",
+        low=0.0,
+        high=1e4,
+    )
+    dithers: tuple[int, ...] = option((), "Dithers of each band.", low=1, high=500, single=True)
+    readout: str = option("FASTR1", "Readout pattern.", choices=readout_patterns())
+    max_fill: float = option(
+        0.6, "Largest share of the well that the sky fills.", low=0.05, high=0.95
+    )
+    max_groups: int = option(100, "Largest number of groups in an integration.", low=2, high=10000)
+    photom: str = option(
+        "",
+        "Photom reference of CRDS, for the response on a date "
+        "(miricigale.reduction.imager_response).",
+    )
+    date: str = option(
+        "",
+        "That date.",
+    )
+    sets: tuple[str, ...] = option(
+        ("all",),
+        "Sets of bands that are compared: all, or names joined by commas.",
+    )
+    pointings: int = option(1, "Pointings side by side.", low=1, high=10000)
 
     def by_band(self, key):
         """``"time"``, ``"depth"`` or ``"dithers"`` of each band; the default for other bands is F770W's."""
@@ -138,105 +134,120 @@ class ExposureSection(Section):
 
 
 class BackgroundSection(Section):
-    """
-    The sky.
+    """The sky."""
 
-    Parameters
-    ----------
-    level
-        Zodiacal light (low, medium, high) or surface brightness ('12.5 MJy/sr'); one for all filters, or one
-        for each.
-    ra
-        Right ascension in degrees; -1: no position.
-    dec
-        Declination in degrees.
-    date
-        Day, such as 2027-03-01, instead of a level (needs zodipy).
-    """
-
-    level: tuple[str, ...] = option(("low",), single=True)
-    ra: float = option(-1.0, low=-1, high=360)
-    dec: float = option(0.0, low=-90, high=90)
-    date: str = ""
+    level: tuple[str, ...] = option(
+        ("low",),
+        "Zodiacal light (low, medium, high) or surface brightness ('12.5 MJy/sr'); "
+        "one for all filters, or one for each.",
+        single=True,
+    )
+    ra: float = option(-1.0, "Right ascension in degrees; -1: no position.", low=-1, high=360)
+    dec: float = option(0.0, "Declination in degrees.", low=-90, high=90)
+    date: str = option(
+        "",
+        "Day, such as 2027-03-01, instead of a level (needs zodipy).",
+    )
 
 
 class NoiseSection(Section):
-    """
-    Where the errors of MIRI fluxes come from.
+    """Where the errors of MIRI fluxes come from."""
 
-    Parameters
-    ----------
-    residual
-        Fraction of the sky that stays as a fixed pattern, or the calculator's.
-    fractional
-        Part of the flux added in quadrature (templates, blends).
-    excess
-        Factor on the noise of the sky of fitted sources: 1.4 (flight) by the limits of surveys, 1 (ideal).
-    sizes
-        Whether errors grow with the half-light radii of the sources.
-    """
-
-    residual: float | str = option(0.0, low=0.0, high=0.1, choices=("etc",))
-    fractional: float = option(0.03, low=0.0, high=1.0)
-    excess: float | str = option(EXCESS["flight"], low=0.1, high=10.0, choices=tuple(EXCESS))
-    sizes: bool = True
+    residual: float | str = option(
+        0.0,
+        "Fraction of the sky that stays as a fixed pattern, or the calculator's.",
+        low=0.0,
+        high=0.1,
+        choices=("etc",),
+    )
+    fractional: float = option(
+        0.03, "Part of the flux added in quadrature (templates, blends).", low=0.0, high=1.0
+    )
+    excess: float | str = option(
+        EXCESS["flight"],
+        "Factor on the noise of the sky of fitted sources: 1.4 (flight) by the limits "
+        "of surveys, 1 (ideal).",
+        low=0.1,
+        high=10.0,
+        choices=tuple(EXCESS),
+    )
+    sizes: bool = option(
+        True,
+        "Whether errors grow with the half-light radii of the sources.",
+    )
 
 
 class SurveySection(Section):
-    """
-    Depth against area.
+    """Depth against area."""
 
-    Parameters
-    ----------
-    areas
-        Numbers of pointings that the exposure times are divided among.
-    rank
-        What is ranked for each hour: AGN found, or precision of fracAGN or redshift.
-    """
-
-    areas: tuple[int, ...] = option((), low=1, high=1000)
-    rank: str = option("agn", choices=("agn", "frac_agn", "redshift"))
+    areas: tuple[int, ...] = option(
+        (), "Numbers of pointings that the exposure times are divided among.", low=1, high=1000
+    )
+    rank: str = option(
+        "agn",
+        "What is ranked for each hour: AGN found, or precision of fracAGN or redshift.",
+        choices=("agn", "frac_agn", "redshift"),
+    )
 
 
 class OverheadSection(Section):
-    """
-    What the observatory charges besides the exposures, in s: approximations to APT.
-
-    Parameters
-    ----------
-    slew
-        Slew to the first pointing (as in reports of APT's Smart Accounting).
-    next_slew
-        Slew to a neighboring pointing; of our own: such reports have 51 s to the next visit of a target,
-        and 169 s with another roll.
-    guide_star
-        Acquisition of the guide star of each pointing (JDox, Visit Timing).
-    visit
-        Scripts and cleanup of each pointing (JDox, JWST Instrument Overheads).
-    filter
-        Move of the filter wheel, each band (JDox, JWST Instrument Overheads).
-    script
-        Compilation of scripts, each band (JDox, JWST Instrument Overheads).
-    exposure
-        Set-up and cleanup of each exposure (JDox, JWST Instrument Overheads: of the first of several
-        dithers; APT charges less for the others).
-    dither
-        Small angle maneuver between dithers; of our own: APT takes it from the distance (JDox, JWST Slew
-        Times and Overheads).
-    observatory
-        Part added to all of it (JDox, JWST Observing Overheads Summary).
-    """
+    """What the observatory charges besides the exposures, in s: approximations to APT."""
 
     # JDox is the JWST user documentation; its "JWST Instrument Overheads" are of APT 2023.3.4
-    slew: float = option(1800.0, low=0.0, high=1e5)
-    next_slew: float = option(150.0, low=0.0, high=1e5)
-    guide_star: float = option(284.0, low=0.0, high=1e5)
-    visit: float = option(90.0, low=0.0, high=1e5)
-    filter: float = option(50.0, low=0.0, high=1e5)
-    script: float = option(22.0, low=0.0, high=1e5)
-    exposure: float = option(44.0, low=0.0, high=1e5)
-    dither: float = option(60.0, low=0.0, high=1e5)
-    observatory: float = option(0.16, low=0.0, high=1.0)
+    slew: float = option(
+        1800.0,
+        "Slew to the first pointing (as in reports of APT's Smart Accounting).",
+        low=0.0,
+        high=1e5,
+    )
+    next_slew: float = option(
+        150.0,
+        "Slew to a neighboring pointing; of our own: such reports have 51 s to the "
+        "next visit of a target, and 169 s with another roll.",
+        low=0.0,
+        high=1e5,
+    )
+    guide_star: float = option(
+        284.0,
+        "Acquisition of the guide star of each pointing (JDox, Visit Timing).",
+        low=0.0,
+        high=1e5,
+    )
+    visit: float = option(
+        90.0,
+        "Scripts and cleanup of each pointing (JDox, JWST Instrument Overheads).",
+        low=0.0,
+        high=1e5,
+    )
+    filter: float = option(
+        50.0,
+        "Move of the filter wheel, each band (JDox, JWST Instrument Overheads).",
+        low=0.0,
+        high=1e5,
+    )
+    script: float = option(
+        22.0,
+        "Compilation of scripts, each band (JDox, JWST Instrument Overheads).",
+        low=0.0,
+        high=1e5,
+    )
+    exposure: float = option(
+        44.0,
+        "Set-up and cleanup of each exposure (JDox, JWST Instrument Overheads: of the "
+        "first of several dithers; APT charges less for the others).",
+        low=0.0,
+        high=1e5,
+    )
+    dither: float = option(
+        60.0,
+        "Small angle maneuver between dithers; of our own: APT takes it from the "
+        "distance (JDox, JWST Slew Times and Overheads).",
+        low=0.0,
+        high=1e5,
+    )
+    observatory: float = option(
+        0.16, "Part added to all of it (JDox, JWST Observing Overheads Summary).", low=0.0, high=1.0
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import dataclasses
 from importlib import resources
-from pathlib import Path
 from typing import ClassVar
 
 from miricigale.refdata import resources as known_resources
@@ -85,32 +84,59 @@ class StudyConfig(Configuration):
     report: ReportSection = dataclasses.field(default_factory=ReportSection)
 
     def __post_init__(self):
-        exposures, fit, perturb = self.exposures, self.fit, self.perturb
+        self._check_exposures()
+        self._check_fits()
+        self._check_perturbations()
+        self._check_photometry()
+
+    def _check_exposures(self):
+        """Refuse exposures, and a background, that do not go with the filters."""
+        exposures = self.exposures
         n = len(exposures.filters)
+        self.check(n, "exposures.filters", "must name at least one filter")
         wanted = f"must have one pattern, or one per filter ({n})"
         self.check_length("exposures.dithers", (0, 1, n), wanted)
-        lists = any(name.lower().endswith(".pointing") for name in exposures.dithers)
+        has_file = any(name.lower().endswith(".pointing") for name in exposures.dithers)
         for key in ("dither_observation", "dither_exposures"):
-            good = lists or not getattr(exposures, key)
+            good = has_file or not getattr(exposures, key)
             self.check(good, f"exposures.{key}", "must come with a .pointing file in dithers")
+        wanted = f"must have one number per filter ({n})"
         for key in ("n_groups", "n_integrations", "n_dithers", "dither_exposures"):
-            wanted = f"must have one number per filter ({n})"
             self.check_length(f"exposures.{key}", (0, n), wanted)
-        self.check(n, "exposures.filters", "must name at least one filter")
         scene = self.scene
         check_levels("scene", "background", scene.background, n, scene.background_date)
+        if exposures.kind == "rates":
+            reason = "with [exposures] kind = 'rates', which have no ramps"
+            good = not self.run.keep_level1b
+            self.check(good, "run.keep_level1b", f"must be false {reason}")
+            good = self.reduction.backend == "native"
+            self.check(good, "reduction.backend", f"must be 'native' {reason}")
+
+    def _check_fits(self):
+        """Refuse fits that do not go with the truths, the filters or the catalog."""
+        fit = self.fit
+        n = len(self.exposures.filters)
         good = self.sed.frac_agn and not isinstance(self.sed.frac_agn[0], str)
         self.check(good, "sed.frac_agn", "must begin with a number")
         self.check("all" in fit.sets, "fit.sets", "must have 'all'")
         good = n > 1 or not {"blue", "red"}.intersection(fit.sets)
         wanted = "may have 'blue' and 'red' with two filters and more only"
         self.check(good, "fit.sets", wanted)
+        wanted = f"must be at most the number of MIRI filters ({n})"
+        self.check(fit.min_detected <= n, "fit.min_detected", wanted)
+        good = fit.depths or not fit.bands or self.catalog.source not in known_resources()
+        wanted = f"must have one number per band ({len(fit.bands)}), for the catalog has no errors"
+        self.check(good, "fit.depths", wanted)
+
+    def _check_perturbations(self):
+        """Refuse perturbed truths that have no base, no AGN or no image."""
+        perturb = self.perturb
         foreign = sorted(set(perturb.of) - set(self.sed.frac_agn), key=str)
         wanted = f"must be out of [sed] frac_agn, {list(self.sed.frac_agn)}"
         self.check(not foreign, "perturb.of", wanted, foreign)
-        lacking = sorted(set(NEEDS_AGN).intersection(perturb.effects))
-        good = not lacking or any(value != 0 for value in perturbed_values(self))
-        wanted = f"must have a value above 0 for {lacking}"
+        need_agn = sorted(set(NEEDS_AGN).intersection(perturb.effects))
+        good = not need_agn or any(value != 0 for value in perturbed_values(self))
+        wanted = f"must have a value above 0 for {need_agn}"
         self.check(good, "perturb.of", wanted, list(perturb.of))
         good = perturb.cutouts or CUTOUTS not in perturb.effects
         self.check(good, "perturb.cutouts", "must name an image for the effect 'cutouts'")
@@ -118,36 +144,29 @@ class StudyConfig(Configuration):
         self.check(good, "perturb.cutouts", "must be empty without the effect 'cutouts'")
         good = perturb.cutouts or not perturb.cutouts_psf
         self.check(good, "perturb.cutouts_psf", "must be empty without an image in cutouts")
-        rates = "with [exposures] kind = 'rates', which have no ramps"
-        if exposures.kind == "rates":
-            self.check(not self.run.keep_level1b, "run.keep_level1b", f"must be false {rates}")
-            good = self.reduction.backend == "native"
-            self.check(good, "reduction.backend", f"must be 'native' {rates}")
-        wanted = f"must be at most the number of MIRI filters ({n})"
-        self.check(fit.min_detected <= n, "fit.min_detected", wanted)
-        good = fit.depths or not fit.bands or self.catalog.source not in known_resources()
-        wanted = f"must have one number per band ({len(fit.bands)}), for the catalog has no errors"
-        self.check(good, "fit.depths", wanted)
-        photometry, fine = self.photometry, self.highres.pixel_scale == 0.06
-        good = photometry.method != "yang2021" or fine
-        self.check(good, "highres.pixel_scale", "must be 0.06 with method = 'yang2021'")
-        good = not photometry.rivals or fine
-        self.check(good, "highres.pixel_scale", "must be 0.06 with [photometry] rivals")
+
+    def _check_photometry(self):
+        """Refuse photometry that does not go with the grid of the prior, or with patches."""
+        photometry = self.photometry
         patches = self.patches
+        is_paper_grid = self.highres.pixel_scale == 0.06
+        good = photometry.method != "yang2021" or is_paper_grid
+        self.check(good, "highres.pixel_scale", "must be 0.06 with method = 'yang2021'")
+        good = not photometry.rivals or is_paper_grid
+        self.check(good, "highres.pixel_scale", "must be 0.06 with [photometry] rivals")
         if patches.size:
-            self.check(
-                patches.size >= patches.overlap, "patches.size", "must be 0 or above overlap"
-            )
-            own = photometry.method == "package"
-            self.check(own, "photometry.method", "must be 'package' in patches")
-            whole = "must be left out in patches: whole fields are compared"
-            self.check(not photometry.rivals, "photometry.rivals", whole)
-            self.check(not self.variants.images, "variants.images", whole)
+            good = patches.size >= patches.overlap
+            self.check(good, "patches.size", "must be 0 or above overlap")
+            good = photometry.method == "package"
+            self.check(good, "photometry.method", "must be 'package' in patches")
+            wanted = "must be left out in patches: whole fields are compared"
+            self.check(not photometry.rivals, "photometry.rivals", wanted)
+            self.check(not self.variants.images, "variants.images", wanted)
 
 
 def preset_names():
     """
-    Names of the configurations that come with the package.
+    Return the names of the configurations that come with the package.
 
     Examples
     --------
@@ -156,8 +175,13 @@ def preset_names():
     ['cosmosweb', 'goodss', 'yang2021']
     """
     folder = resources.files("miricigale.workflow") / "presets"
-    names = (Path(entry.name) for entry in folder.iterdir() if entry.name.endswith(".toml"))
-    return sorted(path.stem for path in names if "." not in path.stem)
+    names = []
+    for entry in folder.iterdir():
+        stem, _, suffix = entry.name.partition(".")
+        # the others are quick variants
+        if suffix == "toml":
+            names.append(stem)
+    return sorted(names)
 
 
 def load_config(source, *, quick=False, overrides=None):
@@ -201,7 +225,9 @@ def load_config(source, *, quick=False, overrides=None):
     else:
         if source not in preset_names():
             raise unknown_name("preset", source, preset_names())
+        names = [f"{source}.toml"]
+        if quick:
+            names.append(f"{source}.quick.toml")
         folder = resources.files("miricigale.workflow") / "presets"
-        names = [f"{source}.toml", *([f"{source}.quick.toml"] if quick else [])]
         texts = [(name, (folder / name).read_text(encoding="utf-8")) for name in names]
     return StudyConfig.from_texts(texts, overrides)

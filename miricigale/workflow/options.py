@@ -6,7 +6,6 @@ import inspect
 import json
 import math
 import operator
-import re
 import tomllib
 import types
 import typing
@@ -23,7 +22,7 @@ _FOLDER_NAME = f"must be the name of a folder in the current one: {FILE_NAME}"
 @dataclasses.dataclass(frozen=True)
 class Limits:
     """
-    What values a key of a configuration may have.
+    Values that a key of a configuration may have.
 
     Parameters
     ----------
@@ -46,34 +45,60 @@ class Limits:
     unique: bool = False
     folder: bool = False
 
+    @property
+    def span(self):
+        """Range of numbers in words, as ``to_toml`` has it."""
+        if self.high < math.inf:
+            return f"{self.low} to {self.high}"
+        return f"at least {self.low}"
+
     def __str__(self):
         names = ", ".join(self.choices)
-        if self.low is None:
-            return f" One of {names}." if names else ""
-        span = f"{self.low} to {self.high}" if self.high < math.inf else f"at least {self.low}"
-        return f" ({span} or {names})" if names else f" ({span})"
+        if self.low is not None and names:
+            return f" ({self.span} or {names})"
+        if self.low is not None:
+            return f" ({self.span})"
+        if names:
+            return f" One of {names}."
+        return ""
 
 
-def option(default, **limits):
-    """A field of a section with `Limits`; one without needs its default only."""
-    return dataclasses.field(default=default, metadata={"limits": Limits(**limits)})
+def option(default, doc, **limits):
+    """
+    Declare a key of a section.
+
+    Parameters
+    ----------
+    default : object
+        Its default.
+    doc : str
+        A sentence on what it means: its comment in files of configurations, and its entry in the
+        reference.
+    **limits
+        As for `Limits`.
+
+    Returns
+    -------
+    field : `dataclasses.Field`
+    """
+    return dataclasses.field(default=default, metadata={"doc": doc, "limits": Limits(**limits)})
 
 
 @typing.dataclass_transform(frozen_default=True, field_specifiers=(option,))
 class Section:
-    """Base of the sections of a configuration: each is a frozen dataclass, whose docstring explains its keys."""
+    """Base of the sections of a configuration: frozen dataclasses whose fields are made by `option`."""
 
     def __init_subclass__(cls):
         dataclasses.dataclass(frozen=True)(cls)
+        entries = [f"{name}\n    {doc}" for name, doc in cls.docs().items()]
+        cls.__doc__ = "\n".join(
+            [inspect.cleandoc(cls.__doc__), "", "Parameters", "----------", *entries]
+        )
 
     @classmethod
     def docs(cls):
-        """What the docstring, and those of the sections that it inherits from, say of each key."""
-        text = "".join(
-            f"{inspect.cleandoc(base.__doc__ or '')}\n" for base in reversed(cls.__mro__)
-        )
-        entries = re.findall(r"^(\w+)\n((?: +.*\n)+)", text, flags=re.MULTILINE)
-        return {name: " ".join(doc.split()) for name, doc in entries}
+        """Return the meaning of each key, a sentence, by name."""
+        return {field.name: field.metadata["doc"] for field in dataclasses.fields(cls)}
 
 
 def require(good, section, key, wanted, got):
@@ -95,26 +120,26 @@ def of_option(label, *errors):
 
 
 def read_text(path):
-    """Text of a configuration file, or a `ConfigError` that names it."""
+    """Return the text of a configuration file; a `ConfigError` names one that cannot be read."""
     path = Path(path).expanduser()
     if not path.is_file():
         raise config_error("no configuration file", path)
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as err:
-        what = f"is not a text file in UTF-8: {err.reason} at byte {err.start}"
-        raise config_error(path, what) from None
+        reason = f"is not a text file in UTF-8: {err.reason} at byte {err.start}"
+        raise config_error(path, reason) from None
 
 
 def read_setting(text):
     """
-    Section, key and value of a text ``section.key=value``.
+    Split a text ``section.key=value`` into section, key and value.
 
     The value is as in TOML; what is no TOML is text, so that quotes may be left out.
     """
-    name, found, value = text.partition("=")
+    name, equals_sign, value = text.partition("=")
     section, dot, key = name.strip().partition(".")
-    if not (found and dot and section and key):
+    if not (equals_sign and dot and section and key):
         raise config_error("a setting", f"must be section.key=value, got {text!r}")
     try:
         return section, key, tomllib.loads(f"value = {value}")["value"]
@@ -140,8 +165,9 @@ class Configuration:
     def check(self, good, name, wanted, got=None):
         """Refuse a key ``section.key`` that does not agree with others; its value came, if not ``got``."""
         section, _, key = name.partition(".")
-        value = operator.attrgetter(name)(self)
-        require(good, section, key, wanted, _shown(value) if got is None else got)
+        if got is None:
+            got = _shown(operator.attrgetter(name)(self))
+        require(good, section, key, wanted, got)
 
     def check_length(self, name, lengths, wanted):
         """Refuse a list whose length is none of ``lengths``; the message has the length."""
@@ -149,12 +175,13 @@ class Configuration:
         self.check(n in lengths, name, wanted, n)
 
     def values(self, *names):
-        """Plain values of sections (``"scene"``) and keys (``"run.name"``), for hashing."""
-        values = {name: operator.attrgetter(name)(self) for name in names}
-        return {
-            name: value if "." in name else dataclasses.asdict(value)
-            for name, value in values.items()
-        }
+        """Return plain values of sections (``"scene"``) and keys (``"run.name"``), for hashing."""
+        values = {}
+        for name in names:
+            values[name] = operator.attrgetter(name)(self)
+            if "." not in name:
+                values[name] = dataclasses.asdict(values[name])
+        return values
 
     @classmethod
     def from_dict(cls, values, *, base=None):
@@ -181,42 +208,46 @@ class Configuration:
         """
         base = base or cls()
         values = keys_of_today(values, cls.earlier)
-        known = [field.name for field in dataclasses.fields(base)]
-        if unknown := sorted(set(values).difference(known)):
-            raise config_error("unknown section", f"{unknown}; known: {sorted(known)}")
-        sections = {
-            name: _replace_section(name, getattr(base, name), entries)
-            for name, entries in values.items()
-        }
+        names = [field.name for field in dataclasses.fields(base)]
+        if unknown := sorted(set(values).difference(names)):
+            raise config_error("unknown section", f"{unknown}; known: {sorted(names)}")
+        sections = {}
+        for name, entries in values.items():
+            sections[name] = _replace_section(name, getattr(base, name), entries)
         return dataclasses.replace(base, **sections)
 
     @classmethod
     def from_texts(cls, texts, overrides=None):
-        """Of pairs of a label for errors and a text in TOML, and of values in their place, in this order."""
+        """Read pairs of a label for errors and a text in TOML, in their order, and then ``overrides``."""
         config = cls()
         for label, text in texts:
             try:
                 config = cls.from_dict(tomllib.loads(text), base=config)
-            except (tomllib.TOMLDecodeError, RecursionError, ConfigError) as err:
-                label += ":" if isinstance(err, ConfigError) else " is not valid TOML:"
+            except ConfigError as err:
+                label = f"{label}:"
                 raise config_error(label, err) from None
-        return cls.from_dict(overrides, base=config) if overrides else config
+            except (tomllib.TOMLDecodeError, RecursionError) as err:
+                label = f"{label} is not valid TOML:"
+                raise config_error(label, err) from None
+        if overrides:
+            config = cls.from_dict(overrides, base=config)
+        return config
 
     def to_toml(self):
-        """The whole configuration as TOML, each key with its documentation."""
+        """Return the whole configuration as TOML, each key with its documentation."""
         lines = [self.heading]
         for field in dataclasses.fields(self):
             section = getattr(self, field.name)
-            summary, docs = type(section).__doc__.split("\n\n")[0], section.docs()
-            lines += ["", f"[{field.name}]  # {summary.strip()}"]
+            summary = type(section).__doc__.split("\n\n")[0]
+            lines += ["", f"[{field.name}]  # {summary}"]
             for entry in dataclasses.fields(section):
-                lines.append(f"# {docs[entry.name]}{_limits_of(entry)}")
+                lines.append(f"# {entry.metadata['doc']}{entry.metadata['limits']}")
                 lines.append(f"{entry.name} = {toml_value(getattr(section, entry.name))}")
         return "\n".join(lines) + "\n"
 
 
 def _shown(value):
-    """A value as error messages have it."""
+    """Return a value as error messages have it."""
     if isinstance(value, bool):
         return toml_value(value)
     if isinstance(value, tuple):
@@ -225,6 +256,7 @@ def _shown(value):
 
 
 def _replace_section(name, section, entries):
+    """Return a section with the values of a file in place of some of its own."""
     label = f"[{name}]"
     if not isinstance(entries, dict):
         raise config_error(label, f"must be a section, got {entries!r}")
@@ -232,50 +264,55 @@ def _replace_section(name, section, entries):
     if unknown := sorted(set(entries) - set(fields)):
         raise config_error(label, f"does not know {unknown}; known: {sorted(fields)}")
     hints = typing.get_type_hints(type(section))
-    changes = {
-        key: _checked((name, key), value, hints[key], _limits_of(fields[key]))
-        for key, value in entries.items()
-    }
+    changes = {}
+    for key, value in entries.items():
+        limits = fields[key].metadata["limits"]
+        changes[key] = _checked(name, key, value, hints[key], limits)
     return dataclasses.replace(section, **changes)
 
 
-def _checked(name, value, hint, limits):
-    if typing.get_origin(hint) is tuple:
-        if limits.single and isinstance(value, (int, float, str)):
-            value = (value,)
-        require(isinstance(value, (list, tuple)), *name, "must be a list", repr(value))
-        item = typing.get_args(hint)[0]
-        value = tuple(_checked(name, entry, item, limits) for entry in value)
-        repeats = limits.unique and len(set(value)) != len(value)
-        require(not repeats, *name, "must not repeat", list(value))
-        return value
+def _checked(section, key, value, hint, limits):
+    """Return a value, or a list of values, as its type and limits want it."""
+    if typing.get_origin(hint) is not tuple:
+        return _checked_scalar(section, key, value, hint, limits)
+    if limits.single and isinstance(value, (int, float, str)):
+        value = (value,)
+    require(isinstance(value, (list, tuple)), section, key, "must be a list", repr(value))
+    item = typing.get_args(hint)[0]
+    values = tuple(_checked_scalar(section, key, entry, item, limits) for entry in value)
+    repeats = limits.unique and len(set(values)) != len(values)
+    require(not repeats, section, key, "must not repeat", list(values))
+    return values
+
+
+def _checked_scalar(section, key, value, hint, limits):
     if isinstance(hint, types.UnionType):
         # a number within the limits, or one of the names
         hint = str if isinstance(value, str) else float
     if hint is float and type(value) is int:
         value = float(value)
-    require(type(value) is hint, *name, f"must be of type {hint.__name__}", repr(value))
-    low, high, choices = limits.low, limits.high, limits.choices
+    shown = repr(value)
+    require(type(value) is hint, section, key, f"must be of type {hint.__name__}", shown)
     if hint is str:
-        good = not choices or value in choices
-        require(good, *name, f"must be one of {list(choices)}", repr(value))
-        require(not limits.folder or is_file_name(value), *name, _FOLDER_NAME, repr(value))
+        good = not limits.choices or value in limits.choices
+        require(good, section, key, f"must be one of {list(limits.choices)}", shown)
+        good = not limits.folder or is_file_name(value)
+        require(good, section, key, _FOLDER_NAME, shown)
         return value
     good = hint is not float or math.isfinite(value)
-    require(good, *name, "must be a finite number", repr(value))
-    wanted = f"between {low} and {high}" if high < math.inf else f"at least {low}"
-    require(low is None or low <= value <= high, *name, f"must be {wanted}", repr(value))
+    require(good, section, key, "must be a finite number", shown)
+    wanted = f"at least {limits.low}"
+    if limits.high < math.inf:
+        wanted = f"between {limits.low} and {limits.high}"
+    good = limits.low is None or limits.low <= value <= limits.high
+    require(good, section, key, f"must be {wanted}", shown)
     return value
 
 
-def _limits_of(field):
-    return field.metadata.get("limits", Limits())
-
-
 def toml_value(value):
-    """Text of a value (text, a number, a truth value or a tuple of these) as TOML has it."""
+    """Return a value (text, a number, a truth value or a tuple of these) as TOML has it."""
     if isinstance(value, tuple):
-        return "[" + ", ".join(toml_value(v) for v in value) + "]"
+        return f"[{', '.join(map(toml_value, value))}]"
     if isinstance(value, float):
         # nan, inf and -inf as TOML has them, and a point or an exponent in all others
         return float.__repr__(value)

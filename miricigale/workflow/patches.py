@@ -49,49 +49,37 @@ _MEMORY, _TEMPLATES = 2_000_000_000, photometry.MemorySettings(max_bytes=3e8)
 
 
 class RunSection(RunBasics):
-    """
-    How the run goes.
+    """How the run goes."""
 
-    Parameters
-    ----------
-    memory
-        Memory (GB) of patches side by side on a machine; 0 for half of all.
-    """
-
-    name: str = option("patches", folder=True)
-    memory: float = option(0.0, low=0.0, high=1e5)
+    name: str = option(
+        "patches", "Name of the run; its folder unless --output is given.", folder=True
+    )
+    memory: float = option(
+        0.0,
+        "Memory (GB) of patches side by side on a machine; 0 for half of all.",
+        low=0.0,
+        high=1e5,
+    )
 
 
 class FilesSection(Section):
-    """
-    What is measured.
+    """What is measured."""
 
-    Parameters
-    ----------
-    inputs
-        Files and options as JSON.
-    """
-
-    inputs: str = ""
+    inputs: str = option(
+        "",
+        "Files and options as JSON.",
+    )
 
 
 class PatchSection(Section):
-    """
-    The grid of patches.
+    """The grid of patches."""
 
-    Parameters
-    ----------
-    size
-        Side of the cores (pixels of the prior).
-    overlap
-        Pixels of the prior around them.
-    pages
-        Whether each patch has a page, and images of model and residual.
-    """
-
-    size: int = option(1000, low=1)
-    overlap: int = option(0, low=0)
-    pages: bool = True
+    size: int = option(1000, "Side of the cores (pixels of the prior).", low=1)
+    overlap: int = option(0, "Pixels of the prior around them.", low=0)
+    pages: bool = option(
+        True,
+        "Whether each patch has a page, and images of model and residual.",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
