@@ -45,8 +45,8 @@ def cluster_executor(address, *, memory=None):
         msg = f"there is no dask scheduler at {address!r}: {err}"
         raise DataError(msg) from err
     with client:
-        what = f"has no workers; start some with 'dask worker {address}'"
-        check_data(client.nthreads(), f"the scheduler at {address}", what)
+        reason = f"has no workers; start some with 'dask worker {address}'"
+        check_data(client.nthreads(), f"the scheduler at {address}", reason)
 
         # functions made here go to others as they are, where this module may be missing
         def version():
@@ -56,9 +56,9 @@ def cluster_executor(address, *, memory=None):
                 return "none"
             return __version__
 
-        found = {client.run_on_scheduler(version), *client.run(version).values()}
-        if found != {version()}:
-            versions = ", ".join(sorted(found))
+        versions = {client.run_on_scheduler(version), *client.run(version).values()}
+        if versions != {version()}:
+            versions = ", ".join(sorted(versions))
             msg = f"scheduler and workers at {address} have version {versions} of the package, here is {version()}"
             raise DataError(msg)
         try:
@@ -89,8 +89,10 @@ class Cluster:
     wait_for = 2.0
 
     def __init__(self, client, memory=None):
-        self._client, self._memory = client, memory
-        self._places, self._asked = {}, -self.wait_for
+        self._client = client
+        self._memory = memory
+        self._places = {}
+        self._asked = -self.wait_for
 
     def places(self):
         """
@@ -104,24 +106,30 @@ class Cluster:
         if time.monotonic() - self._asked > self.wait_for:
 
             def workers(dask_scheduler):
-                return {
-                    w.address: (w.nthreads, w.memory_limit) for w in dask_scheduler.workers.values()
-                }
+                n_threads = {}
+                memory = {}
+                for worker in dask_scheduler.workers.values():
+                    n_threads[worker.address] = worker.nthreads
+                    memory[worker.address] = worker.memory_limit
+                return n_threads, memory
 
             try:
-                found = self._client.run_on_scheduler(workers)
+                n_threads, memory = self._client.run_on_scheduler(workers)
             except OSError as err:
                 raise CancelledError from err
-            self._places = {
-                address: Place(self._submit(address), n_threads, n_threads, self._bytes(limit))
-                for address, (n_threads, limit) in found.items()
-            }
+            self._places = {}
+            for address, n in n_threads.items():
+                submit = self._submit(address)
+                self._places[address] = Place(submit, n, n, self._bytes(memory[address]))
             self._asked = time.monotonic()
         return self._places
 
     def _bytes(self, limit):
+        """Return bytes that units on a worker may take, by the limit of its memory."""
+        if self._memory:
+            return self._memory * 1e9
         # workers without a limit say 0
-        return self._memory * 1e9 if self._memory else 0.5 * limit or float("inf")
+        return 0.5 * limit or float("inf")
 
     def _submit(self, address):
         # there and nowhere else: of workers that it may choose dask knows only those that there are now

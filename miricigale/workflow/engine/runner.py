@@ -97,36 +97,49 @@ class StudyRunner:
         self.stages = tuple(stages() if callable(stages) else stages)
         self.executor = executor
         self.redo = redo
-        self.disk, self.prepare = dict(disk or {}), prepare
+        self.disk = dict(disk or {})
+        self.prepare = prepare
         self.progress_bar = progress_bar
         self.n_threads = thread_count(config.run.threads or None)
-        self.units = {stage.name: stage.unit_names(config) for stage in self.stages}
-        self._parts = {s.key(unit): (s, unit) for s in self.stages for unit in self.units[s.name]}
-        seen = set()
+        self.units = {}
+        # stage and name of each unit, by key
+        self._parts = {}
         for stage in self.stages:
-            missing = set(stage.needs) - seen
+            missing = set(stage.needs) - set(self.units)
             if missing:
                 msg = f"stage {stage.name!r} needs {sorted(missing)}, which do not come before it"
                 raise ConfigError(msg)
-            seen.add(stage.name)
+            self.units[stage.name] = stage.unit_names(config)
+            for unit in self.units[stage.name]:
+                self._parts[stage.key(unit)] = (stage, unit)
         names = {name: Units(units) for name, units in self.units.items()}
         # by unit and stage: keys of the units that it reads
-        self._inputs = {
-            key: stage.needed(config, unit, names) for key, (stage, unit) in self._parts.items()
-        }
-        self._needed = {
-            key: frozenset(itertools.chain.from_iterable(inputs.values()))
-            for key, inputs in self._inputs.items()
-        }
-        chosen = set(self._parts) if until is None else self._matching(until, "until")
+        self._inputs = {}
+        self._needed = {}
+        for key, (stage, unit) in self._parts.items():
+            inputs = stage.needed(config, unit, names)
+            self._inputs[key] = inputs
+            self._needed[key] = frozenset(itertools.chain.from_iterable(inputs.values()))
+        chosen = set(self._parts)
+        if until is not None:
+            chosen = self._matching(until, "until")
         for key in reversed(self._parts):
             if key in chosen:
                 chosen |= self._needed[key]
         self.keys = [key for key in self._parts if key in chosen]
-        self._again = set() if again is None else self._matching(again, "again") & chosen
-        if again is not None and not self._again:
-            msg = f"nothing of 'again', {again!r}, is among what 'until', {until!r}, needs"
-            raise ConfigError(msg)
+        self._again = set()
+        if again is not None:
+            self._again = self._matching(again, "again") & chosen
+            if not self._again:
+                msg = f"nothing of 'again', {again!r}, is among what 'until', {until!r}, needs"
+                raise ConfigError(msg)
+
+    def _matching(self, pattern, argument):
+        """Return keys of units by stage or pattern."""
+        keys = set()
+        for key, (stage, _) in self._parts.items():
+            if stage.name == pattern or fnmatch.fnmatchcase(key, pattern):
+                keys.add(key)
 
     def _matching(self, pattern, argument):
         """Keys of units by stage or pattern."""
@@ -248,11 +261,12 @@ class StudyRunner:
         return store
 
     def _products_bytes(self):
-        """Bytes that the products of the units take that are wanted."""
-        wanted = collections.Counter(self._parts[key][0].name for key in self.keys)
-        return int(
-            sum(self.disk.get(name, 0) * n / len(self.units[name]) for name, n in wanted.items())
-        )
+        """Return about how many bytes the products take of the units that this run has."""
+        n_units = collections.Counter(self._parts[key][0].name for key in self.keys)
+        total = 0
+        for name, n in n_units.items():
+            total += self.disk.get(name, 0) * n / len(self.units[name])
+        return int(total)
 
     def _config_stands(self, store):
         """Whether manifest and ``config.toml`` say what this run does."""
@@ -260,20 +274,20 @@ class StudyRunner:
         return store.config == values == self._values_of(store.path(CONFIG))
 
     def _values_of(self, path):
-        """The same of a file; none where it is missing or cannot be read."""
+        """Return plain values of a configuration file; none where it is missing or cannot be read."""
         try:
             return self._read_values(path)
         except (ConfigError, OSError, ValueError):
             return {}
 
     def _read_values(self, path):
-        """Plain values of a configuration; keys of earlier versions are warned of where users read it."""
+        """Return plain values of a configuration; keys of earlier versions are warned of where users read it."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MiricigaleWarning)
             return _values(self.config.from_texts([(str(path), read_text(path))]))
 
     def _unreadable(self, path):
-        """Why this version does not take a configuration, in words; empty if it does."""
+        """Return why this version does not take a configuration, in words; empty if it does."""
         try:
             self._read_values(path)
         except (ConfigError, OSError, ValueError) as err:
@@ -281,18 +295,22 @@ class StudyRunner:
         return ""
 
     def _edited_config(self, store):
-        """Path of a ``config.toml`` that says neither what this run does nor what the last one did, or None."""
+        """Return the path of a ``config.toml`` that is of neither this run nor the last one, or None."""
         path = store.path(CONFIG)
-        known = store.config, _values(self.config)
-        return path if path.is_file() and self._values_of(path) not in known else None
+        if not path.is_file():
+            return None
+        if self._values_of(path) in (store.config, _values(self.config)):
+            return None
+        return path
 
     def _refuse_replacing(self, store, states):
         if self.redo:
             return
         reasons = []
         if edited := self._edited_config(store):
-            fault = self._unreadable(edited)
-            advice = f"change it where it says {fault}, and run" if fault else "run"
+            advice = "run"
+            if fault := self._unreadable(edited):
+                advice = f"change it where it says {fault}, and run"
             reasons.append(
                 f"{edited} was edited since the run that made this folder (or that run was of an "
                 f"earlier version), and this run has another configuration, which would replace it: "
@@ -314,14 +332,15 @@ class StudyRunner:
             if state == "lost":
                 faults |= store.faults(key)
         if faults:
-            some = [f"{name} ({fault})" for name, fault in itertools.islice(faults.items(), _NAMED)]
-            more = f" and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
+            names = [f"{name} ({fault})" for name, fault in faults.items()]
+            text = ", ".join(names[:_NAMED])
+            if len(names) > _NAMED:
+                text += f" and {len(names) - _NAMED} more"
             log.warning(
-                "%s: %s%s; what made them is done again, with the same bytes (keep copies of what "
+                "%s: %s; what made them is done again, with the same bytes (keep copies of what "
                 "you edit elsewhere)",
                 self.folder,
-                ", ".join(some),
-                more,
+                text,
             )
 
     def _warn_of_new_keys(self, store):
@@ -329,12 +348,11 @@ class StudyRunner:
         old = store.config
         if not old:
             return
-        added = [
-            f"[{section}] {key} = {_short(value)}"
-            for section, values in _values(self.config).items()
-            for key, value in values.items()
-            if key not in old.get(section, {})
-        ]
+        added = []
+        for section, values in _values(self.config).items():
+            for key, value in values.items():
+                if key not in old.get(section, {}):
+                    added.append(f"[{section}] {key} = {_short(value)}")
         if added:
             log.warning(
                 "%s was made by a version without %s: what is made now has these values",
@@ -343,27 +361,28 @@ class StudyRunner:
             )
 
     def _differences(self, store):
-        """What is other in the configuration, in words."""
-        old, new = store.config or {}, _values(self.config)
-        changes = [
-            f"[{section}] {key}: {_short(old.get(section, {}).get(key))} -> {_short(value)}"
-            for section, values in new.items()
-            for key, value in values.items()
-            if old and old.get(section, {}).get(key) != value
-        ]
-        return "; ".join(changes) or (
-            "by another version of the package, its data or the catalog, or before a redo that was stopped"
-        )
+        """Return what is other in the configuration than in that of the folder, in words."""
+        old = store.config
+        changes = []
+        if old:
+            for section, values in _values(self.config).items():
+                for key, value in values.items():
+                    before = old.get(section, {}).get(key)
+                    if before != value:
+                        changes.append(f"[{section}] {key}: {_short(before)} -> {_short(value)}")
+        if changes:
+            return "; ".join(changes)
+        return "by another version of the package, its data or the catalog, or before a redo that was stopped"
 
     def _write_config(self, store):
         if self._config_stands(store):
             return
         if edited := self._edited_config(store):
-            names = (f"config.edited{n if n > 1 else ''}.toml" for n in itertools.count(1))
-            kept = next(k for k in map(edited.with_name, names) if not os.path.lexists(k))
-            os.replace(edited, kept)
-            log.warning("the edited %s is kept as %s", edited, kept.name)
-        store.facts["config"] = values = _values(self.config)
+            copy = _unused_name(edited)
+            os.replace(edited, copy)
+            log.warning("the edited %s is kept as %s", edited, copy.name)
+        values = _values(self.config)
+        store.facts["config"] = values
         if self._values_of(store.path(CONFIG)) != values:
             store.save(CONFIG, lambda path: path.write_text(self.config.to_toml(), "utf-8"))
         store.write_manifest()
@@ -390,7 +409,11 @@ class StudyRunner:
             )
 
     def _task(self, key, store, display):
-        (stage, unit), needed = self._parts[key], self._needed[key]
+        stage, unit = self._parts[key]
+        needed = self._needed[key]
+        memory = _MEMORY
+        if stage.memory is not None:
+            memory = stage.memory(self.config, unit)
         inline = self.executor is None
         digest = None
 
@@ -430,20 +453,29 @@ class StudyRunner:
             begin,
             finish,
             needs=needed,
-            memory=stage.memory(self.config, unit) if stage.memory else _MEMORY,
+            memory=memory,
         )
 
 
 def _values(config):
-    """Plain values of what products may depend on."""
+    """Return plain values of what products may depend on."""
     values = json.loads(json.dumps(dataclasses.asdict(config)))
     # threads and memory do not change products
     del values["run"]["threads"], values["run"]["memory"]
     return values
 
 
+def _unused_name(path):
+    """Return the first of ``config.edited.toml``, ``config.edited2.toml``, ... that is not there."""
+    for n in itertools.count(1):
+        number = n if n > 1 else ""
+        copy = path.with_name(f"config.edited{number}.toml")
+        if not os.path.lexists(copy):
+            return copy
+
+
 def _summary(keys):
-    """Stages, with the number of units where there are several."""
+    """Return stages in words, with the number of units where there are several."""
     counts = collections.Counter(key.split(":")[0] for key in keys)
     return ", ".join(f"{name} ({n})" if n > 1 else name for name, n in counts.items())
 

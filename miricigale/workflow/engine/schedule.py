@@ -100,8 +100,9 @@ def local_place(executor, n_threads, memory):
     places : dict of str to `Place`
         One.
     """
-    slots = n_threads if executor is not None else 1
-    return {"here": Place((executor or _Inline()).submit, slots, n_threads, memory)}
+    if executor is None:
+        return {"here": Place(_Inline().submit, 1, n_threads, memory)}
+    return {"here": Place(executor.submit, n_threads, n_threads, memory)}
 
 
 class _Queue:
@@ -109,13 +110,14 @@ class _Queue:
 
     def __init__(self, tasks):
         self._tasks = tasks
-        self._left = collections.Counter(task.group for task in tasks)
-        self._missing, self._waiting = [], collections.defaultdict(list)
+        self._unfinished = collections.Counter(task.group for task in tasks)
+        self._missing = []
+        self._waiting = collections.defaultdict(list)
         # by memory: there are few amounts and many tasks
         self._ready = collections.defaultdict(list)
         self.n_ready = 0
         for k, task in enumerate(tasks):
-            groups = [group for group in task.needs if group in self._left]
+            groups = [group for group in task.needs if group in self._unfinished]
             self._missing.append(len(groups))
             for group in groups:
                 self._waiting[group].append(k)
@@ -136,13 +138,13 @@ class _Queue:
         if not fitting:
             return None
         self.n_ready -= 1
-        least = min(fitting, key=lambda m: self._ready[m][0])
-        return self._tasks[heapq.heappop(self._ready[least])]
+        amount = min(fitting, key=lambda m: self._ready[m][0])
+        return self._tasks[heapq.heappop(self._ready[amount])]
 
     def complete(self, task):
         """Note that a task is done."""
-        self._left[task.group] -= 1
-        if not self._left[task.group]:
+        self._unfinished[task.group] -= 1
+        if not self._unfinished[task.group]:
             for k in self._waiting.pop(task.group, ()):
                 self._missing[k] -= 1
                 if not self._missing[k]:
@@ -175,13 +177,16 @@ def run_tasks(tasks, *, places, n_threads, wait_for=None, report=None):
     `~miricigale.utils.exceptions.DataError`
         If a process of an executor died, or four places were lost over one task.
     """
-    waiting, running, error = _Queue(list(tasks)), {}, None
+    waiting = _Queue(list(tasks))
+    running = {}
+    error = None
     # concurrent.futures.wait holds locks of all futures, and keeps them if it is interrupted
-    done, deaths = queue.SimpleQueue(), collections.Counter()
+    done = queue.SimpleQueue()
+    deaths = collections.Counter()
     while True:
-        now = places()
+        machines = places()
         for future, (task, place) in list(running.items()):
-            if place not in now and not future.done():
+            if place not in machines and not future.done():
                 future.cancel()
                 del running[future]
                 deaths[task] += 1
@@ -195,14 +200,14 @@ def run_tasks(tasks, *, places, n_threads, wait_for=None, report=None):
                 waiting.put_back(task)
         task = None
         if error is None and len(running) < n_threads:
-            place, left = _roomiest(now, running.values())
-            task = waiting.take(left)
+            place, memory = _roomiest(machines, running.values())
+            task = waiting.take(memory)
         if task is not None:
-            slots = min(n_threads, sum(one.slots for one in now.values()))
+            slots = min(n_threads, sum(machine.slots for machine in machines.values()))
             together = min(slots, len(running) + waiting.n_ready + 1)
-            threads = min(now[place].n_threads, max(1, n_threads // together))
+            threads = min(machines[place].n_threads, max(1, n_threads // together))
             try:
-                future = task.begin(now[place].submit, threads)
+                future = task.begin(machines[place].submit, threads)
             except BrokenExecutor as err:
                 raise _died(task) from err
             if future is None:
@@ -211,7 +216,7 @@ def run_tasks(tasks, *, places, n_threads, wait_for=None, report=None):
                 running[future] = task, place
                 future.add_done_callback(done.put)
                 if report is not None:
-                    report([other.title for other, _ in running.values()])
+                    report([begun.title for begun, _ in running.values()])
         elif running:
             try:
                 future = done.get(timeout=wait_for)
@@ -220,13 +225,13 @@ def run_tasks(tasks, *, places, n_threads, wait_for=None, report=None):
             task, _ = running.pop(future, (None, None))
             if task is None:
                 continue
-            failed = future.exception()
-            if isinstance(failed, BrokenExecutor):
-                raise _died(task) from failed
-            if failed is None:
+            failure = future.exception()
+            if isinstance(failure, BrokenExecutor):
+                raise _died(task) from failure
+            if failure is None:
                 task.finish(future.result())
                 waiting.complete(task)
-            error = error or failed
+            error = error or failure
         elif error is not None:
             raise error
         elif waiting.n_ready:
@@ -238,20 +243,24 @@ def run_tasks(tasks, *, places, n_threads, wait_for=None, report=None):
 
 
 def _roomiest(places, running):
-    """Name of the place with most memory left, and how much; none (-1) where no slot is free."""
-    used, tasks = collections.Counter(), collections.Counter()
+    """Return the place with most memory left, and how much; none (-1) where no slot is free."""
+    memory = collections.Counter()
+    n_tasks = collections.Counter()
     for task, name in running:
-        used[name] += task.memory
-        tasks[name] += 1
-    free = {
-        name: one.memory - used[name] for name, one in places.items() if tasks[name] < one.slots
-    }
-    if not free:
+        memory[name] += task.memory
+        n_tasks[name] += 1
+    unused = {}
+    for name, place in places.items():
+        if n_tasks[name] < place.slots:
+            unused[name] = place.memory - memory[name]
+    if not unused:
         return None, -1
-    name = max(free, key=free.get)
-    largest = max(one.memory for one in places.values())
-    # what fits nowhere is done alone
-    return name, float("inf") if free[name] == largest and not tasks[name] else free[name]
+    name = max(unused, key=unused.get)
+    largest = max(place.memory for place in places.values())
+    if unused[name] == largest and not n_tasks[name]:
+        # what fits nowhere is done alone
+        return name, float("inf")
+    return name, unused[name]
 
 
 def _died(task):

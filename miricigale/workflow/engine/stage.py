@@ -84,12 +84,12 @@ class Stage:
     memory: Callable | None = None
 
     def unit_names(self, config):
-        """Names of the pieces; a single empty one for a stage that has none."""
+        """Return names of the pieces; a single empty one for a stage that has none."""
         return tuple(self.units(config)) if self.units else ("",)
 
     def needed(self, config, unit, units):
         """
-        What a unit reads.
+        Return what a unit reads.
 
         Parameters
         ----------
@@ -105,16 +105,21 @@ class Stage:
         keys : dict of str to list of str
             By stage: keys of its units in the manifest.
         """
-        own = [f"{self.within(config)}/{unit}" if self.within else unit]
-        own = self.reads(config, unit) if self.reads else own
-        found = {}
-        for name in self.needs:
-            others = itertools.chain(*map(units[name].related, own))
-            found[name] = [f"{name}:{k}" if k else name for k in dict.fromkeys(others)]
-        return found
+        names = [unit]
+        if self.within is not None:
+            names = [f"{self.within(config)}/{unit}"]
+        if self.reads is not None:
+            names = self.reads(config, unit)
+        keys = {}
+        for stage in self.needs:
+            related = itertools.chain.from_iterable(map(units[stage].related, names))
+            # each once, in their order
+            related = dict.fromkeys(related)
+            keys[stage] = [f"{stage}:{name}" if name else stage for name in related]
+        return keys
 
     def key(self, unit):
-        """Name of a piece in the manifest."""
+        """Return the name of a piece in the manifest."""
         return f"{self.name}:{unit}" if unit else self.name
 
 
@@ -134,31 +139,39 @@ class Units:
     def __init__(self, names):
         self._names = tuple(names)
         self._parts = [_parts(name) for name in self._names]
-        # so that looking for one does not go through all
-        self._same, self._with = collections.defaultdict(list), collections.defaultdict(list)
+        # numbers of the units by all of their parts and by each, so that looking for one does not
+        # go through all
+        self._by_parts = collections.defaultdict(list)
+        self._by_part = collections.defaultdict(list)
         for k, parts in enumerate(self._parts):
-            self._same[parts].append(k)
+            self._by_parts[parts].append(k)
             for part in parts:
-                self._with[part].append(k)
+                self._by_part[part].append(k)
 
     def related(self, unit):
-        """Names of the units that are parts of a unit, or it of them, in their order."""
+        """Return names of the units that are parts of a unit, or it of them, in their order."""
         parts = _parts(unit)
-        subsets = itertools.chain(
-            *(itertools.combinations(parts, n) for n in range(len(parts) + 1))
-        )
-        found = {k for some in subsets for k in self._same.get(frozenset(some), ())}
-        few = min(
-            (self._with.get(part, ()) for part in parts), key=len, default=range(len(self._names))
-        )
-        found.update(k for k in few if parts <= self._parts[k])
-        return [self._names[k] for k in sorted(found)]
+        numbers = set()
+        for n in range(len(parts) + 1):
+            for subset in itertools.combinations(parts, n):
+                numbers.update(self._by_parts.get(frozenset(subset), ()))
+        # units with all parts are among those with the rarest one
+        candidates = range(len(self._names))
+        for part in parts:
+            candidates = min(candidates, self._by_part.get(part, ()), key=len)
+        numbers.update(k for k in candidates if parts <= self._parts[k])
+        return [self._names[k] for k in sorted(numbers)]
 
 
 @cached
 def _parts(unit):
-    names = [name for name in unit.split("/") if name]
-    return frozenset([*names, *(name.rpartition("-")[0] or name for name in names)])
+    """Return the parts of the name of a unit, those with a number also without it."""
+    parts = set()
+    for name in unit.split("/"):
+        if name:
+            parts.add(name)
+            parts.add(name.rpartition("-")[0] or name)
+    return frozenset(parts)
 
 
 def stage(name, title, **declaration):
@@ -198,12 +211,15 @@ class ConfigView:
     def __getattr__(self, section):
         if section in self._stage.sections:
             return getattr(self._config, section)
-        keys = [k.split(".")[1] for k in self._stage.sections if k.startswith(f"{section}.")]
-        if not keys:
+        view = types.SimpleNamespace()
+        for name in self._stage.sections:
+            declared, _, key = name.partition(".")
+            if declared == section:
+                setattr(view, key, getattr(getattr(self._config, section), key))
+        if not vars(view):
             msg = f"stage {self._stage.name!r} reads [{section}] without declaring it"
             raise RuntimeError(msg)
-        values = getattr(self._config, section)
-        return types.SimpleNamespace(**{key: getattr(values, key) for key in keys})
+        return view
 
 
 class Context:
@@ -232,19 +248,24 @@ class Context:
     def __init__(
         self, config, folder, *, stage=None, unit="", inputs=None, n_threads=1, progress_bar=False
     ):
-        self.config = config if stage is None else ConfigView(config, stage)
-        self.plan = stage.plan(config, unit) if stage is not None and stage.plan else None
+        self.config = config
+        self.plan = None
+        self._name = ""
+        if stage is not None:
+            self.config = ConfigView(config, stage)
+            self._name = stage.name
+            if stage.plan is not None:
+                self.plan = stage.plan(config, unit)
         self.products = FileFolder(folder)
         self.progress_bar = progress_bar
         self.saved = []
         # available without a declaration: the seed enters every hash, threads change no product
         self.seed = config.run.seed
         self.n_threads = n_threads
-        self._name = "" if stage is None else stage.name
         self._inputs = None if inputs is None else frozenset(inputs)
 
     def path(self, name):
-        """Path of a product that an earlier stage wrote."""
+        """Return the path of a product that an earlier stage wrote."""
         if self._inputs is not None and name not in self._inputs:
             msg = f"stage {self._name!r} reads {name!r} without declaring the stage that makes it"
             raise RuntimeError(msg)
@@ -324,9 +345,11 @@ def run_unit(config, folder, stages, name, unit, **options):
         If this machine does not see the folder.
     """
     if not folder.is_dir():
-        where = socket.gethostname()
-        raise data_error(folder, f"is not on {where}: all workers must see the folder of the run")
-    (stage,) = (s for s in (stages() if callable(stages) else stages) if s.name == name)
+        host = socket.gethostname()
+        raise data_error(folder, f"is not on {host}: all workers must see the folder of the run")
+    if callable(stages):
+        stages = stages()
+    (stage,) = (candidate for candidate in stages if candidate.name == name)
     context = Context(config, folder, stage=stage, unit=unit, **options)
     begin = time.perf_counter()
     caught = []
@@ -335,10 +358,10 @@ def run_unit(config, folder, stages, name, unit, **options):
         with single_threaded(), warnings.catch_warnings(record=True) as caught:
             stage.function(context, unit)
     except Exception as err:
-        for one in caught:
-            warn(one.message, one.category)
+        for warning in caught:
+            warn(warning.message, warning.category)
         err.add_note(f"in stage {stage.key(unit)}")
         raise
     products = {product: context.products.describe(product) for product in context.saved}
-    warned = [(one.category, str(one.message)) for one in caught]
+    warned = [(warning.category, str(warning.message)) for warning in caught]
     return products, time.perf_counter() - begin, warned

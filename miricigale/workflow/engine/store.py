@@ -43,12 +43,12 @@ class ProductStore(RecordFolder):
         float(record["seconds"])
 
     def checksums(self, keys):
-        """Checksums of all products of units by their keys; those that are not done have none."""
-        return {
-            name: product["sha256"]
-            for key in sorted(self.records.keys() & set(keys))
-            for name, product in self.records[key]["products"].items()
-        }
+        """Return checksums of all products of units by their keys; those that are not done have none."""
+        checksums = {}
+        for key in sorted(self.records.keys() & set(keys)):
+            for name, product in self.records[key]["products"].items():
+                checksums[name] = product["sha256"]
+        return checksums
 
 
 def check_disk(folder, needed):
@@ -64,7 +64,7 @@ def check_disk(folder, needed):
 
     Returns
     -------
-    free : int
+    n_free : int
         Bytes that are free.
 
     Raises
@@ -75,11 +75,11 @@ def check_disk(folder, needed):
     place = Path(folder).absolute()
     while not place.exists():
         place = place.parent
-    free = shutil.disk_usage(place).free
-    if needed > free:
+    n_free = shutil.disk_usage(place).free
+    if needed > n_free:
         msg = (
-            f"the run needs about {needed / 1e9:.2f} GB in {folder}, only {free / 1e9:.2f} GB are "
+            f"the run needs about {needed / 1e9:.2f} GB in {folder}, only {n_free / 1e9:.2f} GB are "
             "free; free some space, choose another folder, or simulate fewer exposures or skies"
         )
         raise DataError(msg)
-    return free
+    return n_free
