@@ -44,8 +44,10 @@ from miricigale.workflow.recorded_inputs import (
 )
 from miricigale.workflow.sections import RunBasics
 
-#: Most bytes that a patch may take, and of these for templates, where no others are given.
-_MEMORY, _TEMPLATES = 2_000_000_000, photometry.MemorySettings(max_bytes=3e8)
+#: Most bytes that a patch may take.
+_MAX_PATCH_BYTES = 2_000_000_000
+#: Memory of templates, where no other is given.
+_TEMPLATE_MEMORY = photometry.MemorySettings(max_bytes=3e8)
 
 
 class RunSection(RunBasics):
@@ -84,7 +86,7 @@ class PatchSection(Section):
 
 @dataclasses.dataclass(frozen=True)
 class PatchConfig(Configuration):
-    """What a run in patches depends on."""
+    """Everything that a run in patches depends on."""
 
     heading: ClassVar = "# miricigale photometry in patches; a record of what was asked for"
 
@@ -94,117 +96,157 @@ class PatchConfig(Configuration):
 
 
 @cached(maxsize=4)
-def _made(files, patches):
+def _inputs_and_grid(files, patches):
     inputs = inputs_from_text(files.inputs)
-    whole, images = inputs.highres.header, [one.header for one in inputs.images]
-    return inputs, PatchGrid.over(whole, images, patches.size, patches.overlap)
+    return inputs, _grid(inputs, patches.size, patches.overlap)
+
+
+def _grid(inputs, size, overlap):
+    """Return the grid of patches, of cores of a size and overlap in pixels of the prior."""
+    headers = [image.header for image in inputs.images]
+    return PatchGrid.over(inputs.highres.header, headers, size, overlap)
 
 
 def _task(config):
-    """Inputs and grid of a configuration."""
-    return _made(config.files, config.patches)
+    """Return inputs and grid of a configuration."""
+    return _inputs_and_grid(config.files, config.patches)
 
 
 def _states(config, unit):
-    """Size and time of each file that is read, for the digest."""
+    """Return size and time of each file that is read, for the digest."""
     inputs, _ = _task(config)
     return file_states(inputs)
 
 
-def _bytes(inputs, grid, unit):
-    """About how many bytes a patch takes."""
-    parts = patch_parts(inputs, grid, grid.names.index(unit))
-    prior, *images = (tuple(one.stop - one.start for one in part or ()) or (0, 0) for part in parts)
-    return inputs.n_bytes(prior, images)
+def _n_bytes(inputs, grid, unit):
+    """Estimate how many bytes a patch takes."""
+    shapes = []
+    for part in patch_parts(inputs, grid, grid.names.index(unit)):
+        shapes.append(tuple(side.stop - side.start for side in part) if part else (0, 0))
+    return inputs.n_bytes(shapes[0], shapes[1:])
+
+
+def _unit_names(config):
+    _, grid = _task(config)
+    return grid.names
+
+
+def _unit_memory(config, unit):
+    inputs, grid = _task(config)
+    return _n_bytes(inputs, grid, unit)
 
 
 _sources = cached_by_file(1, copies=True)(read_catalog)
 
 
 def _catalog(inputs):
-    """Ids and positions of the sources, if they are given."""
+    """Return ids and positions of the sources, if there is a catalog."""
     return None if inputs.catalog is None else _sources(inputs.catalog)["id", "sky"]
 
 
-_READS = {"sections": ("files", "patches"), "plan": _states}
-_UNITS = {
-    "units": lambda config: _task(config)[1].names,
-    "memory": lambda config, unit: _bytes(*_task(config), unit),
-}
+_SECTIONS = ("files", "patches")
 
 
-@stage("patch", "patches", version=2, **_READS, **_UNITS)
+@stage(
+    "patch",
+    "patches",
+    version=2,
+    sections=_SECTIONS,
+    plan=_states,
+    units=_unit_names,
+    memory=_unit_memory,
+)
 def patch_stage(context, unit):
     """Measure a patch: its table, and its page with model and residual of each band."""
     inputs, grid = _task(context.config)
     k = grid.names.index(unit)
     table, measured = measure_patch(inputs, grid, k, _catalog(inputs), context.n_threads)
     if measured is not None:
-        table.meta["patch"] = _facts(measured, table)
-        shown = [k for k, one in measured.pixels.images.items() if "source" in one.meta]
-        # pictures are of both
-        sharp = "source" in measured.pixels.prior.meta
-        if context.config.patches.pages and shown and sharp and len(table):
-            with tempfile.TemporaryDirectory() as folder:
-                measured.write_page(Path(folder) / f"{unit}.html")
-                for band, result in measured.results.items():
-                    stem = "patches/" + re.sub(r"[^\w.+-]", "-", f"{unit}_{band}")
-                    context.save_image(f"{stem}_model.fits", result.model_image)
-                    context.save_image(f"{stem}_residual.fits", result.residual_image)
-                for path in sorted(Path(folder).rglob("*.*")):
-                    name = f"patches/{path.relative_to(folder).as_posix()}"
-                    context.save(name, functools.partial(shutil.copyfile, path))
+        table.meta["patch"] = _band_entries(measured, table)
+        # pictures are of an image and the prior
+        has_image = any("source" in image.meta for image in measured.pixels.images.values())
+        has_prior = "source" in measured.pixels.prior.meta
+        if context.config.patches.pages and has_image and has_prior and len(table):
+            _save_page(context, measured, unit)
     context.save_table(f"patches/{unit}.ecsv", table)
 
 
-def _facts(measured, table):
-    """What a patch found of each band, as plain values."""
-    rows = []
+def _save_page(context, measured, unit):
+    """Save the page of a patch with its pictures, and its images of model and residual."""
+    with tempfile.TemporaryDirectory() as folder:
+        measured.write_page(Path(folder) / f"{unit}.html")
+        for band, result in measured.results.items():
+            stem = "patches/" + re.sub(r"[^\w.+-]", "-", f"{unit}_{band}")
+            context.save_image(f"{stem}_model.fits", result.model_image)
+            context.save_image(f"{stem}_residual.fits", result.residual_image)
+        for path in sorted(Path(folder).rglob("*.*")):
+            name = f"patches/{path.relative_to(folder).as_posix()}"
+            context.save(name, functools.partial(shutil.copyfile, path))
+
+
+def _band_entries(measured, table):
+    """Return numbers of each band of a patch, as plain values."""
+    entries = []
     for band, result in measured.results.items():
-        flux, background, meta = table[band], result.background, result.meta
+        flux = table[band]
+        background = result.background
         clean = table[f"{band}_err"][np.isfinite(flux) & (table[f"{band}_flags"] == 0)]
-        rows.append({
-            "band": band, "n": len(table), "n_measured": int(np.isfinite(flux).sum()),
-            "depth": float(ab_magnitude(5 * np.median(clean))) if len(clean) else None,
+        depth = None
+        if len(clean):
+            depth = float(ab_magnitude(5 * np.median(clean)))
+        second_pass = result.meta.get("second_pass", {})
+        entry = {
+            "band": band,
+            "n": len(table),
+            "n_measured": int(np.isfinite(flux).sum()),
+            "depth": depth,
             "background": None if background is None else float(background.value),
             "noise_scale": measured.pixels.images[band].meta.get("noise_scale"),
-            "offset": str(meta.get("offset", "not measured")),
-            "second_pass": str(meta.get("second_pass", {}).get("fitted", "not asked for")),
-        })  # fmt: skip
-    return rows
+            "offset": str(result.meta.get("offset", "not measured")),
+            "second_pass": str(second_pass.get("fitted", "not asked for")),
+        }
+        entries.append(entry)
+    return entries
 
 
-@stage("table", "table", needs=("patch",), **_READS)
+@stage("table", "table", needs=("patch",), sections=_SECTIONS, plan=_states)
 def table_stage(context, _):
     """Join the tables of the patches, and write the page of all."""
     inputs, grid = _task(context.config)
-    tables, facts = {}, []
+    tables = {}
+    rows = []
     for k, name in enumerate(grid.names):
-        found = context.table(f"patches/{name}.ecsv")
-        facts += [{"patch": name, **one} for one in found.meta.pop("patch", ())]
-        if len(found):
-            tables[k] = found
+        table = context.table(f"patches/{name}.ecsv")
+        for entry in table.meta.pop("patch", ()):
+            rows.append({"patch": name} | entry)
+        if len(table):
+            tables[k] = table
     if not tables:
         raise argument_error("highres", "an image with sources", "none in any patch")
-    ids = inputs.segmentation is not None
-    table = join_patches(tables, grid, inputs.highres.header, _catalog(inputs), ids)
-    files = {"image": [str(one.path) for one in inputs.images], "highres": str(inputs.highres.path)}
-    about = dataclasses.asdict(context.config.patches)
-    table.meta = provenance(stage="photometry", **files, **about)
-    context.save_table("table.fits", table)
+    has_ids = inputs.segmentation is not None
+    joined = join_patches(tables, grid, inputs.highres.header, _catalog(inputs), has_ids)
+    settings = dataclasses.asdict(context.config.patches)
+    joined.meta = provenance(
+        stage="photometry",
+        image=[str(image.path) for image in inputs.images],
+        highres=str(inputs.highres.path),
+        **settings,
+    )
+    context.save_table("table.fits", joined)
     title = f"Forced photometry in patches: {', '.join(inputs.bands)}"
     report = Page(title, subtitle=f"on the prior {Path(inputs.highres.path).name}")
     page = SectionWriter(report, declared("miricigale.photometry"))
-    page.section("patches", n=len(table), n_patches=len(grid.names), **about)
-    for one in facts:
-        if context.products.path(f"patches/{one['patch']}.html").exists():
-            one["patch"] = Link(one["patch"], f"patches/{one['patch']}.html")
-    page.table("table", facts)
+    page.section("patches", n=len(joined), n_patches=len(grid.names), **settings)
+    for row in rows:
+        name = f"patches/{row['patch']}.html"
+        if context.products.path(name).exists():
+            row["patch"] = Link(row["patch"], name)
+    page.table("table", rows)
     context.save("index.html", report.write)
 
 
 def patch_stages():
-    """The stages of photometry in patches."""
+    """Return the stages of photometry in patches."""
     return patch_stage, table_stage
 
 
@@ -279,11 +321,15 @@ def measure_patches(
     >>> from miricigale.workflow import measure_patches
     >>> table = measure_patches("f770w_i2d.fits", "f444w_i2d.fits", "patches")  # doctest: +SKIP
     """
-    inputs = Inputs.of(image, highres, **{"memory": _TEMPLATES, **options})
-    named = {name: absolute(getattr(inputs, name)) for name in ("segmentation", "catalog")}
-    # all patches have one PSF unless their stars are asked for
-    named |= {"psf_stars": bool(inputs.psf_stars)}
-    inputs = dataclasses.replace(inputs, kernels=tuple(map(absolute, inputs.kernels)), **named)
+    inputs = Inputs.of(image, highres, **{"memory": _TEMPLATE_MEMORY, **options})
+    inputs = dataclasses.replace(
+        inputs,
+        segmentation=absolute(inputs.segmentation),
+        catalog=absolute(inputs.catalog),
+        kernels=tuple(map(absolute, inputs.kernels)),
+        # all patches have one PSF unless their stars are asked for
+        psf_stars=bool(inputs.psf_stars),
+    )
     check_output(output, "output", overwrite=overwrite, inputs=inputs.paths, **TABLE_KIND)
     inputs.check()
     # refused here rather than in each patch
@@ -310,11 +356,10 @@ def measure_patches(
 
 
 def _largest(inputs, rim):
-    """Side of cores of the same size whose patches take 2 GB at most."""
-    whole, images = inputs.highres.header, [one.header for one in inputs.images]
-    longest = max(whole.shape)
+    """Return the side of cores of the same size whose patches take 2 GB at most."""
+    longest = max(inputs.highres.header.shape)
     for n in range(1, longest):
-        grid = PatchGrid.over(whole, images, math.ceil(longest / n), rim)
-        if max(_bytes(inputs, grid, name) for name in grid.names) <= _MEMORY:
+        grid = _grid(inputs, math.ceil(longest / n), rim)
+        if max(_n_bytes(inputs, grid, name) for name in grid.names) <= _MAX_PATCH_BYTES:
             return grid.size
     raise argument_error("overlap", "small enough for patches of 2 GB", f"{rim} pixels")

@@ -24,54 +24,70 @@ from miricigale.utils.store import plain_value
 #: Fields of an image that name files.
 PATHS = ("path", "error", "variance", "inverse_variance", "weight", "psf")
 
-#: What may stand in a record, by name.
-_KINDS = {
-    kind.__name__: kind
-    for kind in (
-        BackgroundSettings,
-        DetectorProperties,
-        ErrorSettings,
-        MemorySettings,
-        MosaicFile,
-        MosaicSettings,
-        RampSettings,
-        Reducer,
-        ReferenceCache,
-        ReferenceFiles,
-    )
-}
+#: Classes whose instances may stand in a record.
+_CLASSES = (
+    BackgroundSettings,
+    DetectorProperties,
+    ErrorSettings,
+    MemorySettings,
+    MosaicFile,
+    MosaicSettings,
+    RampSettings,
+    Reducer,
+    ReferenceCache,
+    ReferenceFiles,
+)
 
 
 def absolute(path):
-    """The same path for workers, which have another working directory; None stays."""
+    """Return the same path for workers, which have another working directory; None stays."""
     return None if path is None else os.path.abspath(path)
 
 
+def _field_values(instance):
+    """Return the fields of a dataclass by name, not copied."""
+    return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
+
+
+def _with_tuples(values):
+    """Return values with tuples in place of lists, as fields of settings are."""
+    restored = dict(values)
+    for name, value in values.items():
+        if isinstance(value, list):
+            restored[name] = tuple(value)
+    return restored
+
+
 def _plain(value):
-    """What JSON does not know, as it does; `_restored` takes it back."""
+    """Return a value that JSON does not know in a form that it does; `_restored` takes it back."""
     if isinstance(value, u.Quantity):
         return {"value": float(value.value), "unit": value.unit.to_string()}
-    if type(value).__name__ in _KINDS:
-        known = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
-        if isinstance(value, MosaicFile):
-            known |= {name: absolute(known[name]) for name in PATHS}
-        known = {k: absolute(v) if isinstance(v, Path) else v for k, v in known.items()}
-        return {"of": type(value).__name__, **known}
-    return os.fspath(value) if isinstance(value, os.PathLike) else plain_value(value)
+    if type(value) in _CLASSES:
+        entries = _field_values(value)
+        for name, entry in entries.items():
+            is_path = isinstance(entry, Path)
+            if is_path or (isinstance(value, MosaicFile) and name in PATHS):
+                entries[name] = absolute(entry)
+        return {"of": type(value).__name__, **entries}
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return plain_value(value)
 
 
 def _restored(values):
+    """Return what `_plain` made plain."""
     if values.keys() == {"value", "unit"}:
         return values["value"] * u.Unit(values["unit"])
     if "of" not in values:
         return values
-    kind = _KINDS[values.pop("of")]
-    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    name = values.pop("of")
+    (kind,) = (kind for kind in _CLASSES if kind.__name__ == name)
+    return kind(**_with_tuples(values))
 
 
 def as_text(value):
     """
-    Text of settings, from which `from_text` makes them again.
+    Write settings as text, from which `from_text` makes them again.
 
     Parameters
     ----------
@@ -87,24 +103,23 @@ def as_text(value):
 
 
 def from_text(text):
-    """Settings of a text that `as_text` made; lists are lists."""
+    """Read settings from a text that `as_text` made; lists are lists."""
     return json.loads(text, object_hook=_restored)
 
 
 def inputs_text(inputs):
-    """Text of what is measured (`~miricigale.photometry.commands.file_inputs.Inputs`)."""
-    return as_text({one.name: getattr(inputs, one.name) for one in dataclasses.fields(inputs)})
+    """Write what is measured (`~miricigale.photometry.commands.file_inputs.Inputs`) as text."""
+    return as_text(_field_values(inputs))
 
 
 def inputs_from_text(text):
-    """What is measured, of a text that `inputs_text` made."""
-    values = from_text(text)
-    return Inputs(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    """Read what is measured from a text that `inputs_text` made."""
+    return Inputs(**_with_tuples(from_text(text)))
 
 
 def file_states(inputs, others=()):
     """
-    Size and time of each file that is read, for the digest of a stage.
+    Return size and time of each file that is read, for the digest of a stage.
 
     Parameters
     ----------
@@ -118,8 +133,12 @@ def file_states(inputs, others=()):
     states : dict of str to list of int
         By path.
     """
-    files = [inputs.highres, *inputs.images, *inputs.detection]
-    paths = [getattr(one, name) for one in files for name in PATHS]
-    paths = {file_place(one)[0] for one in (*paths, *inputs.paths, *others) if one is not None}
-    states = {path: os.stat(path) for path in sorted(map(str, paths))}
-    return {path: [one.st_size, one.st_mtime_ns] for path, one in states.items()}
+    paths = [*inputs.paths, *others]
+    for file in (inputs.highres, *inputs.images, *inputs.detection):
+        paths += [getattr(file, name) for name in PATHS]
+    files = {str(file_place(path)[0]) for path in paths if path is not None}
+    states = {}
+    for file in sorted(files):
+        stat = os.stat(file)
+        states[file] = [stat.st_size, stat.st_mtime_ns]
+    return states

@@ -67,7 +67,7 @@ ELSEWHERE = {
     "sed.components.stellar._library_table",
     "sed.components.dust._sequence",
     "sed.tables._stack",
-    "workflow.patches._made",
+    "workflow.patches._inputs_and_grid",
     "workflow.stages.inputs._catalog",
     "workflow.stages.exposures._file_pattern",
     "workflow.stages.exposures._pointings",
