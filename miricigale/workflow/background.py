@@ -41,12 +41,12 @@ def _read(level):
 
 
 def of_filter(values, k):
-    """The value of a filter, the k-th one, of values of all filters or a single one for all."""
-    return values[k if len(values) > 1 else 0]
+    """Return the value of the k-th filter, of values of all filters or a single one for all."""
+    return values[k] if len(values) > 1 else values[0]
 
 
 def text_by_filter(texts):
-    """One sentence of the texts of filters: the text alone where it is the same for all."""
+    """Join the texts of filters into a sentence: the text alone where it is the same for all."""
     names = {}
     for filter, text in texts.items():
         names.setdefault(text, []).append(filter.removeprefix("miri.").upper())
@@ -57,7 +57,7 @@ def text_by_filter(texts):
 
 def band_background(filter, filters, levels, *, position=None, date=""):
     """
-    Background of one of several filters.
+    Return the background of one of several filters.
 
     Parameters
     ----------
@@ -80,35 +80,40 @@ def band_background(filter, filters, levels, *, position=None, date=""):
     level = of_filter(levels, list(filters).index(filter))
     if level not in _PERCENTILES:
         return sky_background(filter, _read(level))
-    place = None if position is None else (position.icrs.ra.deg, position.icrs.dec.deg)
-    return _named(filter, level, place, date)
+    if position is None:
+        return _named(filter, level, None, date)
+    sky = position.icrs
+    return _named(filter, level, (sky.ra.deg, sky.dec.deg), date)
 
 
 @cached(maxsize=64)
 def _named(filter, level, place, date):
-    """Background of a named level: asked for by every exposure, and some time to evaluate for a day."""
+    """Return the background of a named level, which every exposure asks for and which is slow for a day."""
     if place is None:
         return sky_background(filter, level)
     return sky_background(filter, level, position=SkyCoord(*place, unit="deg"), date=date or None)
 
 
 def background_text(filters, levels, *, position=None, date=""):
-    """What the background of filters is and where it is from, in words; arguments as of `band_background`."""
-    sources = (_source(of_filter(levels, k), position, date) for k in range(len(filters)))
-    return text_by_filter(dict(zip(filters, sources, strict=True)))
+    """Return what the background of filters is and where it is from; arguments as of `band_background`."""
+    texts = {}
+    for k, filter in enumerate(filters):
+        texts[filter] = _source(of_filter(levels, k), position, date)
+    return text_by_filter(texts)
 
 
 def _source(level, position, date):
+    """Return where the background of a level is from, in words."""
     if level not in _PERCENTILES:
         return f"{_read(level):g}, as given"
     if level == "low" and position is None:
         return "telescope and low zodiacal light (Rigby et al. 2023, jwst_backgrounds)"
-    where = "the sky"
+    place = "the sky"
+    days = place
     if position is not None:
-        where = f"RA {position.icrs.ra.deg:.4f}, Dec {position.icrs.dec.deg:.4f}"
+        place = f"RA {position.icrs.ra.deg:.4f}, Dec {position.icrs.dec.deg:.4f}"
+        days = f"the days on which {place} can be seen"
+    light = f"{level} zodiacal light, the {_PERCENTILES.get(level)}th percentile over {days}"
     if date:
-        light = f"zodiacal light of {date} at {where}"
-    else:
-        days = where if position is None else f"the days on which {where} can be seen"
-        light = f"{level} zodiacal light, the {_PERCENTILES[level]}th percentile over {days}"
+        light = f"zodiacal light of {date} at {place}"
     return f"telescope and {light} (Kelsall et al. 1998 by ZodiPy)"

@@ -39,7 +39,7 @@ def disk_use(config):
 
 def study_cost(config):
     """
-    What a run takes: units, processor time, disk and memory by stage.
+    Estimate what a run takes: units, processor time, disk and memory by stage.
 
     Times are of a core on which the plain loop of ``benchmarks/fit.py`` takes 0.03 s an object with ``--kind
     quick``, kernels compiled, after runs of 1, 9 and 25 pointings (docs/accuracy/running.rst).
@@ -62,71 +62,87 @@ def study_cost(config):
     >>> print(cost["units"][cost["stage"] == "exposures"][0], "exposures")
     12 exposures
     """
-    size, rows = _Size(config), []
-    disk, seconds = size.disk(), size.seconds()
-    for one in study_stages():
-        units = one.unit_names(config)
-        memory = max((one.memory(config, unit) for unit in units), default=0) if one.memory else 0
-        taken = round(seconds.get(one.name, 0.0)), round(disk.get(one.name, 0) / 1e6)
-        rows.append((one.name, len(units), *taken, round(memory / 1e6)))
-    names, units = ("stage", "units", "cpu", "disk", "memory"), ("s", "Mbyte", "Mbyte")
-    return QTable(rows=rows, names=names, units=dict(zip(names[2:], units, strict=True)))
+    size = _Size(config)
+    disk = size.disk()
+    seconds = size.seconds()
+    rows = []
+    for stage in study_stages():
+        units = stage.unit_names(config)
+        memory = 0
+        if stage.memory is not None:
+            memory = max((stage.memory(config, unit) for unit in units), default=0)
+        row = {
+            "stage": stage.name,
+            "units": len(units),
+            "cpu": round(seconds.get(stage.name, 0.0)),
+            "disk": round(disk.get(stage.name, 0) / 1e6),
+            "memory": round(memory / 1e6),
+        }
+        rows.append(row)
+    return QTable(rows=rows, units={"cpu": "s", "disk": "Mbyte", "memory": "Mbyte"})
 
 
 class _Size:
-    """What the cost of a study follows from: numbers of exposures, pixels and sources."""
+    """Numbers of exposures, pixels and sources, from which the cost of a study follows."""
 
     def __init__(self, config):
         self.config = config
-        self.exposures, self.truths = study_exposures(config), len(study_truths(config))
-        self.pixels = {name: math.prod(e.shape) for name, e in self.exposures.items()}
+        self.exposures = study_exposures(config)
+        self.truths = len(study_truths(config))
+        self.pixels = {}
+        for name, exposure in self.exposures.items():
+            self.pixels[name] = math.prod(exposure.shape)
         patches = study_patches(config)
-        self.native, self.fine = (
-            sum(math.prod(grid_of(config, scale, name).pixel_shape) for name in patches)
-            for scale in (config.reduction.pixel_scale, config.highres.pixel_scale)
-        )
+        self.native = _n_pixels(config, config.reduction.pixel_scale, patches)
+        self.fine = _n_pixels(config, config.highres.pixel_scale, patches)
         # patches have no mosaics on the prior's pixels
         self.drizzled = 0 if config.patches.size else self.fine
-        self.n_bands, self.n_sets = len(config.exposures.filters), len(config.fit.sets)
+        self.n_bands = len(config.exposures.filters)
+        self.n_sets = len(config.fit.sets)
         self.n_kernels = len(patch_bands(config))
         # exposures of the mosaics, of which an exposure is in several
-        self.n_drizzled = sum(len(one.exposures) for one in patches.values())
+        self.n_drizzled = sum(len(patch.exposures) for patch in patches.values())
         catalog = study_catalog(config.catalog)
         catalog = bright_sources(catalog, config.catalog, config.highres.filter)
         self.n = len(catalog)
         redshifts = np.round(np.asarray(catalog["redshift"], float) / REDSHIFT_STEP)
         self.n_redshifts = len(np.unique(redshifts))
         wcs = grid_of(config, config.reduction.pixel_scale)
-        inside, whole = np.count_nonzero(wcs.footprint_contains(catalog["sky"])), wcs.pixel_shape
+        inside = np.count_nonzero(wcs.footprint_contains(catalog["sky"]))
+        n_pixels = math.prod(wcs.pixel_shape)
         # sources of the prior; those where patches overlap are in each
-        self.n_drawn = inside * self.native / math.prod(whole)
+        self.n_drawn = inside * self.native / n_pixels
         # the box about the fields has corners that no field covers
         first, last = imager_columns()
         height = next(iter(self.exposures.values())).shape[0]
-        share = len(study_pointings(config)) * (last - first) * height / math.prod(whole)
+        share = len(study_pointings(config)) * (last - first) * height / n_pixels
         self.n_imaged = int(inside * min(1.0, share))
         self.pictured = min(self.n_imaged, config.report.pictures)
 
     def disk(self):
         """Bytes by stage, as they were measured; stages of small tables only are left out."""
-        config, pixels = self.config, self.pixels
+        config = self.config
+        pixels = self.pixels
         exposed = 3.5 * sum(pixels.values())
-        if config.run.keep_level1b:
-            # counts, the planes that only a simulation knows, and slopes
-            for name, e in self.exposures.items():
-                exposed += (2 * e.n_groups * e.n_integrations + 11.6) * pixels[name]
-            rates = 0
-        else:
-            # slopes of one dither of each band of the reference
-            rates = 3.6 * sum(pixels[name] for name, e in self.exposures.items() if e.dither == 0)
+        n_rates = 0
+        for name, exposure in self.exposures.items():
+            if config.run.keep_level1b:
+                # counts, the planes that only a simulation knows, and slopes
+                groups = exposure.n_groups * exposure.n_integrations
+                exposed += (2 * groups + 11.6) * pixels[name]
+            elif exposure.dither == 0:
+                # slopes of one dither of each band of the reference
+                n_rates += pixels[name]
         measured = self.fine if config.photometry.method == "yang2021" else self.native
         pointed = min(2, self.n_bands) / len(study_pointings(config)) * config.point_sources.enabled
-        n, truths, bands = self.n, self.truths, self.n_bands
+        n = self.n
+        truths = self.truths
+        bands = self.n_bands
         return {
             "catalog": 240 * n,
             "seds": (5_100 + 14.5 * self.n_redshifts) * n,
             "truth": truths * 800 * n,
-            "exposures": truths * exposed + rates,
+            "exposures": truths * exposed + 3.6 * n_rates,
             "mosaics": truths * bands * 2.05 * (self.native + self.drizzled),
             "highres": 3.8 * self.fine,
             "points": pointed * 2.05 * measured,
@@ -142,23 +158,31 @@ class _Size:
 
     def seconds(self):
         """Processor time by stage; small and optional stages have none."""
-        truths, bands, config = self.truths, self.n_bands, self.config
+        config = self.config
+        truths = self.truths
+        bands = self.n_bands
         # of an exposure as rates, or of an exposure and all groups of its pixels
-        each = 5.0
+        exposure_time = 5.0
         if config.exposures.kind == "ramps":
-            exposures = self.exposures.items()
-            groups = sum(e.n_groups * e.n_integrations * self.pixels[name] for name, e in exposures)
-            each = 1.7 + 5.9e-8 * groups / len(self.exposures)
+            groups = 0
+            for name, exposure in self.exposures.items():
+                groups += exposure.n_groups * exposure.n_integrations * self.pixels[name]
+            exposure_time = 1.7 + 5.9e-8 * groups / len(self.exposures)
         return {
             "seds": (1.6e-3 + truths * 4e-4) * self.n,
-            "exposures": truths * each * len(self.exposures),
+            "exposures": truths * exposure_time * len(self.exposures),
             "mosaics": truths * (0.46 * self.n_drizzled + 9e-7 * self.drizzled * bands),
             "highres": 5e-7 * self.fine + 3e-3 * self.n_drawn,
             "kernels": 0.8 * self.n_kernels,
             "templates": 5e-7 * self.fine + 7e-3 * self.n_drawn,
             "photometry": truths * bands * (5e-7 * self.native + 1.4e-2 * self.n_drawn),
-            "points": config.point_sources.enabled * bands * (each + 3.0),
+            "points": config.point_sources.enabled * bands * (exposure_time + 3.0),
             "fits": truths * self.n_sets * 1.9e-3 * self.n_imaged,
             "sources": truths * (5.0 + 2.5e-3 * self.n),
             "report": 12.0 + 1.5e-3 * self.n,
         }
+
+
+def _n_pixels(config, pixel_scale, patches):
+    """Return the number of pixels of all patches together on grids of a pixel scale (arcsec)."""
+    return sum(math.prod(grid_of(config, pixel_scale, name).pixel_shape) for name in patches)

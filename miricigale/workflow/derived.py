@@ -32,12 +32,11 @@ def changed_config(config, sections, changes):
     changed : `~types.SimpleNamespace`
         With the sections as attributes.
     """
-    return types.SimpleNamespace(
-        **{
-            name: dataclasses.replace(getattr(config, name), **changes.get(name, {}))
-            for name in sections
-        }
-    )
+    changed = types.SimpleNamespace()
+    for name in sections:
+        section = dataclasses.replace(getattr(config, name), **changes.get(name, {}))
+        setattr(changed, name, section)
+    return changed
 
 
 def rows_of(table, ids):

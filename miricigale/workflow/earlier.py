@@ -27,7 +27,7 @@ class EarlierKey:
 
 def keys_of_today(values, earlier):
     """
-    Sections and keys of an earlier version under the names of today.
+    Put the keys of an earlier version under the names of today.
 
     Parameters
     ----------
@@ -46,11 +46,12 @@ def keys_of_today(values, earlier):
     `~miricigale.utils.exceptions.ConfigError`
         If a key is there under both names, or is gone and asks for something. The message has all of them.
     """
-    sections = {
-        name: dict(entries) if isinstance(entries, dict) else entries
-        for name, entries in values.items()
-    }
-    renamed, gone, refused = [], [], []
+    sections = {}
+    for name, entries in values.items():
+        sections[name] = dict(entries) if isinstance(entries, dict) else entries
+    renamed = []
+    gone = []
+    refused = []
     for old, entry in earlier.items():
         section, _, key = old.partition(".")
         entries = sections.get(section)
@@ -73,13 +74,13 @@ def keys_of_today(values, earlier):
             refused.append(f"[{section}] {key} = {value!r} is gone: {entry.instead}")
     if refused:
         raise ConfigError("; ".join(refused))
-    if renamed or gone:
-        texts = list(renamed)
-        if gone:
-            texts.append(f"{', '.join(gone)}, without effect, left out")
-        warn(f"a configuration of an earlier version: {'; '.join(texts)}", MiricigaleWarning)
+    if gone:
+        renamed.append(f"{', '.join(gone)}, without effect, left out")
+    if renamed:
+        warn(f"a configuration of an earlier version: {'; '.join(renamed)}", MiricigaleWarning)
     # sections that held nothing else
-    former = {old.partition(".")[0] for old in earlier}
-    return {
-        name: entries for name, entries in sections.items() if entries != {} or name not in former
-    }
+    for key in earlier:
+        section = key.partition(".")[0]
+        if sections.get(section) == {}:
+            del sections[section]
+    return sections

@@ -40,11 +40,13 @@ def parameter_label(name):
     return _LABELS["parameters"].get(name, name.replace("_", " "))
 
 
-def truth_label(one):
+def truth_label(truth):
     """Return what a truth (`~miricigale.evaluation.TruthResults`) is called."""
-    if one.frac_agn is None:
-        return "AGN of the catalog" if one.name.startswith(CATALOG) else "realistic field"
-    return f"fracAGN {one.frac_agn:g}"
+    if truth.frac_agn is not None:
+        return f"fracAGN {truth.frac_agn:g}"
+    if truth.name.startswith(CATALOG):
+        return "AGN of the catalog"
+    return "realistic field"
 
 
 def by_wavelength(names):
@@ -60,13 +62,17 @@ def end_bands(names):
 def three_bands(names):
     """Return the shortest, the middle and the longest of some bands, or all of fewer than three."""
     bands = by_wavelength(names)
-    return bands if len(bands) < 3 else [bands[0], bands[len(bands) // 2], bands[-1]]
+    if len(bands) < 3:
+        return bands
+    return [bands[0], bands[len(bands) // 2], bands[-1]]
 
 
 def color_bands(names):
     """Return the bands of color images: the shortest and the longest three of six or more, or as `three_bands`."""
+    if len(names) < 6:
+        return three_bands(names)
     bands = by_wavelength(names)
-    return three_bands(names) if len(bands) < 6 else [*bands[:3], *bands[-3:]]
+    return bands[:3] + bands[-3:]
 
 
 def browse(truth, text, source="", **filters):
@@ -87,5 +93,8 @@ def browse(truth, text, source="", **filters):
     """
     if text == 0:
         return text
-    place = quote(str(source), safe="") + (f"?{urlencode(filters)}" if filters else "")
-    return Link(text, f"sources-{quote(truth)}.html{f'#{place}' if place else ''}")
+    page = f"sources-{quote(truth)}.html"
+    anchor = quote(str(source), safe="")
+    if filters:
+        anchor += f"?{urlencode(filters)}"
+    return Link(text, f"{page}#{anchor}" if anchor else page)

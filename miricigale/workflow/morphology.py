@@ -24,17 +24,27 @@ from miricigale.utils.units import ANGLE
 
 log = logging.getLogger(__name__)
 
-#: Clumps in a galaxy, least and largest number; slope of the number by light, dN/dL ~ L^-slope, and largest
-#: over least light (Dessauges-Zavadsky & Adamo 2018, MNRAS 479, L118, masses of clumps).
-CLUMPS, SLOPE, LIGHT_RANGE = (3, 12), 1.7, 30.0
-#: Share of a profile's light within which they lie, and largest index of galaxies that have some.
-CLUMPS_WITHIN, CLUMPY_INDEX = 0.9, 2.5
+#: Clumps in a galaxy, least and largest number.
+CLUMPS = (3, 12)
+#: Slope of the number of clumps by light, dN/dL ~ L^-slope, and largest over least light (Dessauges-Zavadsky &
+#: Adamo 2018, MNRAS 479, L118, masses of clumps).
+SLOPE = 1.7
+LIGHT_RANGE = 30.0
+#: Share of a profile's light within which clumps lie.
+CLUMPS_WITHIN = 0.9
+#: Largest Sersic index of galaxies that have clumps.
+CLUMPY_INDEX = 2.5
 
-#: Stamps: least signal-to-noise; least half-light radius (arcsec) where galaxies are drawn, above the pixel of
-#: MIRI; range of factors on their size.
-MIN_SNR, MIN_RADIUS, SIZE_FACTORS = 50.0, 0.15, (0.5, 2.0)
-#: Width of a PSF's array, and of the rim of a deconvolved image in which no galaxy is used (arcsec).
-_PSF_WIDTH, _RIM = 10.0, 1.0
+#: Least signal-to-noise of stamps.
+MIN_SNR = 50.0
+#: Least half-light radius (arcsec) of stamps where galaxies are drawn, above the pixel of MIRI.
+MIN_RADIUS = 0.15
+#: Range of factors on their size.
+SIZE_FACTORS = (0.5, 2.0)
+#: Width of a PSF's array (arcsec).
+_PSF_WIDTH = 10.0
+#: Rim of a deconvolved image in which no galaxy is used (arcsec).
+_RIM = 1.0
 #: Detection: in sigma, above the noise that would join galaxies; and the least share of the light of a part that
 #: is taken for another galaxy, so that clumps stay.
 DETECTION = {
@@ -91,33 +101,37 @@ def add_clumps(catalog, filter, *, share, seed, point=None):
     if rows.size == 0:
         return catalog
     drawn = [_clumps(checked[row], seed) for row in rows]
-    inner = np.nan_to_num(np.asarray(catalog[point], float)) if point else np.zeros(len(catalog))
+    owner = np.repeat(rows, [len(light) for light, _, _ in drawn])
+    light, east, north = map(np.concatenate, zip(*drawn, strict=True))
     flux = catalog[filter]
-    given = np.where(clumpy, share * (1 - inner), 0.0)
-    owner = np.repeat(rows, [len(one[0]) for one in drawn])
-    light, east, north = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
-    smooth, clumps = catalog.copy(), catalog[owner]
-    smooth[filter] = flux * (1 - given)
+    inner = np.zeros(len(catalog))
+    if point:
+        inner = np.nan_to_num(np.asarray(catalog[point], float))
+    clumped = np.where(clumpy, share * (1 - inner), 0.0)
+    smooth = catalog.copy()
+    clumps = catalog[owner]
+    smooth[filter] = flux * (1 - clumped)
     clumps["id"] = _new_ids(np.asarray(catalog["id"]), owner)
     clumps["profile"] = np.full(len(owner), "point")
     clumps["sky"] = catalog["sky"][owner].spherical_offsets_by(east * ANGLE, north * ANGLE)
-    clumps[filter] = flux[owner] * given[owner] * light
+    clumps[filter] = flux[owner] * clumped[owner] * light
     if point:
         # the same light in the point
-        smooth[point], clumps[point] = inner / (1 - given), np.zeros(len(owner))
+        smooth[point] = inner / (1 - clumped)
+        clumps[point] = np.zeros(len(owner))
     return vstack([smooth, clumps], metadata_conflicts="silent")
 
 
 def _new_ids(ids, owner):
-    """Ids that no source has: numbers above all, or the owner's text with a number."""
+    """Return ids that no source has: numbers above all, or the owner's text with a number."""
     number = np.arange(len(owner))
     if ids.dtype.kind in "iu":
         return ids.max() + 1 + number
-    return np.array([f"{ids[row]} clump {k}" for row, k in zip(owner, number, strict=True)])
+    return np.array([f"{ids[row]} clump {k}" for k, row in enumerate(owner)])
 
 
 def _clumps(row, seed):
-    """Shares of the light, which add up to 1, and offsets to the east and north (arcsec)."""
+    """Draw shares of the light, which add up to 1, and offsets to the east and north (arcsec)."""
     rng = stream(seed, "perturb", "clumps", str(row["id"]))
     n = int(rng.integers(CLUMPS[0], CLUMPS[1] + 1))
     # the inverse of the enclosed number of a power law from 1 to LIGHT_RANGE
@@ -126,7 +140,9 @@ def _clumps(row, seed):
     radius = sersic_radius(rng.uniform(0, CLUMPS_WITHIN, n), row["sersic_index"])
     radius = radius * row["half_light_radius"].to_value(ANGLE)
     angle = rng.uniform(0, 2 * np.pi, n)
-    major, minor = radius * np.cos(angle), radius * np.sin(angle) * row["axis_ratio"]
+    # along the axes of the galaxy, then turned to its position angle
+    major = radius * np.cos(angle)
+    minor = radius * np.sin(angle) * row["axis_ratio"]
     turn = np.nan_to_num(row["position_angle"].to_value(u.rad))
     east = major * np.sin(turn) + minor * np.cos(turn)
     north = major * np.cos(turn) - minor * np.sin(turn)
@@ -177,26 +193,31 @@ class RealGalaxies:
         return cls(file.read(), model)
 
     @functools.cached_property
-    def _found(self):
+    def _detections(self):
         """Light before the PSF, labels, detections, pixels that may be used and boxes of the labels."""
         segments, table = photometry.detect_sources(self.image, **DETECTION)
         usable = np.isfinite(self.image.data)
         if self.image.mask is not None:
             usable &= ~np.asarray(self.image.mask, bool)
-        data, rim = np.where(usable, self.image.data, 0.0), 1
+        data = np.where(usable, self.image.data, 0.0)
+        rim = 1
         if self.psf is not None:
             scale = pixel_scale(self.image.wcs)
             half = int(np.ceil(0.5 * _PSF_WIDTH / scale))
             array = psf_image(self.psf, pixel_scale=scale * ANGLE, shape=2 * half + 1)
-            data, rim = deconvolve(data, array), int(np.ceil(_RIM / scale))
+            data = deconvolve(data, array)
+            rim = int(np.ceil(_RIM / scale))
         # what lies beyond the edges is not known
-        usable[:rim], usable[-rim:], usable[:, :rim], usable[:, -rim:] = False, False, False, False
+        usable[:rim] = False
+        usable[-rim:] = False
+        usable[:, :rim] = False
+        usable[:, -rim:] = False
         labels = np.asarray(segments.data)
         return data, labels, table, usable, find_objects(labels)
 
     def cutout(self, label, position=None):
         """
-        The stamp of a detection: its own segment, all else is 0.
+        Return the stamp of a detection: its own segment, all else is 0.
 
         Parameters
         ----------
@@ -210,24 +231,27 @@ class RealGalaxies:
         cutout : `~miricigale.scene.Cutout` or None
             None where its signal-to-noise is below 50, or a pixel of it is masked or near the edge.
         """
-        data, labels, table, usable, boxes = self._found
+        data, labels, table, usable, boxes = self._detections
         box = boxes[label - 1]
-        own = labels[box] == label
-        if not (table["snr"][label - 1] >= MIN_SNR and np.all(usable[box][own])):
+        segment = labels[box] == label
+        if not (table["snr"][label - 1] >= MIN_SNR and np.all(usable[box][segment])):
             return None
-        light = np.where(own, data[box], 0.0)
-        if not light.sum() > 0:
+        light = np.where(segment, data[box], 0.0)
+        total = light.sum()
+        if not total > 0:
             return None
         wcs = self.image.wcs[box]
         if position is None:
-            y, x = (float(np.sum(light * at) / light.sum()) for at in np.indices(light.shape))
-            position = wcs.pixel_to_world(x, y)
+            y, x = np.indices(light.shape)
+            x_center = float(np.sum(light * x) / total)
+            y_center = float(np.sum(light * y) / total)
+            position = wcs.pixel_to_world(x_center, y_center)
         return Cutout.from_image(CCDData(light, unit=self.image.unit, wcs=wcs), position)
 
     @property
     def labels(self):
         """Labels of all sources of the image, from 1."""
-        return range(1, len(self._found[2]) + 1)
+        return range(1, len(self._detections[2]) + 1)
 
     @functools.cached_property
     def resolved(self):
@@ -237,22 +261,29 @@ class RealGalaxies:
         A table with ``stamp``, ``radius`` (arcsec, with half of the light), ``axis_ratio`` and
         ``major_axis``, the angle (deg) of the major axis from +y of the stamp, counter-clockwise.
         """
-        rows = []
+        columns = {"stamp": [], "radius": [], "axis_ratio": [], "major_axis": []}
         for label in self.labels:
             stamp = self.cutout(label)
-            if stamp is not None and stamp.half_light_radius.value >= MIN_RADIUS:
-                rows.append((stamp, stamp.half_light_radius.value, *_shape(stamp)))
-        names = ["stamp", "radius", "axis_ratio", "major_axis"]
-        return Table(rows=rows, names=names) if rows else Table(names=names)
+            if stamp is None or not stamp.half_light_radius.value >= MIN_RADIUS:
+                continue
+            ratio, angle = _shape(stamp)
+            columns["stamp"].append(stamp)
+            columns["radius"].append(stamp.half_light_radius.value)
+            columns["axis_ratio"].append(ratio)
+            columns["major_axis"].append(angle)
+        return Table(columns)
 
 
 def _shape(stamp):
-    """Axis ratio and angle of the major axis, by the second moments within two half-light radii."""
+    """Return axis ratio and angle of the major axis, by the second moments within two half-light radii."""
     y, x = np.indices(stamp.data.shape)
-    x, y = x - stamp.center[0], y - stamp.center[1]
+    x = x - stamp.center[0]
+    y = y - stamp.center[1]
     inner = np.hypot(x, y) <= 2 * (stamp.half_light_radius / stamp.pixel_scale).value
     light = np.where(inner, stamp.data, 0.0)
-    xx, yy, xy = (float(np.sum(light * a * b)) for a, b in ((x, x), (y, y), (x, y)))
+    xx = float(np.sum(light * x * x))
+    yy = float(np.sum(light * y * y))
+    xy = float(np.sum(light * x * y))
     values, axes = np.linalg.eigh([[xx, xy], [xy, yy]])
     # noise can make the smaller one negative
     ratio = np.sqrt(max(values[0], 0.01 * values[1]) / values[1])
@@ -261,7 +292,7 @@ def _shape(stamp):
 
 def stamps_of_sources(catalog, galaxies, *, of, seed):
     """
-    Stamps of the sources of a catalog that are Sersic profiles.
+    Return stamps of the sources of a catalog that are Sersic profiles.
 
     Parameters
     ----------
@@ -289,17 +320,21 @@ def stamps_of_sources(catalog, galaxies, *, of, seed):
     """
     checked = check_catalog(catalog)
     rows = np.flatnonzero(_sersic(checked))
+    ids = np.asarray(checked["id"]).tolist()
+    stamps = {}
     if of == "own":
         xy = np.stack(galaxies.image.wcs.world_to_pixel(checked["sky"]), axis=-1)
-        labels = nearest_values(galaxies._found[1], xy)[0]
+        labels = nearest_values(galaxies._detections[1], xy)[0]
         # of all sources, points too
         counts = np.bincount(labels)
-        pairs = ((row, labels[row]) for row in rows if labels[row] and counts[labels[row]] == 1)
-        stamps = {row: galaxies.cutout(label, checked["sky"][row]) for row, label in pairs}
+        for row in rows:
+            label = labels[row]
+            if label and counts[label] == 1:
+                stamps[ids[row]] = galaxies.cutout(label, checked["sky"][row])
     else:
-        stamps = {row: _drawn(checked[row], galaxies, seed) for row in rows}
-    ids = np.asarray(checked["id"]).tolist()
-    stamps = {ids[row]: one for row, one in stamps.items() if one is not None}
+        for row in rows:
+            stamps[ids[row]] = _drawn(checked[row], galaxies, seed)
+    stamps = {key: stamp for key, stamp in stamps.items() if stamp is not None}
     if not stamps:
         msg = (
             f"none of the {len(rows)} Sersic profiles of the catalog has a galaxy on the image of [perturb] "
@@ -311,42 +346,53 @@ def stamps_of_sources(catalog, galaxies, *, of, seed):
 
 
 def _drawn(row, galaxies, seed):
-    """The stamp of a galaxy drawn for a source, scaled and turned; None if none is like it."""
-    choice = galaxies.resolved
+    """Return the stamp of a galaxy drawn for a source, scaled and turned; None if none is like it."""
+    galaxy = galaxies.resolved
     radius = row["half_light_radius"].to_value(ANGLE) * np.sqrt(row["axis_ratio"])
-    factors = radius / np.asarray(choice["radius"], float)
+    factors = radius / np.asarray(galaxy["radius"], float)
     like = np.flatnonzero((factors >= SIZE_FACTORS[0]) & (factors <= SIZE_FACTORS[1]))
     if like.size == 0:
         return None
     rng = stream(seed, "perturb", "cutouts", str(row["id"]))
-    other = np.abs(np.asarray(choice["axis_ratio"][like], float) - row["axis_ratio"])
-    chosen = rng.choice(like[np.argsort(other, kind="stable")[:N_LIKE]])
-    stamp, turn = choice["stamp"][chosen], float(rng.choice([0.0, 180.0]))
-    angle = np.nan_to_num(row["position_angle"].to_value(u.deg)) - choice["major_axis"][chosen]
+    difference = np.abs(np.asarray(galaxy["axis_ratio"][like], float) - row["axis_ratio"])
+    chosen = rng.choice(like[np.argsort(difference, kind="stable")[:N_LIKE]])
+    stamp = galaxy["stamp"][chosen]
+    turn = float(rng.choice([0.0, 180.0]))
+    angle = np.nan_to_num(row["position_angle"].to_value(u.deg)) - galaxy["major_axis"][chosen]
     scale = stamp.pixel_scale * factors[chosen]
     return dataclasses.replace(stamp, pixel_scale=scale, angle=(angle + turn) * u.deg)
 
 
 def write_stamps(stamps, path):
     """Write stamps by id to a FITS file, in single precision."""
+    pieces = stamps.values()
     table = QTable({"id": list(stamps)})
-    table["ny"], table["nx"] = np.transpose([stamp.data.shape for stamp in stamps.values()])
-    table["x"], table["y"] = np.transpose([stamp.center for stamp in stamps.values()])
-    for name in ("pixel_scale", "angle"):
-        table[name] = u.Quantity([getattr(stamp, name) for stamp in stamps.values()])
-    light = np.concatenate([stamp.data.ravel() for stamp in stamps.values()])
-    parts = {"arrays": {"light": light.astype(np.float32)}, "tables": {"stamps": table}}
-    write_parts(path, _LAYOUT, **parts, overwrite=True)
+    table["ny"], table["nx"] = np.transpose([stamp.data.shape for stamp in pieces])
+    table["x"], table["y"] = np.transpose([stamp.center for stamp in pieces])
+    table["pixel_scale"] = u.Quantity([stamp.pixel_scale for stamp in pieces])
+    table["angle"] = u.Quantity([stamp.angle for stamp in pieces])
+    light = np.concatenate([stamp.data.ravel() for stamp in pieces])
+    write_parts(
+        path,
+        _LAYOUT,
+        arrays={"light": light.astype(np.float32)},
+        tables={"stamps": table},
+        overwrite=True,
+    )
 
 
 def read_stamps(path):
-    """Stamps by id of a file of `write_stamps`."""
+    """Read stamps by id from a file of `write_stamps`."""
     with open_parts(path, (_LAYOUT,), wanted="stamps of galaxies") as parts:
-        table, light = parts.table("stamps", QTable), parts.array("light")
-        pieces = np.split(light, np.cumsum(table["ny"] * table["nx"])[:-1])
+        table = parts.table("stamps", QTable)
+        light = parts.array("light")
+    pieces = np.split(light, np.cumsum(table["ny"] * table["nx"])[:-1])
     stamps = {}
-    for key, row, one in zip(table["id"].tolist(), table, pieces, strict=True):
-        options = {name: row[name] for name in ("pixel_scale", "angle")}
-        center = float(row["x"]), float(row["y"])
-        stamps[key] = Cutout(one.reshape(row["ny"], row["nx"]), center=center, **options)
+    for key, row, piece in zip(table["id"].tolist(), table, pieces, strict=True):
+        stamps[key] = Cutout(
+            piece.reshape(row["ny"], row["nx"]),
+            center=(float(row["x"]), float(row["y"])),
+            pixel_scale=row["pixel_scale"],
+            angle=row["angle"],
+        )
     return stamps

@@ -44,12 +44,12 @@ class Perturbation:
         return stream(self.seed, "perturb", name, *key)
 
     def _signed(self, name, filter):
-        """Size of an effect with a random sign in each band; 0 without it."""
+        """Return the size of an effect with a random sign in each band; 0 without it."""
         return self.effects.get(name, 0.0) * self._random(name, filter).choice([-1.0, 1.0])
 
     def psf(self, filter):
         """
-        The PSF of a band: of a telescope with another wavefront, wider or narrower.
+        Return the PSF of a band: of a telescope with another wavefront, wider or narrower.
 
         Parameters
         ----------
@@ -60,21 +60,22 @@ class Perturbation:
         -------
         psf : `~miricigale.psf.InstrumentPSF`
         """
-        # the same telescope in all bands
-        other = "psf" in self.effects
-        options = {"seed": int(self._random("psf").integers(2, 2**31))} if other else {}
-        own = psf.miri_psf(filter, **options)
+        seed = None
+        if "psf" in self.effects:
+            # the same telescope in all bands
+            seed = int(self._random("psf").integers(2, 2**31))
+        model = psf.miri_psf(filter) if seed is None else psf.miri_psf(filter, seed=seed)
         factor = 1.0 + self._signed("psf_width", filter)
         if factor == 1.0:
-            return own
+            return model
         # its values at offsets that are smaller by the factor, with the same light
-        cell = own.pixel_scale / own.n_cells
-        data = psf.psf_image(own, pixel_scale=cell / factor, shape=own.data.shape)
-        return own.replace(data * own.n_cells**2, meta={"width_factor": factor})
+        cell = model.pixel_scale / model.n_cells
+        data = psf.psf_image(model, pixel_scale=cell / factor, shape=model.data.shape)
+        return model.replace(data * model.n_cells**2, meta={"width_factor": factor})
 
     def fluxes(self, name, table, bands):
         """
-        A table whose fluxes are higher or lower by the error of a zero point, with a sign of each band.
+        Change fluxes by the error of a zero point, which has a sign of its own in each band.
 
         Parameters
         ----------
@@ -98,7 +99,7 @@ class Perturbation:
 
     def catalog(self, catalog, filter):
         """
-        The sources as a band shows them: fluxes by its zero point, shifted by its astrometry, clumpy.
+        Return the sources as a band shows them: fluxes by its zero point, shifted by its astrometry, clumpy.
 
         Parameters
         ----------
@@ -118,8 +119,13 @@ class Perturbation:
             real = np.isin(catalog["id"], list(self.stamps))
             catalog["profile"] = np.where(real, "cutout", np.asarray(catalog["profile"]))
         if self.effects.get("clumps"):
-            options = {"share": self.effects["clumps"], "point": self.point_column(filter)}
-            catalog = add_clumps(catalog, filter, seed=self.seed, **options)
+            catalog = add_clumps(
+                catalog,
+                filter,
+                share=self.effects["clumps"],
+                seed=self.seed,
+                point=self.point_column(filter),
+            )
         if self.effects.get("astrometry"):
             catalog = catalog.copy()
             shift = self.effects["astrometry"] * u.arcsec
@@ -128,21 +134,21 @@ class Perturbation:
         return catalog
 
     def point_column(self, filter):
-        """Column of a catalog with the share of the light that is in a point, or None."""
+        """Return the column of a catalog with the share of the light that is in a point, or None."""
         return point_column(filter) if "point_agn" in self.effects else None
 
     @functools.cached_property
     def detector(self):
         """`~miricigale.instrument.DetectorProperties` with another gain and non-linearity."""
-        known = miri_detector()
-        own = known.replace(gain=known.gain * (1.0 + self.effects.get("gain", 0.0)))
+        nominal = miri_detector()
+        detector = nominal.replace(gain=nominal.gain * (1.0 + self.effects.get("gain", 0.0)))
         if self.effects.get("linearity"):
             # at the full well the linear signal is other by the size, at lower ones in proportion
-            terms = np.zeros(max(3, len(known.nonlinearity)))
-            terms[: len(known.nonlinearity)] = known.nonlinearity
-            terms[2] += self.effects["linearity"] / known.saturation_dn
-            own = own.replace(nonlinearity=tuple(terms))
-        return own
+            terms = np.zeros(max(3, len(nominal.nonlinearity)))
+            terms[: len(nominal.nonlinearity)] = nominal.nonlinearity
+            terms[2] += self.effects["linearity"] / nominal.saturation_dn
+            detector = detector.replace(nonlinearity=tuple(terms))
+        return detector
 
     def with_flat(self, image, exposure):
         """
@@ -161,19 +167,20 @@ class Perturbation:
         """
         if self.effects.get("flat"):
             seed = int(self._random("flat").integers(2**31))
-            flat = functools.partial(flat_field, exposure.filter, subarray=exposure.subarray)
-            image.data *= 1.0 + self.effects["flat"] * (flat(seed=seed) / flat() - 1.0)
+            actual = flat_field(exposure.filter, subarray=exposure.subarray, seed=seed)
+            assumed = flat_field(exposure.filter, subarray=exposure.subarray)
+            image.data *= 1.0 + self.effects["flat"] * (actual / assumed - 1.0)
         return image
 
 
 def point_column(filter):
-    """Name of the column with the share of a band's light that is in a point."""
+    """Return the name of the column with the share of a band's light that is in a point."""
     return f"{filter}_point"
 
 
 def perturbed_model(effects, *, agn):
     """
-    The model of the sources of a truth where it is another than that of the fits.
+    Return the model of the sources of a truth where it is another than that of the fits.
 
     With ``"stars"`` the history ends in a burst, and gas shines; with ``"dust"`` dust is that of
     Draine & Li 2007 with its own parameters; with ``"torus"`` the torus is our own parametric one,
@@ -191,22 +198,23 @@ def perturbed_model(effects, *, agn):
     model : `~miricigale.sed.SEDModel` or None
         None where it is the model of the fits.
     """
-    others = {}
+    replaced = {}
     if "stars" in effects:
-        others |= {"sfh": components.DelayedSFH(), "nebular": components.Nebular()}
+        replaced["sfh"] = components.DelayedSFH()
+        replaced["nebular"] = components.Nebular()
     if "dust" in effects:
-        others["dust"] = components.DraineLi2007()
+        replaced["dust"] = components.DraineLi2007()
     if "torus" in effects and agn:
-        others["agn"] = components.ParametricTorus(**TORUS)
-    if not others:
+        replaced["agn"] = components.ParametricTorus(**TORUS)
+    if not replaced:
         return None
-    known = {part.role: part for part in sed.SEDModel.yang2021(agn=agn).components}
-    return sed.SEDModel((known | others).values())
+    parts = {part.role: part for part in sed.SEDModel.yang2021(agn=agn).components}
+    return sed.SEDModel((parts | replaced).values())
 
 
 def perturbed_parameters(effects, table, models, prior, *, seed):
     """
-    Parameters of sources for the model of `perturbed_model`.
+    Draw parameters of sources for the model of `perturbed_model`.
 
     Bursts and dust are drawn for each source from its own random stream, evenly in the logarithm
     of `BURST` and `DUST`; masses are such that the galaxies, without AGN, are as bright in the prior's
@@ -235,25 +243,28 @@ def perturbed_parameters(effects, table, models, prior, *, seed):
             streams = [stream(seed, "perturb", effect, str(key)) for key in table["id"]]
             # each stream gives the first parameter, then the second
             for name, ends in ranges.items():
-                changed[name] = np.array([np.exp(rng.uniform(*np.log(ends))) for rng in streams])
-    pairs = zip(models, (table, changed), strict=True)
-    known, own = (galaxy_light(*pair, [prior])[prior].value for pair in pairs)
-    usable = np.isfinite(known) & np.isfinite(own) & (own > 0)
-    changed["mass"] = changed["mass"] * np.where(usable, known / np.where(usable, own, 1.0), 1.0)
+                low, high = np.log(ends)
+                changed[name] = np.array([np.exp(rng.uniform(low, high)) for rng in streams])
+    # masses that keep the light in the prior's band
+    fitted = galaxy_light(models[0], table, [prior])[prior].value
+    perturbed = galaxy_light(models[1], changed, [prior])[prior].value
+    usable = np.isfinite(fitted) & np.isfinite(perturbed) & (perturbed > 0)
+    ratio = fitted / np.where(usable, perturbed, 1.0)
+    changed["mass"] = changed["mass"] * np.where(usable, ratio, 1.0)
     return changed
 
 
 def galaxy_light(model, parameters, bands):
-    """Fluxes of a model without its AGN; as `~miricigale.sed.SEDModel.fluxes`."""
-    alone = parameters.copy()
+    """Return the fluxes of a model without its AGN; as `~miricigale.sed.SEDModel.fluxes`."""
+    parameters = parameters.copy()
     if model.has_agn:
-        alone["frac_agn"] = np.zeros(len(alone))
-    return model.fluxes(alone, bands)
+        parameters["frac_agn"] = np.zeros(len(parameters))
+    return model.fluxes(parameters, bands)
 
 
 def point_columns(model, parameters, bands):
     """
-    Shares of the light that the AGN have, where they are points at the centers of their galaxies.
+    Return the shares of the light that the AGN have, where they are points at the centers of their galaxies.
 
     Parameters
     ----------
@@ -269,7 +280,11 @@ def point_columns(model, parameters, bands):
     columns : dict of str to `~numpy.ndarray`
         By `point_column`, 0 to 1; 0 where the source has no model.
     """
-    alone, both = galaxy_light(model, parameters, bands), model.fluxes(parameters, bands)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shares = {point_column(b): 1.0 - alone[b].value / both[b].value for b in bands}
-    return {name: np.clip(np.nan_to_num(share), 0.0, 1.0) for name, share in shares.items()}
+    galaxies = galaxy_light(model, parameters, bands)
+    total = model.fluxes(parameters, bands)
+    columns = {}
+    for band in bands:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = 1.0 - galaxies[band].value / total[band].value
+        columns[point_column(band)] = np.clip(np.nan_to_num(share), 0.0, 1.0)
+    return columns

@@ -54,11 +54,11 @@ def check_study(config):
     config.check(not unknown, "fit.bands", wanted, unknown)
     with of_option("[exposures]", KeyError, ValueError):
         exposures = study_exposures(config)
-    number = collections.Counter(exposure.filter for exposure in exposures.values())
-    few = [name for name, n in number.items() if n < 3]
-    good = config.reduction.background != "dithers" or not few
+    counts = collections.Counter(exposure.filter for exposure in exposures.values())
+    sparse = [name for name, n in counts.items() if n < 3]
+    good = config.reduction.background != "dithers" or not sparse
     wanted = "must have three exposures of each filter to be 'dithers'"
-    config.check(good, "reduction.background", wanted, few)
+    config.check(good, "reduction.background", wanted, sparse)
     for exposure in exposures.values():
         with of_option("[scene] background:", KeyError, ValueError, ImportError):
             level = study_background(config, exposure.filter)

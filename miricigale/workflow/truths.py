@@ -67,7 +67,7 @@ class Truth:
 
 def study_truths(config):
     """
-    The truths of a configuration by name.
+    Return the truths of a configuration by name.
 
     The first is the reference: of it the prior image is made and the error functions are measured.
     Perturbed ones follow, of those of ``perturb.of`` one for each effect and one for all of them.
@@ -81,18 +81,25 @@ def study_truths(config):
     -------
     truths : dict of str to `Truth`
     """
-    truths = [Truth(_name(value), value) for value in config.sed.frac_agn]
+    truths = {}
+
+    def add(name, *args):
+        truths[name] = Truth(name, *args)
+
+    for value in config.sed.frac_agn:
+        add(_name(value), value)
     for value in perturbed_values(config):
-        effects, base = _effects(config.perturb, value), _name(value)
-        skies = {effect[0]: (effect,) for effect in effects}
+        effects = _effects(config.perturb, value)
+        base = _name(value)
+        for effect in effects:
+            add(f"{base}+{effect[0]}", value, (effect,), base)
         if config.perturb.together and len(effects) > 1:
-            skies[ALL] = effects
-        truths += [Truth(f"{base}+{label}", value, own, base) for label, own in skies.items()]
-    return {truth.name: truth for truth in truths}
+            add(f"{base}+{ALL}", value, effects, base)
+    return truths
 
 
 def perturbed_values(config):
-    """Values of fracAGN whose truths are perturbed."""
+    """Return the values of fracAGN whose truths are perturbed."""
     if not config.perturb.effects:
         return ()
     return config.perturb.of or config.sed.frac_agn[:1]
@@ -103,30 +110,36 @@ def _name(frac_agn):
 
 
 def _effects(options, frac_agn):
-    """Effects on a truth and their sizes, in the order of `EFFECTS`."""
+    """Return effects on a truth and their sizes, in the order of `EFFECTS`."""
     sizes = dataclasses.asdict(options)
     sizes[CUTOUTS] = {
-        "image": options.cutouts, "psf": options.cutouts_psf, "of": options.cutouts_of
-    }  # fmt: skip
-    chosen = [n for n in EFFECTS if n in options.effects or ALL in options.effects]
-    if not options.cutouts:
-        chosen = [name for name in chosen if name != CUTOUTS]
-    return tuple((n, sizes.get(n)) for n in chosen if frac_agn != 0 or n not in NEEDS_AGN)
+        "image": options.cutouts,
+        "psf": options.cutouts_psf,
+        "of": options.cutouts_of,
+    }
+    effects = []
+    for name in EFFECTS:
+        chosen = name in options.effects or ALL in options.effects
+        has_image = options.cutouts or name != CUTOUTS
+        has_agn = frac_agn != 0 or name not in NEEDS_AGN
+        if chosen and has_image and has_agn:
+            effects.append((name, sizes.get(name)))
+    return tuple(effects)
 
 
 def truth_names(config):
-    """Names of the truths."""
+    """Return the names of the truths."""
     return tuple(study_truths(config))
 
 
 def reference(config):
-    """Name of the truth that gives the prior image and the error functions."""
+    """Return the name of the truth that gives the prior image and the error functions."""
     return truth_names(config)[0]
 
 
 def band_sets(config):
     """
-    MIRI bands of each fit.
+    Return the MIRI bands of each fit.
 
     Parameters
     ----------
@@ -142,13 +155,16 @@ def band_sets(config):
     bands = tuple(config.exposures.filters)
     by_wave = sorted(bands, key=lambda name: Filter.from_name(name).pivot)
     half = (len(by_wave) + 1) // 2
-    chosen = {"all": bands, "none": (), "blue": by_wave[:half], "red": by_wave[half:]}
-    return {name: tuple(b for b in bands if b in chosen[name]) for name in config.fit.sets}
+    members = {"all": bands, "none": (), "blue": by_wave[:half], "red": by_wave[half:]}
+    sets = {}
+    for name in config.fit.sets:
+        sets[name] = tuple(band for band in bands if band in members[name])
+    return sets
 
 
 def unit_names(*parts):
-    """Names of units, ``a/b/...``, of all combinations of some parts; one without a name is left out."""
-    return tuple("/".join(filter(None, one)) for one in itertools.product(*parts))
+    """Return names of units, ``a/b/...``, of all combinations of parts; a part without a name is left out."""
+    return tuple("/".join(filter(None, names)) for names in itertools.product(*parts))
 
 
 def variant_changes(config):
@@ -167,11 +183,12 @@ def variant_changes(config):
         switched, off where the study has it on and on where it has it off. With ramps there is one
         more, ``"rates"``, first: the study's own images by rates, which all others are drawn as.
     """
-    chosen, changes = config.variants.images, {}
-    if chosen and config.exposures.kind == "ramps":
+    images = config.variants.images
+    changes = {}
+    if images and config.exposures.kind == "ramps":
         changes["rates"] = {}
     for name, (section, key, (on, off)) in VARIANTS.items():
-        if name in chosen or ALL in chosen:
+        if name in images or ALL in images:
             value = getattr(getattr(config, section), key)
             changes[name] = {section: {key: off if value else on}}
     return changes

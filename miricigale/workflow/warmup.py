@@ -27,6 +27,7 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def _fit():
+    """Evaluate model spectra, and fit them at a free and at a fixed redshift."""
     import astropy.units as u
     from astropy.table import QTable
 
@@ -39,15 +40,19 @@ def _fit():
     # with frac_agn = 0 the AGN would be skipped
     table["frac_agn"] = [0.4]
     SEDModel.yang2021().fluxes(table, bands)
-    axes = {name: values[:2] for name, values in SEDModel.yang2021_axes("quick").items()}
+    axes = SEDModel.yang2021_axes("quick")
+    for name in axes:
+        axes[name] = axes[name][:2]
     fitter = BayesFitter(SEDModel.yang2021(), bands, axes=axes, model_error=0.1)
     for k, name in enumerate(bands):
-        table[name], table[f"{name}_err"] = [1.0 + k] * u.uJy, [0.5] * u.uJy
+        table[name] = [1.0 + k] * u.uJy
+        table[f"{name}_err"] = [0.5] * u.uJy
     fitter.fit(table)
     fitter.fit(table, redshift="redshift")
 
 
 def _images():
+    """Expose, reduce and drizzle a galaxy and a star, and draw the prior."""
     import astropy.units as u
     from astropy.coordinates import SkyCoord
 
@@ -61,18 +66,22 @@ def _images():
     # options that are off by default call further kernels
     overrides = {"detector": {"residual": 0.01}}
     config = load_config("goodss", quick=True, overrides=overrides)
-    where = {"subarray": "SUB64", "pointing": center, "roll": 0 * u.deg}
-    exposure = Exposure("miri.f770w", n_groups=12, **where)
+    exposure = Exposure(
+        "miri.f770w", n_groups=12, subarray="SUB64", pointing=center, roll=0 * u.deg
+    )
     catalog = point_catalog(exposure, 3 * u.uJy, config.highres.filter, spacing=100, seed=1)[:2]
     # a galaxy and a star
     catalog["sky"] = center.directional_offset_by(45 * u.deg, [0, 1.4] * u.arcsec)
     catalog["profile"] = ["sersic", "point"]
     catalog["half_light_radius"] = [0.3, 0.0] * u.arcsec
-    ramps, images = [], []
+    ramps = []
+    images = []
     for n in (1, 2):
-        for one in exposure.replace(n_integrations=n).dithered("ceers", 2):
-            options = {"seed": 1, "n_threads": 2, "keep": ramps.append}
-            images.append(expose_and_reduce(config, one, catalog, **options)[1])
+        for dither in exposure.replace(n_integrations=n).dithered("ceers", 2):
+            _, image = expose_and_reduce(
+                config, dither, catalog, seed=1, n_threads=2, keep=ramps.append
+            )
+            images.append(image)
     # low thresholds, so that few pixels contain large jumps
     Reducer(jump_threshold=2.0, ramps=RampSettings(neighbor_threshold=2.0)).fit_ramp(ramps[0])
     grid = north_up_wcs(center, 0.06 * u.arcsec, (128, 128))
@@ -81,6 +90,7 @@ def _images():
 
 
 def _photometry():
+    """Detect and measure three sources, wider than the PSF, so that profiles are fitted."""
     import astropy.units as u
     import numpy as np
     from astropy.coordinates import SkyCoord
@@ -101,20 +111,26 @@ def _photometry():
         light = 0.03 * gaussian_filter(rng.standard_normal(y.shape), 1.0)
         for px, py in zip(*wcs.world_to_pixel(sky), strict=True):
             light += np.exp(-0.5 * ((x - px) ** 2 + (y - py) ** 2) / width**2)
-        options = {"unit": "MJy/sr", "wcs": wcs, "mask": np.zeros(y.shape, bool)}
-        errors = StdDevUncertainty(np.full(y.shape, 0.01, np.float32))
-        return CCDData(np.asarray(light, np.float32), uncertainty=errors, **options)
+        return CCDData(
+            np.asarray(light, np.float32),
+            uncertainty=StdDevUncertainty(np.full(y.shape, 0.01, np.float32)),
+            unit="MJy/sr",
+            wcs=wcs,
+            mask=np.zeros(y.shape, bool),
+        )
 
-    # wider than the PSF, so that profiles are fitted
-    fine, native = 0.06 * u.arcsec, 0.11 * u.arcsec
-    prior, mosaic = image(fine, 132, 2.5), image(native, 72, 1.8)
+    fine = 0.06 * u.arcsec
+    native = 0.11 * u.arcsec
+    prior = image(fine, 132, 2.5)
+    mosaic = image(native, 72, 1.8)
     kernel = MatchingKernel.from_psfs(
         gaussian_psf(0.2 * u.arcsec, pixel_scale=fine, fov=3 * u.arcsec),
         gaussian_psf(0.3 * u.arcsec, pixel_scale=native, fov=3 * u.arcsec),
         pixel_scale=fine,
     )
     photometer = ForcedPhotometer(kernel, background_order=0)
-    photometer.measure(mosaic, prior, *detect_sources(prior, threshold=10))
+    segments, sources = detect_sources(prior, threshold=10)
+    photometer.measure(mosaic, prior, segments, sources)
 
 
 #: What is compiled together: what it is, and about how many seconds it takes on a slow machine.
@@ -218,17 +234,27 @@ def _cache_folder():
 
 
 def _numba_folder():
-    """Where numba keeps compiled code that it cannot keep beside the source."""
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(named or Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "numba")
+    """Return the folder of compiled code that numba cannot keep with the source."""
+    folder = os.environ.get("NUMBA_CACHE_DIR")
+    if folder:
+        return Path(folder)
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "numba"
 
 
 def _key():
-    """What the compiled code depends on: the sources as numba sees them, packages, processor."""
-    processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    parts = [str(_PACKAGE), sys.version, *processor, os.environ.get("NUMBA_CPU_NAME", "")]
-    parts += [importlib.metadata.version(name) for name in ("numba", "llvmlite", "numpy")]
-    for path in sorted([*_PACKAGE.glob("*/_core.py"), *_PACKAGE.glob("*/_core/*.py")]):
+    """Return a hash of what compiled code depends on: sources as numba sees them, packages, processor."""
+    parts = [
+        str(_PACKAGE),
+        sys.version,
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+        os.environ.get("NUMBA_CPU_NAME", ""),
+    ]
+    for name in ("numba", "llvmlite", "numpy"):
+        parts.append(importlib.metadata.version(name))
+    sources = list(_PACKAGE.glob("*/_core.py"))
+    sources += _PACKAGE.glob("*/_core/*.py")
+    for path in sorted(sources):
         state = path.stat()
         parts.append(f"{path.relative_to(_PACKAGE)} {state.st_size} {state.st_mtime_ns}")
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
