@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import binary_propagation, gaussian_filter
 
-from miricigale.reduction.sky.sky_mask import cells_of, pixels_of
+from miricigale.reduction.images.cells import cells_of, pixels_of
 
 # sides of cells in pixels, the Gaussian width, in cells, by which they are smoothed, a factor on the threshold: an
 # afterglow is as wide as the image of a star, a shower some tens of pixels; where few pixels add up, errors

@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 
 from miricigale.instrument import DQ, ImageFacts
+from miricigale.reduction.images.cells import cells_of, pixels_of
 from miricigale.reduction.images.images import flag_pixels, plain_mask, sigma, with_data
-from miricigale.reduction.sky.sky_mask import cells_of, detect, grown, light_left, pixels_of
+from miricigale.reduction.sky.sky_mask import detect, grown, light_left
 from miricigale.reduction.sky.sky_mesh import SkyMesh, sky_boxes
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import ReductionWarning, warn

@@ -4,14 +4,15 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, label
 from scipy.stats import norm
 
+from miricigale.reduction.images.cells import cells_of, pixels_of
+
 # detection of what is masked: standard deviations of the smoothing in pixels (cores, and
 # the wings of bright sources), and the least number of connected pixels: those of the smoothing
 _TIERS = ((0.85, 5), (2.5, 20))
 # sigma by which sources rise above the sky
 _THRESHOLD = 3.0
-# light too faint and wide for these is looked for in cells of so many pixels: standard deviations of the
+# light too faint and wide for these is looked for in cells (of 4 pixels a side): standard deviations of the
 # smoothing in cells, least numbers of connected ones, and sigma
-_CELL = 4
 _WIDE_TIERS = ((1.0, 3, 3.0), (2.0, 12, 6.0))
 # the mask of the sources is dilated by this many pixels
 _GROW = 3
@@ -29,34 +30,6 @@ _STRUCTURE = 20.0
 # as measured (benchmarks/background.py)
 _MASKED = 0.5
 _WIDE = 2.5
-
-
-def cells_of(values, weight=None, size=_CELL):
-    """Mean of an image in cells, and the share of a cell that counts; without a weight, the share alone."""
-    if weight is None:
-        return _added(values.astype(np.uint8), size) / np.float32(size**2)
-    total = _added(np.where(weight, values, np.float32(0)), size)
-    count = _added(weight.astype(np.uint8), size)
-    return total / np.maximum(count, 1), count / np.float32(size**2)
-
-
-def _added(values, size):
-    """Sums over cells; what is beyond the edge is zero."""
-    padding = [(0, -n % size) for n in values.shape]
-    if any(end for _, end in padding):
-        values = np.pad(values, padding)
-    rows = values[::size] + values[1::size]
-    for k in range(2, size):
-        rows += values[k::size]
-    # sums of neighbors as a product of matrices
-    pairs = rows.astype(np.float32, copy=False).reshape(-1, size)
-    return (pairs @ np.ones(size, np.float32)).reshape(len(rows), -1)
-
-
-def pixels_of(cells, shape, size=_CELL):
-    """Pixels of cells."""
-    wide = np.repeat(np.repeat(cells, size, axis=0), size, axis=1)
-    return wide[: shape[0], : shape[1]]
 
 
 def detect(residual, rms, mask, sources):

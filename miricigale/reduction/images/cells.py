@@ -1,0 +1,34 @@
+"""Images in square cells of pixels."""
+
+import numpy as np
+
+#: Pixels along a side of a cell.
+CELL = 4
+
+
+def cells_of(values, weight=None, size=CELL):
+    """Mean of an image in cells, and the share of a cell that counts; without a weight, the share alone."""
+    if weight is None:
+        return _added(values.astype(np.uint8), size) / np.float32(size**2)
+    total = _added(np.where(weight, values, np.float32(0)), size)
+    count = _added(weight.astype(np.uint8), size)
+    return total / np.maximum(count, 1), count / np.float32(size**2)
+
+
+def _added(values, size):
+    """Sums over cells; what is beyond the edge is zero."""
+    padding = [(0, -n % size) for n in values.shape]
+    if any(end for _, end in padding):
+        values = np.pad(values, padding)
+    rows = values[::size] + values[1::size]
+    for k in range(2, size):
+        rows += values[k::size]
+    # sums of neighbors as a product of matrices
+    pairs = rows.astype(np.float32, copy=False).reshape(-1, size)
+    return (pairs @ np.ones(size, np.float32)).reshape(len(rows), -1)
+
+
+def pixels_of(cells, shape, size=CELL):
+    """Pixels of cells."""
+    wide = np.repeat(np.repeat(cells, size, axis=0), size, axis=1)
+    return wide[: shape[0], : shape[1]]
