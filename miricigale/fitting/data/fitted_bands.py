@@ -9,7 +9,7 @@ from miricigale.utils.tables import as_table, error_column
 
 def bands_of(photometry):
     """
-    Bands of a catalog that can be fitted: those of known filters that have an error.
+    Find the bands of a catalog that can be fitted: those of known filters that have an error.
 
     Parameters
     ----------
@@ -29,19 +29,19 @@ def bands_of(photometry):
     table = as_table(photometry, "photometry")
     ours = our_names(table.colnames, "photometry")
     bands = bands_with_errors([ours.get(name, name) for name in table.colnames], "photometry")
-    taken = {name for name, our in ours.items() if our in bands}
-    return bands, unused_bands(table, {*bands, *taken})
+    catalog_names = {name for name, our in ours.items() if our in bands}
+    return bands, unused_bands(table, {*bands, *catalog_names})
 
 
 def warn_of_unfitted(unused):
     """Warn of bands of a catalog that cannot be fitted."""
     if unused:
-        why = "as their names ('miricigale filters') or errors are missing"
-        warn(f"bands of the photometry are not fitted, {why}: {', '.join(unused)}", FitWarning)
+        reason = "as their names ('miricigale filters') or errors are missing"
+        warn(f"bands of the photometry are not fitted, {reason}: {', '.join(unused)}", FitWarning)
 
 
 def bands_with_errors(names, argument):
-    """Of our names of columns those of bands that have an error: list of str, one at least."""
+    """Select, from our names of columns, the bands that have an error: list of str, at least one."""
     bands = [name for name in names if is_filter(name) and error_column(name) in names]
     wanted = "a table with columns <filter> and <filter>_err ('miricigale filters' lists the names)"
     check_that(bands, argument, wanted, f"columns {list(names)}")

@@ -13,14 +13,18 @@ from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, flux_unit, to_array
 
-#: S/N of the best model in all bands together below which an object is flagged, and reduced chi2 above which.
-LOW_SIGNAL, HIGH_CHI2 = 3.0, 100.0
+#: S/N of the best model in all bands together below which an object is flagged.
+LOW_SIGNAL = 3.0
+#: Largest limit of the reduced chi2 above which an object is flagged.
+HIGH_CHI2 = 100.0
 #: Stellar mass in solar masses below which an object is flagged.
 LOW_MASS = 3e6
-#: Least error in units of the flux: below it chi2 in double precision has no digits left.
-_LEAST_ERROR = 1e-6
-#: Least and largest error, and largest flux, in uJy; beyond, their squares are no numbers.
-_SMALL, _LARGE = 1e-60, 1e60
+#: Smallest error in units of the flux: below it chi2 in double precision has no digits left.
+_MIN_RELATIVE_ERROR = 1e-6
+#: Smallest error in uJy; the squares of smaller ones underflow.
+_MIN_ERROR = 1e-60
+#: Largest flux and error in uJy; the squares of larger ones overflow.
+_MAX_FLUX = 1e60
 #: Fluxes that are all 0 become negative by this part of their error; see `FitData.of_engine`.
 _DARK = 1e-8
 #: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
@@ -202,24 +206,33 @@ class FitData(ObjectRows):
 
     @property
     def columns(self):
-        """What results take over: keywords of `~miricigale.fitting.FitResults`."""
-        taken = ("ids", "flux", "flux_err", "sigma", "limit")
-        return {name: getattr(self, name) for name in taken} | {"n_bands": self.used.sum(axis=1)}
+        """Keywords of `~miricigale.fitting.FitResults` that are taken from the photometry."""
+        fields = ("ids", "flux", "flux_err", "sigma", "limit")
+        return {name: getattr(self, name) for name in fields} | {"n_bands": self.used.sum(axis=1)}
 
     def of_engine(self, log_prior):
-        """Keywords of `~miricigale.fitting.grid.grid.GridEngine.fit`; priors of redshift have the shape (n,
-        nz).
         """
-        flux, measured, limit = np.nan_to_num(self.flux), self.measured, self.limit
+        Return the keywords of `~miricigale.fitting.grid.grid.GridEngine.fit`, fluxes in uJy.
+
+        ``log_prior``, shape (n, nz), is ln of the prior of each redshift of the grid.
+        """
+        flux = np.nan_to_num(self.flux)
+        measured = self.measured
+        limit = self.limit
         signal = np.divide(flux, self.sigma, out=np.zeros(flux.shape), where=measured)
-        # the engine compares directions, of which zeros have none. Just below zero the best scale
-        # of every model is 0 as well, and chi2 is larger by 1e-16 a band
+        # The engine compares the directions of flux vectors, and a vector of zeros has none. Just below
+        # zero the best scale of every model is 0 as well, and chi2 is larger by 1e-16 for each band.
         dark = measured & (np.sum(signal * signal, axis=1) < _NO_SIGNAL)[:, None]
         flux = np.where(dark, -_DARK * self.sigma, flux)
-        out = {"flux": flux, "sigma": np.where(limit, np.inf, self.sigma), "log_prior": log_prior}
+        keywords = {
+            "flux": flux,
+            "sigma": np.where(limit, np.inf, self.sigma),
+            "log_prior": log_prior,
+        }
         if np.any(limit):
-            out |= {"limit": flux, "limit_sigma": np.where(limit, self.sigma, np.inf)}
-        return out
+            keywords["limit"] = flux
+            keywords["limit_sigma"] = np.where(limit, self.sigma, np.inf)
+        return keywords
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,45 +299,62 @@ class PhotometryReader:
             If a flux has no unit of flux density.
         """
         filters = self.fitted(table)
-        columns = [c for name in filters for c in (name, error_column(name))]
+        columns = []
+        for name in filters:
+            columns += [name, error_column(name)]
         require_columns(table, ["id", *columns], "photometry")
         for name in columns:
             if getattr(table[name], "unit", None) is None:
-                how = "no unit: say it, as unit='uJy' of the fit or --flux-unit uJy of the command"
-                raise units_error("photometry", f"convertible to {FNU}", how, column=name)
+                got = "no unit: say it, as unit='uJy' of the fit or --flux-unit uJy of the command"
+                raise units_error("photometry", f"convertible to {FNU}", got, column=name)
         require_columns(table, [], "photometry", units=dict.fromkeys(columns, FNU))
         n = len(table)
         shape = (n, len(self.bands))
-        flux, err, sigma = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.inf)
+        flux = np.full(shape, np.nan)
+        flux_err = np.full(shape, np.nan)
+        sigma = np.full(shape, np.inf)
         limit = np.zeros(shape, dtype=bool)
         flags = np.zeros(n, dtype=int)
         for name in filters:
-            i, floor = self.bands.index(name), self.error_floor[name]
-            point = self.zero_point.get(name, 1.0)
-            f = point * flux_column(table, name)
-            e = point * self.error_factor.get(name, 1.0) * flux_column(table, error_column(name))
-            has_flux = np.abs(f) < _LARGE
-            known = (e > _SMALL) & (e < _LARGE)
-            flags[~np.isnan(f) & ~has_flux] |= int(FitFlags.BAD_FLUX)
+            column = self.bands.index(name)
+            floor = self.error_floor[name]
+            zero_point = self.zero_point.get(name, 1.0)
+            band_flux = zero_point * flux_column(table, name)
+            band_err = (
+                zero_point
+                * self.error_factor.get(name, 1.0)
+                * flux_column(table, error_column(name))
+            )
+            has_flux = np.abs(band_flux) < _MAX_FLUX
+            has_error = (band_err > _MIN_ERROR) & (band_err < _MAX_FLUX)
+            flags[~np.isnan(band_flux) & ~has_flux] |= int(FitFlags.BAD_FLUX)
             # a flux without error is a missing band; an error that cannot be used is flagged
-            flags[has_flux & ~known & ~np.isnan(e)] |= int(FitFlags.BAD_ERROR)
-            good = has_flux & known
-            flux[:, i], err[:, i] = f, e
-            size = np.abs(np.where(good, f, 0.0))
-            own = np.where(good, e, 1.0)
-            total = np.hypot(np.maximum(own, floor * size), self.model_error[name] * size)
-            limit[:, i] = good & limits(table, name)
-            total = np.maximum(np.where(limit[:, i], own, total), _LEAST_ERROR * size)
-            sigma[:, i] = np.where(good, total, np.inf)
+            flags[has_flux & ~has_error & ~np.isnan(band_err)] |= int(FitFlags.BAD_ERROR)
+            usable = has_flux & has_error
+            flux[:, column] = band_flux
+            flux_err[:, column] = band_err
+            abs_flux = np.abs(np.where(usable, band_flux, 0.0))
+            own_err = np.where(usable, band_err, 1.0)
+            total_err = np.hypot(
+                np.maximum(own_err, floor * abs_flux), self.model_error[name] * abs_flux
+            )
+            limit[:, column] = usable & limits(table, name)
+            total_err = np.maximum(
+                np.where(limit[:, column], own_err, total_err), _MIN_RELATIVE_ERROR * abs_flux
+            )
+            sigma[:, column] = np.where(usable, total_err, np.inf)
         n_bands = np.isfinite(sigma).sum(axis=1)
         flags[(n_bands > 0) & (n_bands == limit.sum(axis=1))] |= int(FitFlags.ALL_LIMITS)
         flags[n_bands == 0] |= int(FitFlags.NO_BAND)
         flags[(n_bands > 0) & (n_bands < self.n_bands_min)] |= int(FitFlags.FEW_BANDS)
         ids = read_ids(table)
-        first = np.zeros(n, dtype=bool)
-        first[np.unique(ids, return_index=True)[1]] = True
-        flags[~first if repeated is None else ~first | repeated] |= int(FitFlags.DUPLICATE_ID)
-        return FitData(ids, flux, err, sigma, limit, flags)
+        first_of_id = np.zeros(n, dtype=bool)
+        first_of_id[np.unique(ids, return_index=True)[1]] = True
+        is_duplicate = ~first_of_id
+        if repeated is not None:
+            is_duplicate |= repeated
+        flags[is_duplicate] |= int(FitFlags.DUPLICATE_ID)
+        return FitData(ids, flux, flux_err, sigma, limit, flags)
 
 
 def unused_bands(table, filters):
@@ -340,8 +370,11 @@ def unused_bands(table, filters):
         pair = (name, error_column(name))
         return columns.issuperset(pair) and all(_is_flux(table[column]) for column in pair)
 
-    others = (name for name in table.colnames if name not in filters and not is_nucleus(name))
-    return [name for name in others if is_filter(name) or measured(name)]
+    candidates = []
+    for name in table.colnames:
+        if name not in filters and not is_nucleus(name):
+            candidates.append(name)
+    return [name for name in candidates if is_filter(name) or measured(name)]
 
 
 def is_nucleus(name):
@@ -378,16 +411,17 @@ def limits(table, name):
         return np.zeros(len(table), dtype=bool)
     values = table[column]
     mask = np.asarray(getattr(values, "mask", False))
-    plain = np.asarray(getattr(values, "unmasked", np.ma.getdata(values)))
-    text = np.char.strip(np.char.lower(plain.astype(str)))
-    limit, known = np.isin(text, _TRUE), np.isin(text, (*_TRUE, *_FALSE))
+    data_values = np.asarray(getattr(values, "unmasked", np.ma.getdata(values)))
+    text = np.char.strip(np.char.lower(data_values.astype(str)))
+    is_true = np.isin(text, _TRUE)
+    is_readable = np.isin(text, (*_TRUE, *_FALSE))
     if getattr(values, "unit", None) is not None:
-        known = limit = np.zeros(len(table), dtype=bool)
-    if plain.shape != (len(table),) or not np.all(known | mask):
+        is_readable = is_true = np.zeros(len(table), dtype=bool)
+    if data_values.shape != (len(table),) or not np.all(is_readable | mask):
         wanted = f"a table whose column {column!r} is boolean"
-        some = ", ".join(str(value) for value in values[:3])
-        raise argument_error("photometry", wanted, f"{some}, ...")
-    return limit & ~mask
+        first_values = ", ".join(str(value) for value in values[:3])
+        raise argument_error("photometry", wanted, f"{first_values}, ...")
+    return is_true & ~mask
 
 
 def filter_names(argument, filters):
@@ -399,12 +433,15 @@ def filter_names(argument, filters):
 
 def per_band(value, filters, name):
     """A setting by filter, dict of str to float: given as a number or by name."""
-    given = value if isinstance(value, dict) else dict.fromkeys(filters, value)
-    unknown = sorted(set(given) - set(filters))
+    if isinstance(value, dict):
+        parts = value
+    else:
+        parts = dict.fromkeys(filters, value)
+    unknown = sorted(set(parts) - set(filters))
     check_that(not unknown, name, f"a dict with keys among {list(filters)}", unknown)
     # 10 % is 0.1
     unit = u.dimensionless_unscaled
-    out = {f: float(to_array(given.get(f, 0.0), unit, name, ndim=0)) for f in filters}
+    out = {f: float(to_array(parts.get(f, 0.0), unit, name, ndim=0)) for f in filters}
     if not all(np.isfinite(part) and part >= 0 for part in out.values()):
         raise argument_error(name, "finite and not negative", f"{value}")
     return out
@@ -434,7 +471,9 @@ def flags_of_fits(results, measured, edge_weight):
     ``measured`` are the bands with a flux, shape (n, nb); ``edge_weight`` is the weight of the first
     or last redshift above which an object is flagged, None where redshifts were fixed.
     """
-    flags, fitted, pdf = np.array(results.flags), results.fitted, results.pdf["redshift"]
+    flags = np.array(results.flags)
+    fitted = results.fitted
+    pdf = results.pdf["redshift"]
     signal = np.where(measured, results.best_flux / results.sigma, 0.0)
     with np.errstate(invalid="ignore"):
         flags[fitted & (results.band_off != "")] |= FitFlags.BAND_OFF

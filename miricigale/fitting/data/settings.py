@@ -8,7 +8,7 @@ from miricigale.utils.options import check_that
 from miricigale.utils.units import check_count, is_number
 
 #: Largest effective number of models between the nodes for an object.
-_MOST_MODELS = 20_000
+_MAX_MODELS = 20_000
 
 
 @dataclass(frozen=True)
@@ -90,18 +90,23 @@ class GridSettings:
         def check(name, good, wanted):
             check_that(good, name, wanted, repr(getattr(self, name)))
 
-        near, error, finer = self.redshift_tolerance, self.agn_error, self.finer
+        tolerance = self.redshift_tolerance
+        agn_err = self.agn_error
+        finer = self.finer
         check("rtol", is_number(self.rtol) and 0 <= self.rtol < 0.1, "in [0, 0.1)")
-        check("redshift_tolerance", near is None or (is_number(near) and near >= 0), ">= 0")
-        most = check_count(self.interpolate, "interpolate", least=0)
-        check("interpolate", most <= _MOST_MODELS, f"at most {_MOST_MODELS}")
-        good = is_number(error) and error >= 0 and (most or not error)
-        check("agn_error", good, "0 or more, and 0 without 'interpolate'")
+        is_tolerance = tolerance is None or (is_number(tolerance) and tolerance >= 0)
+        check("redshift_tolerance", is_tolerance, ">= 0")
+        n_models = check_count(self.interpolate, "interpolate", least=0)
+        check("interpolate", n_models <= _MAX_MODELS, f"at most {_MAX_MODELS}")
+        is_valid = is_number(agn_err) and agn_err >= 0 and (n_models or not agn_err)
+        check("agn_error", is_valid, "0 or more, and 0 without 'interpolate'")
         check("agn_bins", isinstance(self.agn_bins, AGNBins | None), "AGNBins or None")
         stars = self.nuclear_stars
         check("nuclear_stars", is_number(stars) and 0 <= stars < 10, "in [0, 10)")
-        wanted = "an SEDModel" if most else "None without 'interpolate'"
-        check("finer", finer is None or (most and isinstance(finer, SEDModel)), wanted)
+        wanted = "None without 'interpolate'"
+        if n_models:
+            wanted = "an SEDModel"
+        check("finer", finer is None or (n_models and isinstance(finer, SEDModel)), wanted)
 
 
 @dataclass(frozen=True)
@@ -147,6 +152,6 @@ class SamplerSettings:
     options: dict = field(default_factory=dict)
 
     def __post_init__(self):
-        least = {"n_live": 10, "n_effective": 1, "max_calls": 1, "n_draws": 1, "n_cells": 2}
-        for name, value in least.items():
-            check_count(getattr(self, name), name, value)
+        minima = {"n_live": 10, "n_effective": 1, "max_calls": 1, "n_draws": 1, "n_cells": 2}
+        for name, minimum in minima.items():
+            check_count(getattr(self, name), name, minimum)

@@ -53,7 +53,8 @@ class TemplateError:
     error: np.ndarray
 
     def __post_init__(self):
-        wave, error = to_array(self.wave, WAVE, "wave", ndim=1), floats(self.error)
+        wave = to_array(self.wave, WAVE, "wave", ndim=1)
+        error = floats(self.error)
         if wave.size == 0 or not (wave[0] > 0 and np.all(np.diff(wave) > 0)):
             raise argument_error("wave", "ascending values above 0", f"{wave}")
         if error.shape != wave.shape or not np.all(np.isfinite(error) & (error >= 0)):
@@ -80,13 +81,14 @@ class TemplateError:
 
 
 def pivots(filters):
-    """Pivot wavelengths of a `FilterSet`, or of bands by name."""
-    filters = filters if isinstance(filters, FilterSet) else FilterSet.from_names(filters)
-    return u.Quantity([one.pivot for one in filters]).to(WAVE)
+    """Return the pivot wavelengths (um) of a `FilterSet`, or of bands by name: Quantity, shape (nb,)."""
+    if not isinstance(filters, FilterSet):
+        filters = FilterSet.from_names(filters)
+    return u.Quantity([band.pivot for band in filters]).to(WAVE)
 
 
 def grid_errors(template_error, filters, redshift):
-    """Template errors of bands at the redshifts of a grid, 0 without: shape (nz, nb)."""
+    """Evaluate the template error, as a part of the flux, at the redshifts of a grid: shape (nz, nb)."""
     if template_error is None:
         return np.zeros((len(redshift), len(filters)))
     check_kind(template_error, "template_error", TemplateError)
