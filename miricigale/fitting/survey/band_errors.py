@@ -112,13 +112,17 @@ def instrument_of(band):
     instrument = name.split("_")[0]
     if instrument == "jwst":
         long = pivots([band]).to_value(WAVE)[0] > _LONG_PIVOT
-        return "miri" if long else "nircam"
+        if long:
+            return "miri"
+        return "nircam"
     return instrument
 
 
 def prior_of_band(band):
     """Return the prior of the errors of a band, a `BandErrorPrior`: that of MIRI, or of all others."""
-    return MIRI_PRIOR if instrument_of(band) == "miri" else DEFAULT_PRIOR
+    if instrument_of(band) == "miri":
+        return MIRI_PRIOR
+    return DEFAULT_PRIOR
 
 
 def long_instruments(bands):
@@ -140,13 +144,17 @@ def long_instruments(bands):
     by_instrument = {}
     for band in bands:
         by_instrument.setdefault(instrument_of(band), []).append(band)
-    wave = dict(zip(bands, pivots(bands).to_value(WAVE), strict=True)) if bands else {}
+    wave = {}
+    if bands:
+        wave = dict(zip(bands, pivots(bands).to_value(WAVE), strict=True))
     groups = []
     for group in by_instrument.values():
         if min(wave[band] for band in group) > _LONG_PIVOT:
             groups.append(group)
     n_long = sum(len(group) for group in groups)
-    return groups if len(bands) - n_long >= MIN_PREDICTING_BANDS else []
+    if len(bands) - n_long >= MIN_PREDICTING_BANDS:
+        return groups
+    return []
 
 
 def left_out_predictions(results):
@@ -177,10 +185,10 @@ def left_out_predictions(results):
     with np.errstate(all="ignore"):
         usable = results.fitted[:, None] & (mean > 0) & (std < _MAX_SPREAD * sigma)
         # s^2 over sigma^2 - s^2: 0 of bands that were not fitted
-        own = 1.0 / (np.square(sigma / std) - 1.0)
-        own = np.where(fitted, own, 0.0)
-        predicted = mean + own * (mean - flux)
-        predicted_std = std * np.sqrt(1.0 + own)
+        leverage = 1.0 / (np.square(sigma / std) - 1.0)
+        leverage = np.where(fitted, leverage, 0.0)
+        predicted = mean + leverage * (mean - flux)
+        predicted_std = std * np.sqrt(1.0 + leverage)
         usable &= (predicted > 0) & (
             _others_chi2(results, fitted, mean, std) < _largest_chi2(results)
         )
@@ -194,9 +202,9 @@ def _others_chi2(results, fitted, mean, std):
     Without a flux chi2 falls by the square of its pull about what the others predict (Cook & Weisberg 1982).
     """
     variance = np.square(results.sigma) - np.square(std)
-    own = np.where(fitted, np.square(results.flux - mean) / variance, 0.0)
+    own_chi2 = np.where(fitted, np.square(results.flux - mean) / variance, 0.0)
     n_others = fitted.sum(axis=1)[:, None] - fitted
-    chi2 = results.chi2[:, None] - own
+    chi2 = results.chi2[:, None] - own_chi2
     return np.maximum(chi2, 0.0) / np.maximum(n_others - 1, 1)
 
 
@@ -204,7 +212,9 @@ def _largest_chi2(results):
     """Reduced chi2 above which a fit predicts nothing: 4, or 4 times that of half of the catalog."""
     chi2 = np.asarray(results.reduced_chi2, dtype=float)
     chi2 = chi2[results.fitted & np.isfinite(chi2)]
-    median = np.median(chi2) if chi2.size else 0.0
+    median = 0.0
+    if chi2.size:
+        median = np.median(chi2)
     return MAX_REDUCED_CHI2 * max(1.0, median)
 
 
@@ -238,10 +248,15 @@ class PredictedFluxes:
     def concatenate(cls, samples):
         """Join the fluxes of several bands."""
         names = ("flux", "flux_err", "predicted", "predicted_std", "model_error")
-        return cls(*(np.concatenate([getattr(one, name) for one in samples]) for name in names))
+        columns = {}
+        for name in names:
+            columns[name] = np.concatenate([getattr(sample, name) for sample in samples])
+        return cls(**columns)
 
 
-def select_fluxes(flux, flux_err, predicted, predicted_std, rest, template_error, longest=None):
+def select_fluxes(
+    flux, flux_err, predicted, predicted_std, rest_wave, template_error, longest=None
+):
     """
     Choose the fluxes of a band that say how large its errors are.
 
@@ -265,16 +280,17 @@ def select_fluxes(flux, flux_err, predicted, predicted_std, rest, template_error
     -------
     fluxes : `PredictedFluxes`
     """
-    longest = LONGEST_REST if longest is None else longest
+    if longest is None:
+        longest = LONGEST_REST
     with np.errstate(invalid="ignore"):
         good = np.isfinite(flux) & (flux_err > 0) & np.isfinite(flux_err)
         good &= (predicted > MIN_SIGNAL * flux_err) & np.isfinite(predicted_std)
-        good &= (rest > SHORTEST_REST) & (rest < longest)
+        good &= (rest_wave > SHORTEST_REST) & (rest_wave < longest)
     columns = [values[good] for values in (flux, flux_err, predicted, predicted_std)]
     if template_error is None:
         model_error = np.zeros(np.count_nonzero(good))
     else:
-        model_error = template_error(rest[good] * WAVE)
+        model_error = template_error(rest_wave[good] * WAVE)
     return PredictedFluxes(*columns, model_error)
 
 
@@ -304,10 +320,12 @@ def estimate_band_errors(fluxes, prior):
     scatter = np.array([prior.factor_scatter, prior.part_scatter, 1.0, 1.0])
     if has_zero_point:
         scatter[3] = prior.zero_point_scatter
-    n_free = 4 if has_zero_point else 3
+    n_free = 3
+    if has_zero_point:
+        n_free = 4
 
-    def minus_log_posterior(free):
-        values = np.array([*free, 0.0])[:4]
+    def minus_log_posterior(free_values):
+        values = np.array([*free_values, 0.0])[:4]
         ln_factor, ln_part, logit_wrong, ln_zero = values
         wrong = expit(logit_wrong)
         log_right = np.log1p(-wrong)
@@ -441,7 +459,10 @@ def relative_zero_points(errors, reference=None):
     -------
     errors : dict of str to `BandErrors`
     """
-    measured = [band for band, found in errors.items() if found.n > 0 and found.zero_point_err > 0]
+    measured = []
+    for band, band_errors in errors.items():
+        if band_errors.n > 0 and band_errors.zero_point_err > 0:
+            measured.append(band)
     if not measured:
         return errors
     if reference is None:

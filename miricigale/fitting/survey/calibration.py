@@ -25,13 +25,15 @@ from miricigale.utils.units import FNU, WAVE, to_array
 
 _COLUMNS = declared("miricigale.fitting", "columns.toml")["zero_points"]
 #: Fluxes of lower S/N say more of their noise than of the models.
-_LEAST_SIGNAL = 5.0
-#: Least number of such fluxes for what is measured by band, and in a bin of rest wavelength.
-_N_BAND, _N_BIN = 30, 10
+_MIN_SIGNAL = 5.0
+#: Smallest number of such fluxes for what is measured by band.
+_N_BAND = 30
+#: Smallest number of such fluxes in a bin of rest wavelength.
+_N_BIN = 10
 #: Median of the absolute value of a normal deviate.
 _MEDIAN = 0.6744897501960817
-#: Largest template error that is looked for.
-_MOST = 10.0
+#: Largest template error that is looked for, as a part of the flux.
+_MAX_ERROR = 10.0
 #: Edges in um of the bins of rest wavelength; wider where few bands fall.
 _EDGES = (0.09, 0.17, 0.22, 0.28, 0.36, 0.45, 0.6, 0.8, 1.1, 1.5, 2.0, 2.6, 3.6, 5.5, 12.0)
 
@@ -42,35 +44,42 @@ def _check_known(results):
 
 
 def _residuals(results):
-    """Fluxes, errors, best models and pivots of fits at known redshifts, and which fluxes count."""
+    """Return fluxes, errors and best models of fits at known redshifts, in uJy, and which fluxes count."""
     _check_known(results)
-    flux, error, model = results.flux, results.flux_err, results.best_flux
+    flux = results.flux
+    error = results.flux_err
+    model = results.best_flux
     with np.errstate(invalid="ignore"):
         good = results.fitted[:, None] & np.isfinite(results.sigma) & ~results.limit & (model > 0)
-        good &= flux > _LEAST_SIGNAL * error
+        good &= flux > _MIN_SIGNAL * error
     return flux, error, model, good
 
 
-def _rest(results):
-    """Rest wavelengths in um of the bands of all objects, shape (n, nb)."""
+def _rest_wavelengths(results):
+    """Compute the rest wavelengths in um of the bands of all objects, shape (n, nb)."""
     return pivots(results.filters).value / (1.0 + results.best["redshift"].value[:, None])
 
 
 def _excess(flux, error, model, scatter):
     """
-    What has to be added to errors, as a part of the flux, for residuals to have a normal median.
+    Solve for the part of the flux to add to errors for residuals to have a normal median.
 
     Residuals of models drawn from the posteriors, Gaussians about their means: half of these draws are to be
     within the median of abs(flux - model) of the errors.
     """
-    apart, scatter = np.abs(flux - model), np.maximum(scatter, 1e-9 * flux)
+    residual = np.abs(flux - model)
+    scatter = np.maximum(scatter, 1e-9 * flux)
 
     def excess(part):
         within = _MEDIAN * np.hypot(error, part * flux)
-        return 0.5 - np.mean(ndtr((within - apart) / scatter) - ndtr((-within - apart) / scatter))
+        return 0.5 - np.mean(
+            ndtr((within - residual) / scatter) - ndtr((-within - residual) / scatter)
+        )
 
-    check_that(not excess(_MOST) > 0, "results", "with models near most fluxes", "others")
-    return brentq(excess, 0.0, _MOST, xtol=1e-4) if excess(0.0) > 0 else 0.0
+    check_that(not excess(_MAX_ERROR) > 0, "results", "with models near most fluxes", "others")
+    if excess(0.0) > 0:
+        return brentq(excess, 0.0, _MAX_ERROR, xtol=1e-4)
+    return 0.0
 
 
 def measure_band_errors(left, template_error, *, longest=LONGEST_REST * u.um, prior=None):
@@ -189,19 +198,23 @@ def measure_template_error(results, *, model_error=0.0, edges=None):
     >>> measure_template_error(results).error.max().round(2)
     np.float64(0.0)
     """
-    edges = to_array(_EDGES * WAVE if edges is None else edges, WAVE, "edges", ndim=1)
-    own = per_band(model_error, results.filters, "model_error")
+    if edges is None:
+        edges = _EDGES * WAVE
+    edges = to_array(edges, WAVE, "edges", ndim=1)
+    band_error = per_band(model_error, results.filters, "model_error")
     flux, error, _, good = _residuals(results)
-    error = np.hypot(error, np.array([own[name] for name in results.filters]) * flux)
-    rest = _rest(results)
-    columns, wave, found = (flux, error, results.model_flux, results.model_flux_std), [], []
+    error = np.hypot(error, np.array([band_error[name] for name in results.filters]) * flux)
+    rest_wave = _rest_wavelengths(results)
+    columns = (flux, error, results.model_flux, results.model_flux_std)
+    wave = []
+    bin_errors = []
     for low, high in itertools.pairwise(edges):
-        some = good & (rest >= low) & (rest < high)
-        if np.count_nonzero(some) >= _N_BIN:
+        in_bin = good & (rest_wave >= low) & (rest_wave < high)
+        if np.count_nonzero(in_bin) >= _N_BIN:
             wave.append(np.sqrt(low * high))
-            found.append(_excess(*(column[some] for column in columns)))
+            bin_errors.append(_excess(*(column[in_bin] for column in columns)))
     check_that(wave, "results", f"with {_N_BIN} fluxes of S/N above 5 in a bin", "fewer")
-    return TemplateError(wave * WAVE, found)
+    return TemplateError(wave * WAVE, bin_errors)
 
 
 def measure_priors(results):
@@ -314,7 +327,7 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
     """
     flux, _, model, good = _residuals(results)
     if longest is not None:
-        good &= _rest(results) < to_array(longest, WAVE, "longest", ndim=0)
+        good &= _rest_wavelengths(results) < to_array(longest, WAVE, "longest", ndim=0)
     bands = list(results.fitted_filters)
     columns = [results.filters.index(name) for name in bands]
     n = good[:, columns].sum(axis=0)
@@ -324,17 +337,22 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
     if n[bands.index(reference)] < _N_BAND:
         wanted = f"a band with {_N_BAND} sources of S/N above 5"
         raise argument_error("reference", wanted, f"{reference} with {n[bands.index(reference)]}")
-    factor, scatter, known = np.ones(len(bands)), np.full(len(bands), np.nan), n >= _N_BAND
-    for i in np.flatnonzero(known):
-        some = good[:, columns[i]]
-        ratio = np.log(model[some, columns[i]] / flux[some, columns[i]])
-        middle = np.median(ratio)
-        factor[i] = np.exp(middle)
-        # standard error of a median
-        of_best = np.sqrt(np.pi / (2.0 * n[i])) * np.median(np.abs(ratio - middle)) / _MEDIAN
-        free = _free_part(results, columns[i], some)
-        scatter[i] = of_best / free if free > 0 else np.inf
-    factor[known] /= factor[bands.index(reference)]
+    factor = np.ones(len(bands))
+    scatter = np.full(len(bands), np.nan)
+    has_factor = n >= _N_BAND
+    for i in np.flatnonzero(has_factor):
+        rows = good[:, columns[i]]
+        ratio = np.log(model[rows, columns[i]] / flux[rows, columns[i]])
+        median = np.median(ratio)
+        factor[i] = np.exp(median)
+        # standard error of a median: sqrt(pi / 2n) sigma, with sigma from the median absolute deviation
+        median_err = np.sqrt(np.pi / (2.0 * n[i])) * np.median(np.abs(ratio - median)) / _MEDIAN
+        free_part = _free_part(results, columns[i], rows)
+        if free_part > 0:
+            scatter[i] = median_err / free_part
+        else:
+            scatter[i] = np.inf
+    factor[has_factor] /= factor[bands.index(reference)]
     columns = {
         "band": np.array(bands),
         "n": n,
@@ -345,7 +363,7 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
 
 
 def _free_part(results, column, rows):
-    """Median part of the residuals of a band that models do not take up, as they follow its own fluxes."""
+    """Return the median part of the residuals of a band that models, which follow its fluxes, do not take up."""
     taken_up = np.square(results.model_flux_std[rows, column] / results.sigma[rows, column])
     return 1.0 - np.median(taken_up)
 
@@ -382,9 +400,12 @@ def apply_zero_points(photometry, zero_points):
     [2.1] uJy
     """
     require_columns(zero_points, ["band", "factor"], "zero_points")
-    names, values = map(str, zero_points["band"]), map(float, zero_points["factor"])
+    names = map(str, zero_points["band"])
+    values = map(float, zero_points["factor"])
     factors = dict(zip(names, values, strict=True))
-    columns = [c for name in factors for c in (name, error_column(name))]
+    columns = []
+    for name in factors:
+        columns += [name, error_column(name)]
     require_columns(photometry, columns, "photometry", units=dict.fromkeys(columns, FNU))
     out = QTable(photometry, copy=True)
     for name, factor in factors.items():

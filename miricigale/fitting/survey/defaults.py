@@ -15,7 +15,7 @@ DEFAULT = "default"
 
 def models_and_bands(model, filters, axes):
     """
-    The models and bands that arguments of `~miricigale.fitting.BayesFitter` stand for.
+    Find the models and bands that arguments of `~miricigale.fitting.BayesFitter` stand for.
 
     Parameters
     ----------
@@ -36,27 +36,31 @@ def models_and_bands(model, filters, axes):
     if isinstance(model, (list, tuple, FilterSet)):
         wanted = "left out where 'model' is a list of bands"
         check_that(filters is None, "filters", wanted, filters)
-        filters, model = model, None
+        filters = model
+        model = None
     if filters is not None and not isinstance(filters, (str, FilterSet)):
         filters = list(filters)
         if not all(isinstance(name, str) for name in filters):
             # curves of one's own among names
             filters = FilterSet(filters)
     if model is None:
-        model = SEDModel.for_axes(axes if isinstance(axes, str) else "survey")
+        grid_name = "survey"
+        if isinstance(axes, str):
+            grid_name = axes
+        model = SEDModel.for_axes(grid_name)
     return model, filters
 
 
 def own_curves(filters):
-    """Filters of a `FilterSet` that are not those of the library, as a tuple."""
+    """Select the filters of a `FilterSet` that are not those of the library: tuple of `Filter`."""
     if not isinstance(filters, FilterSet):
         return ()
-    return tuple(one for one in filters if find_filter(one.name) is None)
+    return tuple(band for band in filters if find_filter(band.name) is None)
 
 
 def axes_of(model, axes):
     """
-    Axes of a grid of a model, and the name of the grid.
+    Find the axes of a grid of a model, and the name of the grid.
 
     Parameters
     ----------
@@ -79,34 +83,40 @@ def axes_of(model, axes):
     """
     if not isinstance(model, SEDModel):
         return axes, None
-    if axes is None or isinstance(axes, str):
-        return model.named_axes(axes), model.preset if axes is None else axes
+    if axes is None:
+        return model.named_axes(axes), model.preset
+    if isinstance(axes, str):
+        return model.named_axes(axes), axes
     for name, (preset, _) in GRIDS.items():
         if preset == model.preset and _are_same(axes, grid_axes(name, agn=model.has_agn)):
             return axes, name
     return axes, None
 
 
-def _are_same(axes, others):
-    """Whether two grids have the same axes."""
-    if not isinstance(axes, dict) or axes.keys() != others.keys():
+def _are_same(axes, grid_axes_of_name):
+    """Whether axes are those of a named grid."""
+    if not isinstance(axes, dict) or axes.keys() != grid_axes_of_name.keys():
         return False
-    return all(np.array_equal(np.asarray(axes[name]), values) for name, values in others.items())
+    return all(
+        np.array_equal(np.asarray(axes[name]), values) for name, values in grid_axes_of_name.items()
+    )
 
 
 @cached(copies=True)
 def _survey_calibration(bands):
-    """`SurveyCalibration.survey` for bands (tuple of str) of a catalog that was not measured."""
+    """Return `SurveyCalibration.survey` for bands (tuple of str) of a catalog that was not measured."""
     # it is measured by fits, whose modules are made of this one
     from miricigale.fitting.survey.survey import SurveyCalibration
 
     calibration = SurveyCalibration.survey()
-    return calibration.with_prior_errors(bands) if bands else calibration
+    if bands:
+        return calibration.with_prior_errors(bands)
+    return calibration
 
 
 def default_calibration(grid, model_error=None, template_error=None, *, bands=None):
     """
-    Calibration of a grid of ours where none was given.
+    Choose the calibration of a named grid where none was given.
 
     Parameters
     ----------
@@ -138,7 +148,7 @@ def default_calibration(grid, model_error=None, template_error=None, *, bands=No
 
 def chosen_calibration(calibration, grid, model_error=None, template_error=None, *, bands=None):
     """
-    The calibration that was given, or `default_calibration` where that is asked for.
+    Return the calibration that was given, or `default_calibration` where that is asked for.
 
     Raises
     ------
@@ -155,7 +165,7 @@ def chosen_calibration(calibration, grid, model_error=None, template_error=None,
 
 def statement(fitter, unused=()):
     """
-    What a fitter fits, in three lines: models, bands, and errors with priors.
+    Describe what a fitter fits in three lines: models, bands, and errors with priors.
 
     Parameters
     ----------
@@ -169,7 +179,9 @@ def statement(fitter, unused=()):
     lines : list of str
     """
     bands = fitter.filters or fitter.bands
-    lost = f"; not fitted: {', '.join(unused)}" if unused else ""
+    lost = ""
+    if unused:
+        lost = f"; not fitted: {', '.join(unused)}"
     return [
         f"models: {_models(fitter)}",
         f"bands: {len(bands)} fitted, {', '.join(bands)}{lost}",
@@ -178,18 +190,23 @@ def statement(fitter, unused=()):
 
 
 def _models(fitter):
-    """The models in words: the grid by its name, its size and redshifts."""
+    """Describe the models: the grid by its name, its size and redshifts."""
     if fitter.grid is None:
         return f"{fitter.model!r}, by {fitter.engine}"
     z = fitter.grid.redshift
-    name = "a grid" if fitter.grid_name is None else f"the grid {fitter.grid_name!r}"
+    name = "a grid"
+    if fitter.grid_name is not None:
+        name = f"the grid {fitter.grid_name!r}"
     text = f"{name} of {fitter.grid.n_models:,} models, redshifts {z[0]:.2f} to {z[-1]:.2f}"
-    return text if fitter.model is None else f"{text}, of {fitter.model!r}"
+    if fitter.model is None:
+        return text
+    return f"{text}, of {fitter.model!r}"
 
 
 def errors_and_priors(fitter):
-    """Calibration, errors as parts of the flux, and priors of a fitter, in words."""
-    settings, parts = fitter.settings(), []
+    """Describe calibration, errors as parts of the flux, and priors of a fitter in a line."""
+    settings = fitter.settings()
+    parts = []
     if "calibration" in settings:
         parts.append(f"calibration {settings['calibration']!r}")
     if fitter.template_error is not None:
@@ -207,13 +224,13 @@ def errors_and_priors(fitter):
 
 
 def _span(values):
-    """Least and largest of some numbers in per cent; one number if they are the same."""
+    """Format smallest and largest of some numbers in per cent; one number if they are the same."""
     ends = [f"{100.0 * end:.0f}" for end in (min(values), max(values))]
     return " to ".join(dict.fromkeys(ends))
 
 
 def _priors(fitter):
-    """Names of the parameters whose prior is not flat in the nodes; all of a sampler."""
+    """List the parameters whose prior is not flat in the nodes; all of a sampler."""
     if fitter.grid is None:
         return list(fitter.priors)
     settings = fitter.backend.given

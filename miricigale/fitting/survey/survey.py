@@ -1,6 +1,7 @@
 """Calibration of a survey: priors, errors of models and bands, and zero points, from sources of known redshift."""
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,15 +29,17 @@ from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
 
-#: Turns of the calibration, each a step of expectation maximization, and the power by which steps of priors are
-#: lengthened (Salakhutdinov & Roweis 2003).
-_TURNS, _LONGER = 6, 2.0
+#: Turns of the calibration, each a step of expectation maximization.
+_N_TURNS = 6
+#: Power by which steps of priors are lengthened (over-relaxation; Salakhutdinov & Roweis 2003).
+_OVER_RELAXATION = 2.0
 #: Errors of models before any were measured.
-_FIRST = 0.1
-#: Least number of sources of a half.
-_LEAST = 50
+_FIRST_MODEL_ERROR = 0.1
+#: Smallest number of sources of a half.
+_MIN_SOURCES = 50
 _NAME = "miricigale survey calibration"
-_COLUMNS, _SCORES = (declared("miricigale.fitting", "columns.toml")[k] for k in ("bands", "scores"))
+_COLUMNS = declared("miricigale.fitting", "columns.toml")["bands"]
+_SCORES = declared("miricigale.fitting", "columns.toml")["scores"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +91,15 @@ class SurveyCalibration:
         return f"<SurveyCalibration {self.name}: {numbers}>"
 
     def of_bands(self, column, filters, default):
-        """Values of a column for bands: dict by name; ``default`` for those that are not in it."""
-        known = dict(zip(map(str, self.bands["band"]), map(float, self.bands[column]), strict=True))
-        return {name: known.get(name, default) for name in filters}
+        """Look up a column for bands: dict of str to float, ``default`` for bands that are not in the table."""
+        values_by_band = dict(
+            zip(map(str, self.bands["band"]), map(float, self.bands[column]), strict=True)
+        )
+        return {name: values_by_band.get(name, default) for name in filters}
 
     def grid_priors(self, axes):
-        """Weights for the axes of a grid: dict by name of those whose values are the same."""
-        out = {}
+        """Select the prior weights of the axes of a grid whose values are the same: dict by name."""
+        grid_weights = {}
         for name, (values, weights) in self.priors.items():
             axis = axes.get(name)
             if axis is None or np.size(axis) < 2:
@@ -103,21 +108,21 @@ class SurveyCalibration:
                 text = f"the calibration {self.name!r} has no prior for the values of {name!r}"
                 warn(f"{text}: flat", FitWarning)
                 continue
-            out[name] = np.array(weights)
-        return out
+            grid_weights[name] = np.array(weights)
+        return grid_weights
 
     def without_priors(self):
-        """Calibration of the same bands and errors for other models: without priors."""
+        """Return a calibration of the same bands and errors without priors, for other models."""
         return dataclasses.replace(self, priors={}, mass_function=None, errors={})
 
     @classmethod
     def without_bands(cls, name, template_error):
-        """Calibration that has errors of models only."""
+        """Make a calibration that has errors of models only."""
         return cls(name, described_rows([], _COLUMNS), template_error, {})
 
     def with_band_errors(self, errors):
         """
-        Calibration with other errors of bands; fluxes of MIRI may be wrong.
+        Return a calibration with other errors of bands; fluxes of MIRI may be wrong.
 
         Parameters
         ----------
@@ -129,12 +134,12 @@ class SurveyCalibration:
         calibration : `SurveyCalibration`
             With these bands alone.
         """
-        rows = [_band_row(band, found) for band, found in errors.items()]
+        rows = [_band_row(band, band_errors) for band, band_errors in errors.items()]
         return dataclasses.replace(self, bands=described_rows(rows, _COLUMNS))
 
     def with_prior_errors(self, bands):
         """
-        Calibration of a catalog of which nothing was measured.
+        Return a calibration for a catalog of which nothing was measured.
 
         Parameters
         ----------
@@ -145,14 +150,13 @@ class SurveyCalibration:
         -------
         calibration : `SurveyCalibration`
             Its bands have the errors of `~miricigale.fitting.survey.band_errors.prior_errors`: in MIRI 3.3 times
-            those
-            of the catalog, 15 % of the flux, and 5 % of wrong fluxes.
+            those of the catalog, 15 % of the flux, and 5 % of wrong fluxes.
         """
         return self.with_band_errors({band: prior_errors(band) for band in bands})
 
     def summary(self):
         """
-        Table of what is done to the fluxes and errors of each band, as text.
+        Format what is done to the fluxes and errors of each band as a table in text.
 
         Returns
         -------
@@ -164,13 +168,17 @@ class SurveyCalibration:
         lines = [f"{'band':20s} {'fluxes':>6s}  zero point      errors x  + flux, %  wrong, %"]
         for row in self.bands:
             measured = row["n"] > 0
-            n_fluxes = str(int(row["n"])) if measured else "prior"
+            n_fluxes = "prior"
+            if measured:
+                n_fluxes = str(int(row["n"]))
             zero_point = f"{row['zero_point']:.3f}"
             if measured and row["zero_point_err"] > 0:
                 zero_point += f" +- {row['zero_point_err']:.3f}"
             numbers = f"{row['error_factor']:8.2f}  {100 * row['error_part']:9.1f}"
             has_wrong = measured and np.isfinite(row["wrong"])
-            wrong = f"{100 * row['wrong']:8.1f}" if has_wrong else ""
+            wrong = ""
+            if has_wrong:
+                wrong = f"{100 * row['wrong']:8.1f}"
             line = f"{row['band']:20s} {n_fluxes:>6s}  {zero_point:14s} {numbers}  {wrong}"
             lines.append(line.rstrip())
         return "\n".join(lines)
@@ -179,7 +187,9 @@ class SurveyCalibration:
     @cached(copies=True)
     def survey(cls):
         """
-        Calibration of `~miricigale.sed.SEDModel.survey`, measured on CEERS by ``tools/make_calibration.py``.
+        Load the calibration of `~miricigale.sed.SEDModel.survey`, measured on CEERS.
+
+        ``tools/make_calibration.py`` makes the file.
 
         On sources of CEERS (Finkelstein et al. 2023, ApJL 946, L13) in HST, NIRCam and MIRI bands as published by
         Lisiecki et al. 2025, with S/N above 5 in seven bands, at published redshifts most of which are
@@ -221,19 +231,22 @@ class SurveyCalibration:
         if meta.get("kind") != _NAME:
             raise DataError(msg)
         try:
-            error, mass, scores = (
-                meta.get(name) for name in ("template_error", "mass_function", "scores")
-            )
+            mass_function = None
+            if meta.get("mass_function") is not None:
+                mass_function = MassFunction(**meta["mass_function"])
+            scores = None
+            if meta.get("scores") is not None:
+                scores = QTable(meta["scores"])
             return cls(
                 name=meta["name"],
                 bands=_read_bands(table),
-                template_error=TemplateError.from_meta(error),
+                template_error=TemplateError.from_meta(meta.get("template_error")),
                 priors={
                     n: (np.array(p["values"]), np.array(p["weights"]))
                     for n, p in meta["priors"].items()
                 },
-                mass_function=None if mass is None else MassFunction(**mass),
-                scores=None if scores is None else QTable(scores),
+                mass_function=mass_function,
+                scores=scores,
                 errors={name: np.array(e) for name, e in meta.get("errors", {}).items()},
             )
         except (KeyError, TypeError, ValueError) as error:
@@ -242,16 +255,22 @@ class SurveyCalibration:
 
 
 def _read_bands(table):
-    """Bands of a file; those of earlier versions do not have the share of wrong fluxes that was found."""
+    """Read the table of bands; files of earlier versions have no share of wrong fluxes."""
     columns = {}
     for name, text in _COLUMNS.items():
-        values = table[name] if name in table.colnames else np.full(len(table), np.nan)
+        if name in table.colnames:
+            values = table[name]
+        else:
+            values = np.full(len(table), np.nan)
         columns[name] = (values, text)
     return described_table(columns)
 
 
 def _band_row(band, errors):
-    """Row of the table of bands from `BandErrors`: dict by column."""
+    """Make a row of the table of bands from `BandErrors`: dict by column."""
+    outlier = 0.0
+    if prior_of_band(band).allows_wrong:
+        outlier = errors.wrong
     return {
         "band": band,
         "n": errors.n,
@@ -259,7 +278,7 @@ def _band_row(band, errors):
         "zero_point_err": errors.zero_point_err,
         "error_factor": errors.factor,
         "error_part": errors.part,
-        "outlier": errors.wrong if prior_of_band(band).allows_wrong else 0.0,
+        "outlier": outlier,
         "wrong": errors.wrong,
     }
 
@@ -330,31 +349,39 @@ def calibrate(
     check_that(fitter.grid is not None, "fitter", "one with a grid", fitter.engine)
     table = fitter._table_of(photometry)
     z = known_redshifts(table, redshift)
-    # none of NaN
+    # comparisons leave out missing redshifts, which are NaN
     rows = np.flatnonzero((z >= fitter.grid.redshift[0]) & (z <= fitter.grid.redshift[-1]))
-    wanted = f"with {2 * _LEAST} known redshifts or more"
-    check_that(rows.size >= 2 * _LEAST, "photometry", wanted, rows.size)
+    wanted = f"with {2 * _MIN_SOURCES} known redshifts or more"
+    check_that(rows.size >= 2 * _MIN_SOURCES, "photometry", wanted, rows.size)
     if priors is None:
         axis = fitter.priors.axes.get("frac_agn")
-        some = axis is not None and axis.values.size > 1 and axis.values[0] == 0
-        priors = {"frac_agn": agn_fraction_prior(axis.values)} if some else {}
+        has_fractions = axis is not None and axis.values.size > 1 and axis.values[0] == 0
+        priors = {}
+        if has_fractions:
+            priors = {"frac_agn": agn_fraction_prior(axis.values)}
     if reference is not None:
         check_names([reference], "band that is fitted", _fitted(fitter, table))
     options = {"executor": executor}
-    halves = [(table[rows[h::2]], z[rows[h::2]]) for h in (0, 1)]
-    before, after = [], []
-    # what there is to say of the catalog was said of all of it
+    half_tables = [table[rows[0::2]], table[rows[1::2]]]
+    half_redshifts = [z[rows[0::2]], z[rows[1::2]]]
+    before = []
+    after = []
+    # the warnings about the catalog were given for all of it
     with without_warnings():
-        found = [_measure(fitter, *half, name, reference, priors, options) for half in halves]
-        for (some, _), other in zip(halves, found[::-1], strict=True):
-            before.append(fitter.fit(some, **options))
-            after.append(with_calibration(fitter, other).fit(some, **options))
-    true = np.concatenate([half[1] for half in halves])
+        calibrations = []
+        for sources, known_z in zip(half_tables, half_redshifts, strict=True):
+            measured = _measure(fitter, sources, known_z, name, reference, priors, options)
+            calibrations.append(measured)
+        # each half is fitted with the calibration of the other half
+        for sources, calibration in zip(half_tables, calibrations[::-1], strict=True):
+            before.append(fitter.fit(sources, **options))
+            after.append(with_calibration(fitter, calibration).fit(sources, **options))
+    true = np.concatenate(half_redshifts)
     scores = [
         {"fit": "before"} | _score(before, true),
         {"fit": "after"} | _score(after, true),
     ]
-    return dataclasses.replace(_mean(found), scores=described_rows(scores, _SCORES))
+    return dataclasses.replace(_mean(calibrations), scores=described_rows(scores, _SCORES))
 
 
 def _fitted(fitter, table):
@@ -363,10 +390,9 @@ def _fitted(fitter, table):
 
 
 def _score(fits, true):
-    """Sources, bias, sigma_MAD, outliers, and part within the 68 % interval: dict by column."""
-    low, z, high = np.concatenate(
-        [one.percentile("redshift", (0.16, 0.5, 0.84)).value for one in fits]
-    ).T
+    """Score redshifts: sources, bias, sigma_MAD, outliers, and part within the 68 % interval, by column."""
+    percentiles = [fit.percentile("redshift", (0.16, 0.5, 0.84)).value for fit in fits]
+    low, z, high = np.concatenate(percentiles).T
     good = np.isfinite(z)
     metrics = photoz_metrics(true[good], z[good])
     inside = np.mean((low <= true)[good] & (true <= high)[good])
@@ -386,36 +412,43 @@ def on_nodes(fitter):
 
 
 def _measure(fitter, table, z, name, reference, priors, options):
-    """`SurveyCalibration` of some sources at their redshifts."""
+    """Measure the `SurveyCalibration` of sources at their redshifts, in turns of expectation maximization."""
     options = {"redshift": z, **options}
     fitter = on_nodes(fitter)
     bands = _fitted(fitter, table)
-    long = [band for group in long_instruments(bands) for band in group]
+    long = list(itertools.chain.from_iterable(long_instruments(bands)))
     predicting = [band for band in bands if band not in long]
     data = fitter.replace(calibration=None)._read_bands(table, bands)
     errors = {band: prior_errors(band) for band in bands}
     weights = {}
 
     def current(template_error):
-        known = {n: (fitter.priors.axes[n].values, w) for n, w in weights.items()}
-        rows = [_band_row(band, found) for band, found in errors.items()]
+        measured_priors = {n: (fitter.priors.axes[n].values, w) for n, w in weights.items()}
+        rows = [_band_row(band, band_errors) for band, band_errors in errors.items()]
         table = described_rows(rows, _COLUMNS)
-        return SurveyCalibration(name, table, template_error, known, MassFunction())
+        return SurveyCalibration(name, table, template_error, measured_priors, MassFunction())
 
-    now = fitter.replace(model_error=_FIRST, template_error=None, calibration=None)
-    for turn in range(_TURNS):
-        fit = now.fit(table, **options)
-        part = {band: 0.0 if turn == 0 else errors[band].part for band in bands}
+    current_fitter = fitter.replace(
+        model_error=_FIRST_MODEL_ERROR, template_error=None, calibration=None
+    )
+    for turn in range(_N_TURNS):
+        fit = current_fitter.fit(table, **options)
+        # the first turn only finds models that are near: errors of bands and long steps come after it
+        part = dict.fromkeys(bands, 0.0)
+        power = 1.0
+        if turn > 0:
+            part = {band: errors[band].part for band in bands}
+            power = _OVER_RELAXATION
         error = measure_template_error(fit, model_error=part)
-        weights = _longer(weights, measure_priors(fit), 1.0 if turn == 0 else _LONGER) | priors
+        weights = _longer(weights, measure_priors(fit), power) | priors
         if turn > 0:
             if long:
-                fit = now.replace(filters=predicting).fit(table, **options)
+                fit = current_fitter.replace(filters=predicting).fit(table, **options)
             errors = measure_bands(fit, data, bands, error)
             if reference is not None:
                 errors = relative_zero_points(errors, reference)
-        now = with_calibration(fitter, current(error))
-    return now.calibration
+        current_fitter = with_calibration(fitter, current(error))
+    return current_fitter.calibration
 
 
 def with_calibration(fitter, calibration):
@@ -424,20 +457,21 @@ def with_calibration(fitter, calibration):
     return fitter.replace(calibration=calibration, **none)
 
 
-def _longer(before, now, power):
-    """Weights with a longer step from those before."""
-    out = {}
-    for name, weights in now.items():
+def _longer(before, after, power):
+    """Lengthen the step of weights in the logarithm: old * (new / old)^power, normalized, by name."""
+    longer = {}
+    for name, weights in after.items():
         old = before.get(name, np.full(weights.size, 1.0 / weights.size))
         step = np.divide(weights, old, out=np.zeros(weights.size), where=old > 0) ** power * old
-        out[name] = step / step.sum()
-    return out
+        longer[name] = step / step.sum()
+    return longer
 
 
-def _mean(found):
-    """Mean of two calibrations, of errors that of their squares, with half of the difference as error."""
-    a, b = found
-    bands, wave = a.bands.copy(), a.template_error.wave
+def _mean(calibrations):
+    """Average two calibrations, errors in quadrature, with half of the difference as error."""
+    a, b = calibrations
+    bands = a.bands.copy()
+    wave = a.template_error.wave
     for name in ("zero_point", "outlier", "wrong"):
         bands[name] = 0.5 * (a.bands[name] + b.bands[name])
     # what is scatter in parts of the flux in one half may be in parts of its error in the other
@@ -445,9 +479,10 @@ def _mean(found):
         bands[name] = np.sqrt(0.5 * (a.bands[name] ** 2 + b.bands[name] ** 2))
     bands["zero_point_err"] = 0.5 * np.abs(a.bands["zero_point"] - b.bands["zero_point"])
     bands["n"] = a.bands["n"] + b.bands["n"]
-    error = a.template_error.error, b.template_error(wave)
+    a_error = a.template_error.error
+    b_error = b.template_error(wave)
     priors = {n: (v, 0.5 * (w + b.priors[n][1])) for n, (v, w) in a.priors.items()}
     errors = {n: 0.5 * np.abs(w - b.priors[n][1]) for n, (_, w) in a.priors.items()}
-    errors["template_error"] = 0.5 * np.abs(error[0] - error[1])
-    mean = TemplateError(wave, np.sqrt(0.5 * (error[0] ** 2 + error[1] ** 2)))
+    errors["template_error"] = 0.5 * np.abs(a_error - b_error)
+    mean = TemplateError(wave, np.sqrt(0.5 * (a_error**2 + b_error**2)))
     return SurveyCalibration(a.name, bands, mean, priors, a.mass_function, errors=errors)
