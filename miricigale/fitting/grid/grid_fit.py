@@ -23,7 +23,7 @@ from miricigale.fitting.posterior.priors import (
     grid_priors,
     known_redshifts,
 )
-from miricigale.fitting.posterior.quantities import Quantities, plain
+from miricigale.fitting.posterior.quantities import Quantities, column_values
 from miricigale.fitting.results.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.results.samples import Samples
 from miricigale.sed import ModelGrid, SEDModel
@@ -176,7 +176,9 @@ class GridFit:
     def constants(self):
         """Parameters of the grid that have one value, which have no posterior: name to float."""
         tables = self.grid.galaxy_parameters, self.grid.agn_parameters
-        first = {name: plain(table[name])[:1] for table in tables for name in table.colnames}
+        first = {
+            name: column_values(table[name])[:1] for table in tables for name in table.colnames
+        }
         return {n: float(v[0]) for n, v in first.items() if n not in self.priors.axes and v.size}
 
     def settings(self):
@@ -466,10 +468,12 @@ class GridFit:
         z, g, k, f = np.where(ok[:, None], out.index, 0).T
         frac = grid.frac_agn[f]
         values = {"redshift": grid.redshift[z], "frac_agn": frac}
-        values |= {name: plain(column)[g] for name, column in grid.galaxy_parameters.items()}
+        values |= {
+            name: column_values(column)[g] for name, column in grid.galaxy_parameters.items()
+        }
         for name, column in grid.agn_parameters.items() if grid.n_agn else ():
             # without AGN light there is no template
-            values[name] = np.where(frac > 0, plain(column)[k], np.nan)
+            values[name] = np.where(frac > 0, column_values(column)[k], np.nan)
         best = {name: np.where(ok, values[name], np.nan) for name in self.priors.axes}
         scale = np.where(ok, out.best_scale, np.nan)
         return best | {n: known.evaluate(n, grid, g, k, frac, scale) for n in known.names}

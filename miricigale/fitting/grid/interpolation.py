@@ -25,7 +25,7 @@ from miricigale.fitting.grid.part_tables import (
     with_columns,
 )
 from miricigale.fitting.posterior.priors import grid_priors
-from miricigale.fitting.posterior.quantities import Quantities, plain
+from miricigale.fitting.posterior.quantities import Quantities, column_values
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +120,10 @@ class InterpolatedModels:
         stars = _part_of_grid(table, model, values, grid.redshift, place)
         names = _Names.of_grid(grid)
         scaling_names = [*names.galaxy, "reference"]
-        scaling = [plain(column) for column in grid.galaxy_properties.itercols()]
+        scaling = [column_values(column) for column in grid.galaxy_properties.itercols()]
         scaling.append(np.asarray(grid.dust_luminosity, float))
         scaling = np.log(np.maximum(np.array(scaling).T, LEAST))
-        shape = np.array([plain(column) for column in grid.galaxy_shape.itercols()], float)
+        shape = np.array([column_values(column) for column in grid.galaxy_shape.itercols()], float)
         shape = shape.reshape(len(names.shape), grid.n_galaxies).T
         agn = empty_part(n_bands)
         agn_columns = empty_part(len(names.agn))
@@ -132,7 +132,7 @@ class InterpolatedModels:
             flux = np.moveaxis(np.asarray(grid.agn), 0, 1)
             table = logarithms(flux, np.zeros((grid.n_agn, 0)), grid.redshift)
             agn = _part_of_grid(table, model_agn, values_agn, grid.redshift, place)
-            columns = np.array([plain(column) for column in grid.agn_properties.itercols()])
+            columns = np.array([column_values(column) for column in grid.agn_properties.itercols()])
             agn_columns = with_columns(agn, np.log(np.maximum(columns.T, LEAST)))
         light = _core.Light(
             stars=stars,

@@ -7,23 +7,30 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior.posterior import cell_edges
-from miricigale.fitting.posterior.quantities import plain
+from miricigale.fitting.posterior.quantities import column_values
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.units import MASS, is_number, to_array
 
-#: Of `agn_fraction_prior`: galaxies with lambda above 0.01, solar luminosities of dust for each solar mass of
-#: stars, those at the Eddington limit for each of a black hole, and solar masses of stars for each of it.
-_ACTIVE, _DUST, _EDDINGTON, _PER_HOLE = 0.1, 10.0, 3.3e4, 500.0
-#: Median redshift of little red dots, and the width of their distribution in ln(1 + z).
-_RED_DOT_REDSHIFT, _RED_DOT_WIDTH = 5.5, 0.25
+#: Part of the galaxies whose specific accretion rate lambda is above 0.01.
+_ACTIVE_PART = 0.1
+#: Solar luminosities of dust for each solar mass of stars.
+_DUST_PER_MASS = 10.0
+#: Solar luminosities at the Eddington limit for each solar mass of a black hole.
+_EDDINGTON_PER_MASS = 3.3e4
+#: Solar masses of stars for each solar mass of a black hole.
+_STARS_PER_HOLE = 500.0
+#: Median redshift of little red dots.
+_RED_DOT_REDSHIFT = 5.5
+#: Width of their distribution in ln(1 + z).
+_RED_DOT_WIDTH = 0.25
 
 
 def agn_fraction_prior(frac_agn):
     """
-    Prior of AGN fractions from how fast black holes grow in galaxies, for ``priors`` of `BayesFitter`.
+    Compute a prior of AGN fractions from how fast black holes grow, for ``priors`` of `BayesFitter`.
 
     The specific accretion rate lambda (L_bol over 1.26e38 erg/s for each 500 solar masses of stars) is taken to
     exceed 0.01 in a tenth of the galaxies, with a number for each dex that falls as lambda^-0.5, and
@@ -56,15 +63,15 @@ def agn_fraction_prior(frac_agn):
     number = 10.0 ** (-0.5 * log) * np.exp(-(10.0**log))
     steps = 0.5 * (number[1:] + number[:-1])
     above = 1.0 - np.concatenate([[0.0], np.cumsum(steps)]) / np.sum(steps)
-    # 33,000 solar luminosities for each solar mass of black hole
-    rate = edges / (1.0 - edges) * _DUST / (0.5 * _EDDINGTON / _PER_HOLE)
-    exceeding = _ACTIVE * np.interp(np.log10(rate), log, above)
+    # lambda at which half of the AGN's light over that plus the dust of stars is the fraction of each edge
+    rate = edges / (1.0 - edges) * _DUST_PER_MASS / (0.5 * _EDDINGTON_PER_MASS / _STARS_PER_HOLE)
+    exceeding = _ACTIVE_PART * np.interp(np.log10(rate), log, above)
     return -np.diff(np.concatenate([[1.0], exceeding, [0.0]]))
 
 
 def red_dot_prior(redshift):
     """
-    Prior of the redshifts of little red dots, for ``priors`` of `BayesFitter`.
+    Compute a prior of the redshifts of little red dots, for ``priors`` of `BayesFitter`.
 
     Log-normal in 1 + z about z = 5.5 with a width of 0.25: 16 and 84 % lie below 4.1 and 7.3. Surveys find few of
     them at z < 4 and at z > 8. Of 260 selected by photometry (Kokorev et al. 2024, arXiv:2401.09981) 16, 50 and
@@ -96,8 +103,8 @@ def red_dot_prior(redshift):
     z = np.asarray(redshift, dtype=float)
     if z.ndim != 1 or z.size < 2 or not (z[0] >= 0 and np.all(np.diff(z) > 0)):
         raise argument_error("redshift", "two or more, ascending from 0 or more", f"{redshift}")
-    apart = (np.log1p(z) - np.log1p(_RED_DOT_REDSHIFT)) / _RED_DOT_WIDTH
-    weights = np.exp(-0.5 * apart**2) * np.diff(cell_edges(np.log1p(z)))
+    deviation = (np.log1p(z) - np.log1p(_RED_DOT_REDSHIFT)) / _RED_DOT_WIDTH
+    weights = np.exp(-0.5 * deviation**2) * np.diff(cell_edges(np.log1p(z)))
     return weights / weights.sum()
 
 
@@ -141,8 +148,10 @@ class MassFunction:
 class MassPrior:
     """Prior of mass and redshift as the kernels take it: see `~miricigale.fitting._core.weigh_masses`."""
 
-    #: Values of the table for a factor of ten, and log10 of the largest mass.
-    per_dex, last = 100.0, 16.0
+    #: Values of the table for a factor of ten in mass.
+    per_dex = 100.0
+    #: log10 of the largest mass of the table, in solar masses.
+    last = 16.0
 
     mass_function: object
     table: np.ndarray
@@ -150,26 +159,30 @@ class MassPrior:
 
     @classmethod
     def of_grid(cls, mass_function, grid):
-        """Of a density, that of the comoving volume in the cell of each redshift; None without one."""
+        """Tabulate ln of a density times the comoving volume in the cell of each redshift; None without one."""
         if mass_function is None:
             return None
         wanted = "a function of stellar mass and redshift, such as MassFunction()"
         check_that(callable(mass_function), "mass_function", wanted, repr(mass_function))
-        z, stars = grid.redshift, plain(grid.galaxy_properties["stellar_mass"])
+        redshift = grid.redshift
+        stars = column_values(grid.galaxy_properties["stellar_mass"])
         mass = 10.0 ** (np.arange(cls.last * cls.per_dex + 1) / cls.per_dex)
-        density = mass_function(mass * MASS, z[:, None])
+        density = mass_function(mass * MASS, redshift[:, None])
         density = to_array(density, u.dimensionless_unscaled, "mass_function")
         if not np.all(np.isfinite(density) & (density >= 0)):
             raise argument_error("mass_function", "densities of 0 or more and finite", "others")
-        cells = np.diff(cell_edges(z, (0.0, np.inf))) if z.size > 1 else np.ones(1)
-        volume = COSMOLOGY.differential_comoving_volume(z).value * cells
+        if redshift.size > 1:
+            cells = np.diff(cell_edges(redshift, (0.0, np.inf)))
+        else:
+            cells = np.ones(1)
+        volume = COSMOLOGY.differential_comoving_volume(redshift).value * cells
         table = np.log(np.maximum(density, 1e-300)) + np.log(volume)[:, None]
         return cls(mass_function, np.ascontiguousarray(table), np.log10(np.maximum(stars, 1e-290)))
 
 
 def sfr_log_prior(sfr_prior, grid):
     """
-    Prior of star-formation rates given mass and redshift, for `~miricigale.fitting.grid.grid.GridEngine`.
+    Make the prior of star-formation rates given mass and redshift of `~miricigale.fitting.grid.grid.GridEngine`.
 
     ``sfr_prior`` is that of `~miricigale.fitting.GridSettings`: a relation and its scatter, or None. Anything
     else is a `ValueError`.
@@ -177,23 +190,26 @@ def sfr_log_prior(sfr_prior, grid):
     if sfr_prior is None:
         return None
     pair = isinstance(sfr_prior, tuple) and len(sfr_prior) == 2
-    relation, scatter = sfr_prior if pair else (None, None)
+    relation = None
+    scatter = None
+    if pair:
+        relation, scatter = sfr_prior
     wanted = "a function of stellar mass and redshift, and a scatter in dex above 0"
     good = callable(relation) and is_number(scatter) and scatter > 0
     check_that(good, "sfr_prior", wanted, repr(sfr_prior))
     rate = grid.galaxy_properties["sfr_100myr"].to_value(u.Msun / u.yr / MASS)
-    stars = plain(grid.galaxy_properties["stellar_mass"])
+    stars = column_values(grid.galaxy_properties["stellar_mass"])
     return partial(_log_normal_sfr, relation, float(scatter), grid.redshift[:, None], stars, rate)
 
 
 def expected_sfr(relation, mass, redshift):
-    """Star-formation rates of a relation in Msun/yr; a `ValueError` where they are not positive and finite."""
+    """Evaluate a relation: rates in Msun/yr; a `ValueError` where they are not positive and finite."""
     rate = to_array(relation(mass, redshift), u.Msun / u.yr, "sfr_prior")
     bad = ~((rate > 0) & np.isfinite(rate))
     if np.any(bad):
-        # a rate of 0 would leave no galaxy any prior
-        every = np.broadcast_arrays(rate, mass.to_value(MASS), redshift)
-        value, mass, z = (array[bad][0] for array in every)
+        # a rate of 0 would give all galaxies a prior of 0
+        arrays = np.broadcast_arrays(rate, mass.to_value(MASS), redshift)
+        value, mass, z = (array[bad][0] for array in arrays)
         got = f"{value:g} Msun/yr at {mass:.3g} Msun and redshift {z:g}"
         raise argument_error("sfr_prior", "a relation to rates above 0 and finite", got)
     return rate
@@ -202,5 +218,5 @@ def expected_sfr(relation, mass, redshift):
 def _log_normal_sfr(relation, scatter, redshift, stars, rate, formed, rows):
     expected = expected_sfr(relation, formed * stars * MASS, redshift[rows])
     with np.errstate(divide="ignore"):
-        apart = np.log10(formed * rate / expected)
-    return -0.5 * np.square(apart / scatter)
+        log_ratio = np.log10(formed * rate / expected)
+    return -0.5 * np.square(log_ratio / scatter)

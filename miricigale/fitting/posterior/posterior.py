@@ -21,7 +21,7 @@ _ALWAYS = {"redshift", "frac_agn"}
 
 def cell_edges(values, bounds=(-np.inf, np.inf)):
     """
-    Edges of the cells around ascending nodes: shape (n,) to (n + 1,).
+    Compute the edges of the cells around ascending nodes: shape (n,) to (n + 1,).
 
     Half way between the nodes; the outermost cells are symmetric about their nodes, as far as the
     bounds allow. A single node has a cell of no width.
@@ -36,7 +36,7 @@ def cell_edges(values, bounds=(-np.inf, np.inf)):
 
 
 def moments(values, pdf):
-    """Mean and standard deviation, shape (...), for weights (..., n) of nodes (n,) that sum to 1."""
+    """Compute mean and standard deviation, shape (...), for weights (..., n) of nodes (n,) that sum to 1."""
     # a matrix product's last digit would depend on how many rows there are
     mean = np.sum(pdf * values, axis=-1)
     # about the mean, so that narrow posteriors do not lose digits
@@ -46,7 +46,7 @@ def moments(values, pdf):
 
 def check_levels(levels):
     """
-    Levels of percentiles as an array of numbers between 0 and 1; those above 1, such as 16, are percent.
+    Check levels of percentiles: an array of numbers between 0 and 1; those above 1, such as 16, are percent.
 
     A `ValueError` if one is neither, or both kinds are there.
     """
@@ -62,7 +62,7 @@ def check_levels(levels):
 
 def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):
     """
-    Percentiles from the cumulative distribution, linear within each cell of `cell_edges`.
+    Compute percentiles from the cumulative distribution, linear within each cell of `cell_edges`.
 
     Levels in (0, 1), shape (k,), of m objects whose nodes have the weights ``pdf``, shape (m, n):
     shape (m, k). Rows of NaN give NaN.
@@ -80,7 +80,7 @@ def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):
 
 def cell_shares(values, pdf, low, high, bounds=(-np.inf, np.inf)):
     """
-    Part of distributions that are linear within each cell of `cell_edges` from ``low`` to ``high``.
+    Integrate distributions that are linear within each cell of `cell_edges` from ``low`` to ``high``.
 
     Nodes (k,), their weights (m, k), limits (m,): shape (m,). Rows of NaN give NaN.
     """
@@ -95,24 +95,25 @@ def cell_shares(values, pdf, low, high, bounds=(-np.inf, np.inf)):
 
 def randomized_ranks(pdf, node, draw):
     """
-    Ranks of true values that lie on nodes, shape (m,), uniform if the posteriors are right.
+    Draw the ranks of true values that lie on nodes, shape (m,), uniform if the posteriors are right.
 
     The distribution steps at every node: the rank is drawn (a uniform number for each object) from
     the step of the true node, for otherwise narrow posteriors have ranks of 0 and 1 only.
     """
     node = np.asarray(node)[:, None]
-    own = np.take_along_axis(pdf, node, axis=1)[:, 0]
+    node_weight = np.take_along_axis(pdf, node, axis=1)[:, 0]
     upto = np.take_along_axis(np.cumsum(pdf, axis=1), node, axis=1)[:, 0]
-    return upto - own * np.asarray(draw)
+    return upto - node_weight * np.asarray(draw)
 
 
 def bin_edges(values, *, log):
     """
-    Edges of 30 bins between the least and the largest value.
+    Compute the edges of 30 bins between the smallest and the largest value.
 
     They have equal widths, in the logarithm with ``log``, if all values are above 0.
     """
-    low, high = np.nanmin(values), np.nanmax(values)
+    low = np.nanmin(values)
+    high = np.nanmax(values)
     # equal values get a narrow bin
     high = max(high, low + 1e-6 * max(abs(low), 1e-30))
     if not (log and low > 0):
@@ -131,18 +132,23 @@ def check_pairs(pairs, axes, constant, derived, wanted):
     whatever its order, without redshift and AGN fraction, which every fit has. Unknown names are a
     `KeyError`, what is no pair of different parameters with several values a `ValueError`.
     """
-    pairs, of_names, out = () if pairs is None else pairs, "a list of pairs of parameter names", {}
+    if pairs is None:
+        pairs = ()
+    of_names = "a list of pairs of parameter names"
+    out = {}
     if isinstance(pairs, (str, dict)) or not np.iterable(pairs):
         raise argument_error("pairs", of_names, repr(pairs))
     for pair in pairs:
-        names = () if isinstance(pair, (str, dict)) or not np.iterable(pair) else tuple(pair)
+        names = ()
+        if np.iterable(pair) and not isinstance(pair, (str, dict)):
+            names = tuple(pair)
         if len(names) != 2 or not all(isinstance(name, str) for name in names):
             raise argument_error("pairs", of_names, f"{pair!r} in it")
         for name in names:
             check_that(name not in derived, "pairs", wanted, repr(name))
             if name in constant or (name in axes and axes[name].values.size == 1):
-                several = "of parameters with several values"
-                raise argument_error("pairs", several, f"{name!r}, which has one")
+                expected = "of parameters with several values"
+                raise argument_error("pairs", expected, f"{name!r}, which has one")
             check_names([name], "parameter for 'pairs'", axes)
         names = tuple(map(str, names))
         check_that(names[0] != names[1], "pairs", "of two different parameters", names)
@@ -152,17 +158,19 @@ def check_pairs(pairs, axes, constant, derived, wanted):
 
 
 def joint_names(pairs, axes):
-    """Joint sums of the engine that pairs need: tuple of str, sorted."""
+    """List the joint sums of the engine that pairs need: tuple of str, sorted."""
     names = {_letters(axes[x], axes[y])[0] for x, y in pairs}
     return tuple(sorted(name for name in names if name[0] != name[1]))
 
 
 def _letters(a, b):
-    """Two letters of a pair of axes in the order of the engine, and whether that is another."""
+    """Return two letters of a pair of axes in the order of the engine, and whether that is reversed."""
     order = "".join(_LETTERS.values())
     name = _LETTERS[a.kind] + _LETTERS[b.kind]
-    turned = order.index(name[0]) > order.index(name[1])
-    return (name[::-1] if turned else name), turned
+    is_reversed = order.index(name[0]) > order.index(name[1])
+    if is_reversed:
+        name = name[::-1]
+    return name, is_reversed
 
 
 def joint_tables(out, pairs, axes):
@@ -175,13 +183,18 @@ def joint_tables(out, pairs, axes):
     product of their shares is exact. ``out`` is what the engine found, with the sums that
     `joint_names` names.
     """
-    tables, folded = {}, {}
+    tables = {}
+    folded = {}
     for x, y in pairs:
-        a, b = axes[x], axes[y]
-        letters, turned = _letters(a, b)
-        a, b = (b, a) if turned else (a, b)
+        a = axes[x]
+        b = axes[y]
+        letters, is_reversed = _letters(a, b)
+        if is_reversed:
+            a = axes[y]
+            b = axes[x]
         if letters[0] == letters[1]:
-            table = _shared(out.galaxy if letters == "gg" else out.agn, a.share, b.share)
+            posterior = {"gg": out.galaxy, "kk": out.agn}[letters]
+            table = _shared(posterior, a.share, b.share)
         else:
             # several pairs may need the same sum over the second models
             if (letters, b.name) not in folded:
@@ -189,7 +202,9 @@ def joint_tables(out, pairs, axes):
             table = folded[letters, b.name]
             if a.share is not None:
                 table = _fold(table.swapaxes(1, 2), a.share).swapaxes(1, 2)
-        tables[x, y] = np.array(table.swapaxes(1, 2) if turned else table, order="C")
+        if is_reversed:
+            table = table.swapaxes(1, 2)
+        tables[x, y] = np.array(table, order="C")
         tables[x, y][np.isnan(out.chi2)] = np.nan
     return tables
 
@@ -206,7 +221,7 @@ def _fold(table, share):
 
 
 def _shared(posterior, a_share, b_share):
-    """Joint posterior of two parameters of the same models, of shape (n, n_models)."""
+    """Compute the joint posterior of two parameters of the same models from theirs, shape (n, n_models)."""
     out = np.empty((len(posterior), len(a_share), len(b_share)))
     for value, part in enumerate(a_share):
         models = np.flatnonzero(part)
@@ -217,7 +232,7 @@ def _shared(posterior, a_share, b_share):
 
 def other_name(name, known):
     """
-    Parameter or derived quantity that a name of CIGALE's or a usual one is.
+    Find the parameter or derived quantity that a name of CIGALE's or a usual one is.
 
     Parameters
     ----------
@@ -239,15 +254,18 @@ def other_name(name, known):
     """
     if name in known or not isinstance(name, str):
         return name
-    plain = name.removeprefix("bayes.").removeprefix("best.")
+    bare_name = name.removeprefix("bayes.").removeprefix("best.")
     usual = declared("miricigale.fitting", "columns.toml")["other_names"]
-    if usual.get(plain) in known:
-        return usual[plain]
+    if usual.get(bare_name) in known:
+        return usual[bare_name]
     tables = declared("miricigale.cigale", "names.toml")
     pairs = [(ours, theirs) for ours, (theirs, _) in tables["quantities"].items()]
     for names in tables["modules"].values():
         pairs += names.items()
-    return next((ours for ours, theirs in pairs if theirs == plain and ours in known), name)
+    for ours, theirs in pairs:
+        if theirs == bare_name and ours in known:
+            return ours
+    return name
 
 
 class FitRows(ObjectRows):

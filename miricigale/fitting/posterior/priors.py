@@ -8,7 +8,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.posterior.posterior import cell_edges
-from miricigale.fitting.posterior.quantities import plain
+from miricigale.fitting.posterior.quantities import column_values
 from miricigale.sed import COMPONENTS
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
@@ -16,10 +16,12 @@ from miricigale.utils.missing_values import floats, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
 from miricigale.utils.units import to_array
 
-#: Power, peak at magnitude 24 and its change with each magnitude of `magnitude_prior`.
-_POWER, _PEAK, _SLOPE = 0.90, 0.62, 0.066
-
-
+#: Power of the redshift in `magnitude_prior`.
+_POWER = 0.90
+#: Redshift of its peak at magnitude 24.
+_PEAK = 0.62
+#: Change of that redshift with each magnitude.
+_SLOPE = 0.066
 #: Points of the Gauss-Legendre rule by which a density is integrated over a cell.
 _CELL_POINTS = 16
 
@@ -68,8 +70,8 @@ class GridAxis:
         """Whether values are labels of what a library has, with nothing between them."""
         return self.values.size > 1 and self._declared_as("label")
 
-    def _declared_as(self, what):
-        return _declared(tuple(COMPONENTS.names()), self.name, what)
+    def _declared_as(self, attribute):
+        return _declared(tuple(COMPONENTS.names()), self.name, attribute)
 
     @property
     def ranges(self):
@@ -77,7 +79,9 @@ class GridAxis:
         n = self.values.size
         if self.label:
             return [(i, 1) for i in range(n)]
-        return [(0, 1), (1, n - 1)] if self.absent_at_zero else [(0, n)]
+        if self.absent_at_zero:
+            return [(0, 1), (1, n - 1)]
+        return [(0, n)]
 
     def cells(self, bounds=(-np.inf, np.inf)):
         """
@@ -85,23 +89,24 @@ class GridAxis:
 
         Those of a label, and of a component that is absent, are the value itself; the first cell of what is
         present begins at 0. The outermost are those of `~miricigale.fitting.posterior.posterior.cell_edges` with
-        these
-        bounds.
+        these bounds.
         """
         edges = cell_edges(self.values, bounds)
-        low, high = edges[:-1].copy(), edges[1:].copy()
+        low = edges[:-1].copy()
+        high = edges[1:].copy()
         if self.label:
             return self.values.copy(), self.values.copy()
         if self.absent_at_zero:
-            low[:2], high[0] = 0.0, 0.0
+            low[:2] = 0.0
+            high[0] = 0.0
         return low, high
 
 
 @cached(maxsize=1024)
-def _declared(components, name, what):
-    """Whether a component declares the parameter of this name so."""
-    declared = [COMPONENTS.get(one).declared().get(name) for one in components]
-    return any(getattr(parameter, what, False) for parameter in declared)
+def _declared(components, name, attribute):
+    """Whether a component declares the parameter of this name with an attribute that is true."""
+    declared = [COMPONENTS.get(component).declared().get(name) for component in components]
+    return any(getattr(parameter, attribute, False) for parameter in declared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +122,7 @@ class GridPriors:
 
 def grid_priors(grid, priors=None, *, prior_f="grid"):
     """
-    Work out the prior weights of a model grid: `GridPriors`.
+    Compute the prior weights of a model grid: `GridPriors`.
 
     ``priors`` and ``prior_f`` are given as for `~miricigale.fitting.BayesFitter`; the latter counts if
     the former do not name the AGN fraction.
@@ -134,7 +139,8 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
     priors = dict(priors or {})
     check_choice(prior_f, "prior_f", ("grid", "uniform"))
     axes = {}
-    z, f = grid.redshift, grid.frac_agn
+    z = grid.redshift
+    f = grid.frac_agn
     axes["redshift"] = _axis("redshift", z, 1, "redshift", priors, bounds=(0.0, np.inf))
     if grid.agn_multiplicity.size:
         if prior_f == "uniform" and "frac_agn" not in priors:
@@ -146,26 +152,29 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
         galaxy *= _add_axis(axes, name, grid.galaxy_parameters[name], "galaxy", priors, bounds)
     agn = np.ones(grid.agn_multiplicity.size)
     if agn.size:
-        left = grid.agn_multiplicity.astype(float)
+        multiplicity = grid.agn_multiplicity.astype(float)
         inert = _inert(grid)
         for name in grid.agn_parameters.colnames:
             rows, nodes = inert.get(name, (None, None))
             column = grid.agn_parameters[name]
             agn *= _add_axis(axes, name, column, "agn", priors, bounds, rows, nodes)
             if rows is not None:
-                left[rows] /= len(nodes)
-        agn *= left
+                multiplicity[rows] /= len(nodes)
+        agn *= multiplicity
     check_names(sorted(priors), "grid parameter", axes)
     if not galaxy.sum() > 0 or (agn.size and not agn.sum() > 0):
         raise argument_error("priors", "positive for at least one model", "0 for all")
-    frac = axes["frac_agn"].weights if agn.size else np.ones(1)
+    if agn.size:
+        frac = axes["frac_agn"].weights
+    else:
+        frac = np.ones(1)
     return GridPriors(axes, galaxy, agn, frac, axes["redshift"].weights)
 
 
 def _add_axis(axes, name, column, kind, priors, bounds, rows=None, nodes=None):
     """Add the axis of a table's column; return the prior factor of each model."""
     unit = getattr(column, "unit", None) or 1
-    column = plain(column)
+    column = column_values(column)
     if nodes is None:
         # means of equal values may differ in the last digit
         values, rows_of = np.unique(np.char.mod("%.12g", column).astype(float), return_inverse=True)
@@ -197,7 +206,10 @@ def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
         check_that(prior == "log" and np.all(values > 0), argument, wanted, repr(prior))
         # flat in the logarithm from the first value to the last
         edges = cell_edges(values, (values[0], values[-1]))
-        weights = np.diff(np.log(edges)) if values.size > 1 else np.ones(1)
+        if values.size > 1:
+            weights = np.diff(np.log(edges))
+        else:
+            weights = np.ones(1)
     elif callable(prior) or hasattr(prior, "pdf"):
         weights = cell_integrals(prior, values, argument)
     else:
@@ -211,7 +223,7 @@ def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
 
 def cell_integrals(prior, values, argument):
     """
-    Integrals of a density over the cells of ascending nodes.
+    Integrate a density over the cells of ascending nodes.
 
     Parameters
     ----------
@@ -251,19 +263,19 @@ def cell_integrals(prior, values, argument):
 
 
 def _inert(grid):
-    """Rows in which a parameter has no effect, and all values of its axis: by name."""
-    found = {}
+    """Find the rows in which a parameter has no effect, and all values of its axis: by name."""
+    inert_rows = {}
     for row, names in enumerate(grid.inert):
         for name in names:
             nodes = np.unique(grid.axes.get(name, []))
             if nodes.size > 1:
-                found.setdefault(name, ([], nodes))[0].append(row)
-    return found
+                inert_rows.setdefault(name, ([], nodes))[0].append(row)
+    return inert_rows
 
 
 def known_redshifts(photometry, redshift, *, zero=False):
     """
-    Redshifts of a catalog: a column by its name, one value, or one for each object.
+    Read the redshifts of a catalog: a column by its name, one value, or one for each object.
 
     NaN where one is missing, masked, not finite or not positive. With ``zero``, of a grid that has this node (at
     10 pc, for objects with distances of their own), 0 is a redshift. A `ValueError` is raised for a column that
@@ -285,7 +297,7 @@ def known_redshifts(photometry, redshift, *, zero=False):
 
 def magnitude_prior(magnitude, redshift=None):
     """
-    Density of redshift of galaxies of a magnitude, for ``redshift_prior`` of `BayesFitter.fit`.
+    Compute the density of redshift of galaxies of a magnitude, for ``redshift_prior`` of `BayesFitter.fit`.
 
     z^a exp(-(z / z_m)^a) with its peak at z_m = 0.62 + 0.066 (m - 24) and a = 0.90, the form of Benitez 2000
     (ApJ 536, 571, eq. 24), without types. The numbers are the fit of greatest likelihood to the 2302 sources of
@@ -319,15 +331,23 @@ def magnitude_prior(magnitude, redshift=None):
     >>> z[density.argmax(axis=1)].round(1)
     array([0.4, 0.8])
     """
-    plain, mask = without_mask(magnitude)
+    unmasked, mask = without_mask(magnitude)
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = u.Quantity(plain, subok=True).to(u.ABmag).value
-    values = np.asarray(values, dtype=float) if mask is None else np.where(mask, np.nan, values)
-    apart = np.atleast_1d(values) - 24.0
-    z = np.linspace(0.0, 15.0, 751) if redshift is None else floats(redshift)
+        values = u.Quantity(unmasked, subok=True).to(u.ABmag).value
+    if mask is None:
+        values = np.asarray(values, dtype=float)
+    else:
+        values = np.where(mask, np.nan, values)
+    faintness = np.atleast_1d(values) - 24.0
+    if redshift is None:
+        z = np.linspace(0.0, 15.0, 751)
+    else:
+        z = floats(redshift)
     # bright galaxies are not all at 0
-    top = np.maximum(_PEAK + _SLOPE * np.where(np.isfinite(apart), apart, 0.0), 0.1 * _PEAK)
-    density = z**_POWER * np.exp(-((z / top[:, None]) ** _POWER))
+    peak = np.maximum(
+        _PEAK + _SLOPE * np.where(np.isfinite(faintness), faintness, 0.0), 0.1 * _PEAK
+    )
+    density = z**_POWER * np.exp(-((z / peak[:, None]) ** _POWER))
     return z, density / np.trapezoid(density, z, axis=1)[:, None]
 
 
@@ -342,7 +362,8 @@ def read_density(redshift_prior, n):
     wanted = "(redshifts of shape (n_z,), densities of shape (n_z,) or (n, n_z))"
     if not (isinstance(redshift_prior, tuple) and len(redshift_prior) == 2):
         raise argument_error("redshift_prior", wanted, type(redshift_prior).__name__)
-    nodes, density = (_unmasked(redshift_prior[i], f"redshift_prior[{i}]") for i in (0, 1))
+    nodes = _unmasked(redshift_prior[0], "redshift_prior[0]")
+    density = _unmasked(redshift_prior[1], "redshift_prior[1]")
     if nodes.ndim != 1 or nodes.size < 2 or density.shape not in (nodes.shape, (n, nodes.size)):
         shapes = f"shapes {nodes.shape} and {density.shape}"
         raise argument_error("redshift_prior", wanted, shapes)
@@ -354,14 +375,18 @@ def read_density(redshift_prior, n):
 
 
 def _unmasked(value, name):
-    """Numbers as an array, NaN where they are masked."""
+    """Return numbers as an array, NaN where they are masked."""
     mask = np.asarray(getattr(value, "mask", False))
     array = to_array(getattr(value, "unmasked", value), u.dimensionless_unscaled, name)
     return np.where(mask, np.nan, array)
 
 
 def integrals_to(values, nodes, density, total):
-    """Integrals up to values (m,) between the nodes, shape (..., m), from their integrals up to each."""
+    """
+    Integrate a density that is linear between nodes up to values (m,), shape (..., m).
+
+    ``total`` are the integrals up to each node.
+    """
     cell = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
     step = values - nodes[cell]
     slope = (density[..., cell + 1] - density[..., cell]) / (nodes[cell + 1] - nodes[cell])
@@ -370,7 +395,7 @@ def integrals_to(values, nodes, density, total):
 
 def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
     """
-    ln(prior) of the redshifts of a grid, shape (n, nz), from a density for each object.
+    Compute ln(prior) of the redshifts of a grid, shape (n, nz), from a density for each object.
 
     The prior of a redshift is the integral of the density over its cell, as a share of the whole
     density: what lies outside the grid is missing from the evidence. Only redshifts that are
@@ -386,36 +411,39 @@ def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
     else:
         edges = np.clip(cell_edges(grid_redshift, (0.0, np.inf)), nodes[0], nodes[-1])
     weights = np.maximum(np.diff(integrals_to(edges, nodes, density, total), axis=1), 0.0)
-    whole = total[:, -1:]
-    known = np.isfinite(whole[:, 0]) & (whole[:, 0] > 0)
-    flags[~known] |= int(FitFlags.NO_REDSHIFT)
+    integral = total[:, -1:]
+    is_usable = np.isfinite(integral[:, 0]) & (integral[:, 0] > 0)
+    flags[~is_usable] |= int(FitFlags.NO_REDSHIFT)
     with np.errstate(divide="ignore", invalid="ignore"):
-        out = np.where(allowed & known[:, None], np.log(weights / whole), -np.inf)
-    flags[known & ~np.isfinite(out).any(axis=1)] |= int(FitFlags.NO_MODEL)
+        out = np.where(allowed & is_usable[:, None], np.log(weights / integral), -np.inf)
+    flags[is_usable & ~np.isfinite(out).any(axis=1)] |= int(FitFlags.NO_MODEL)
     return out
 
 
 def fixed_log_prior(values, grid_redshift, allowed, tolerance, flags):
     """
-    ln(prior) of the redshifts of a grid, shape (n, nz), where they are known: 0 at the nearest.
+    Compute ln(prior) of the redshifts of a grid, shape (n, nz), where they are known: 0 at the nearest.
 
     It is -inf elsewhere. The nearest lies within ``tolerance`` in abs(dz) / (1 + z), or half a cell.
     Redshifts that are missing, too far from the grid, or without a model are flagged in ``flags``.
     """
-    n, z = values.size, grid_redshift
+    n = values.size
+    z = grid_redshift
     missing = np.isnan(values)
-    safe = np.where(missing, z[0], values)
-    node = np.argmin(np.abs(np.log1p(safe)[:, None] - np.log1p(z)), axis=1)
-    apart = np.abs(safe - z[node]) / (1.0 + safe)
+    z_or_first = np.where(missing, z[0], values)
+    node = np.argmin(np.abs(np.log1p(z_or_first)[:, None] - np.log1p(z)), axis=1)
+    distance = np.abs(z_or_first - z[node]) / (1.0 + z_or_first)
     if tolerance is not None:
         limit = np.full(n, tolerance)
     else:
         # in ln(1 + z), in which the nearest is: between two nodes nothing is too far from both
-        apart = np.abs(np.log1p(safe) - np.log1p(z[node]))
+        distance = np.abs(np.log1p(z_or_first) - np.log1p(z[node]))
         step = np.concatenate([[0.0], np.diff(np.log1p(z)), [0.0]])
         limit = 1.001 * np.maximum(step[node], step[node + 1]) / 2.0 + 1e-6
-        limit = np.maximum(limit, 1e-3 if z.size == 1 else 0.0)
-    outside = ~missing & (apart > limit)
+        if z.size == 1:
+            # a single redshift has no cell
+            limit = np.maximum(limit, 1e-3)
+    outside = ~missing & (distance > limit)
     flags[missing] |= int(FitFlags.NO_REDSHIFT)
     flags[outside] |= int(FitFlags.REDSHIFT_OUTSIDE)
     out = np.full((n, z.size), -np.inf)

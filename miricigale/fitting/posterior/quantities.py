@@ -23,16 +23,15 @@ _IR = ("AGN share of 3-1000 um light", "ir_luminosity_agn", "ir_luminosity_galax
 _DUST = ("AGN power over the sum with the dust luminosity", "agn_power", "dust_luminosity")
 #: AGN fractions by name: what they are, the AGN's part in them and the galaxy's.
 FRACTIONS = {"frac_agn_dust": _DUST, "frac_agn_ir": _IR}
-_ALL = 1e30
-
-
+#: Factor of y where all of a luminosity is the AGN's.
+_AGN_ALONE = 1e30
 #: Other codes quote the mass of living stars, which is 0.2 to 0.3 dex less.
 FORMED_TEXT = (
     "mass of all stars formed; that of living stars, which other codes quote, is stellar_mass"
 )
 
 
-def plain(column):
+def column_values(column):
     """Values of a column as an array of float, without its unit."""
     return np.asarray(getattr(column, "value", column), dtype=float)
 
@@ -44,7 +43,7 @@ def unit_of(column):
 
 def draws_summary(value, *, with_log=True, weight=None):
     """
-    Mean, standard deviation and mean log10, and quantiles at `DERIVED_LEVELS`, of finite draws.
+    Compute mean, standard deviation and mean log10, and quantiles at `DERIVED_LEVELS`, of finite draws.
 
     The mean log10, of draws above 0, is NaN without ``with_log``: for quantities that do not scale with mass.
     Draws have the same weight, or the weights ``weight``.
@@ -56,7 +55,9 @@ def draws_summary(value, *, with_log=True, weight=None):
     if not value.size:
         return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
     lit = value[value > 0]
-    log = np.mean(np.log10(lit)) if with_log and lit.size else np.nan
+    log = np.nan
+    if with_log and lit.size:
+        log = np.mean(np.log10(lit))
     place = DERIVED_LEVELS * (value.size - 1)
     quantiles = np.interp(place, np.arange(value.size), np.sort(value))
     return np.array([value.mean(), value.std(), log]), quantiles
@@ -70,7 +71,8 @@ def _weighted_summary(value, weight, with_log):
     weight = weight / total
     mean = np.sum(weight * value)
     std = np.sqrt(np.sum(weight * np.square(value - mean)))
-    lit, log = value > 0, np.nan
+    lit = value > 0
+    log = np.nan
     if with_log and np.any(lit):
         log = np.sum(weight[lit] * np.log10(value[lit])) / weight[lit].sum()
     order = np.argsort(value, kind="stable")
@@ -89,26 +91,30 @@ def put_draws(results, new, i, values, weight=None):
     for j, name in enumerate(results.quantities):
         if name in values:
             with_log = np.isfinite(results.moments[i, j, 2])
-            found = draws_summary(values[name], with_log=with_log, weight=weight)
-            new["moments"][i, j], new["quantiles"][i, j] = found
+            moments, quantiles = draws_summary(values[name], with_log=with_log, weight=weight)
+            new["moments"][i, j] = moments
+            new["quantiles"][i, j] = quantiles
 
 
 def node_shares(nodes, shape, weight=None):
     """
-    Part of the draws at each combination of nodes: arrays of indices, one for each axis of ``shape``.
+    Count the part of the draws at each combination of nodes: arrays of indices, one for each axis of ``shape``.
 
     Draws have the same weight, or the weights ``weight``.
     """
     place = np.ravel_multi_index(nodes, shape)
-    total = len(place) if weight is None else weight.sum()
+    if weight is None:
+        total = len(place)
+    else:
+        total = weight.sum()
     return np.bincount(place, weight, minlength=np.prod(shape)).reshape(shape) / total
 
 
-def kept_percentiles(name, levels, kept):
+def kept_percentiles(name, levels, quantiles):
     """
-    Percentiles of a quantity, shape (n, n_levels), linear between its kept quantiles.
+    Interpolate percentiles of a quantity, shape (n, n_levels), linearly between its stored quantiles.
 
-    ``kept`` has those at `DERIVED_LEVELS`, shape (n, n_kept). A `ValueError` is raised for levels beyond
+    ``quantiles`` has those at `DERIVED_LEVELS`, shape (n, n_kept). A `ValueError` is raised for levels beyond
     these: nothing is known of the tails.
     """
     low, high = DERIVED_LEVELS[[0, -1]]
@@ -116,7 +122,7 @@ def kept_percentiles(name, levels, kept):
     check_that(not np.any((levels < low) | (levels > high)), "levels", wanted, f"{levels.tolist()}")
     i = np.maximum(np.searchsorted(DERIVED_LEVELS, levels) - 1, 0)
     part = (levels - DERIVED_LEVELS[i]) / (DERIVED_LEVELS[i + 1] - DERIVED_LEVELS[i])
-    return kept[:, i] * (1.0 - part) + kept[:, i + 1] * part
+    return quantiles[:, i] * (1.0 - part) + quantiles[:, i + 1] * part
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,13 +139,15 @@ class ShapeQuantities:
 
     @cached_property
     def _nodes(self):
-        """For each quantity: galaxies by ascending value, starts of equal values, the values."""
+        """Galaxies by ascending value, starts of equal values and the values, for each quantity."""
         out = []
         for row in self.values:
             finite = np.flatnonzero(np.isfinite(row))
             order = finite[np.argsort(row[finite], kind="stable")]
             value = row[order]
-            width = np.ptp(value) if value.size else 0.0
+            width = 0.0
+            if value.size:
+                width = np.ptp(value)
             start = np.flatnonzero(np.diff(value, prepend=-np.inf) > _SAME * width)
             out.append((order, start, value[start]))
         return out
@@ -153,7 +161,8 @@ class ShapeQuantities:
         cell. Rows of NaN give NaN.
         """
         shape = len(weights), len(self.names)
-        out, quantiles = np.full((*shape, 3), np.nan), np.full((*shape, len(levels)), np.nan)
+        out = np.full((*shape, 3), np.nan)
+        quantiles = np.full((*shape, len(levels)), np.nan)
         for i, (order, start, nodes) in enumerate(self._nodes):
             if nodes.size == 0:
                 continue
@@ -167,8 +176,10 @@ class ShapeQuantities:
             out[:, i, 0] = mean
             out[:, i, 1] = np.sqrt(np.sum(part * (value - mean[:, None]) ** 2, axis=1))
             pdf = np.add.reduceat(part, start, axis=1)
-            bounds = (0.0 if self.names[i] in _NOT_NEGATIVE else -np.inf, np.inf)
-            quantiles[:, i] = cell_percentiles(nodes, pdf, levels, bounds)
+            lowest = -np.inf
+            if self.names[i] in _NOT_NEGATIVE:
+                lowest = 0.0
+            quantiles[:, i] = cell_percentiles(nodes, pdf, levels, (lowest, np.inf))
         return out, quantiles
 
 
@@ -188,19 +199,27 @@ class OtherFraction:
 
     @classmethod
     def of_grid(cls, grid):
-        """Of a `~miricigale.sed.ModelGrid`; None if it has no AGN or not the quantities needed."""
+        """Make the fraction of a `~miricigale.sed.ModelGrid`; None without AGN or the quantities needed."""
         by_dust = grid.frac_agn_definition == "dust"
-        of_galaxy = "ir_luminosity" if by_dust else "dust_luminosity"
-        of_agn = "ir_luminosity" if by_dust else "agn_power"
-        tables = (grid.galaxy_properties, of_galaxy), (grid.agn_properties, of_agn)
-        if not (grid.n_agn and all(column in table.colnames for table, column in tables)):
+        # the definition that the grid does not use
+        name = "frac_agn_dust"
+        of_galaxy = "dust_luminosity"
+        of_agn = "agn_power"
+        if by_dust:
+            name = "frac_agn_ir"
+            of_galaxy = "ir_luminosity"
+            of_agn = "ir_luminosity"
+        has_galaxy = of_galaxy in grid.galaxy_properties.colnames
+        has_agn = grid.n_agn and of_agn in grid.agn_properties.colnames
+        if not (has_galaxy and has_agn):
             return None
-        galaxy, agn = (_in_watt(table[column])[0] for table, column in tables)
+        galaxy, _ = _in_watt(grid.galaxy_properties[of_galaxy])
+        agn, _ = _in_watt(grid.agn_properties[of_agn])
         reference = grid.dust_luminosity
-        # where a galaxy has none of it all of it is the AGN's
-        ratio = np.where(reference > 0, _ALL, 0.0)
+        # where a galaxy has none of this luminosity, all of it is the AGN's
+        ratio = np.where(reference > 0, _AGN_ALONE, 0.0)
         np.divide(reference, galaxy, out=ratio, where=galaxy > 0)
-        return cls("frac_agn_ir" if by_dust else "frac_agn_dust", ratio, agn)
+        return cls(name, ratio, agn)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,50 +246,76 @@ class Quantities:
     @classmethod
     def of_grid(cls, grid):
         """
-        Quantities of a model grid.
+        Collect the quantities of a model grid.
 
         All columns of its property tables are taken. A column of both tables (``ir_luminosity``)
         gives three quantities: the sum, and the parts ``<name>_galaxy`` and ``<name>_agn``;
         without one, the sum is ``total_luminosity``, dust luminosity and AGN power.
         """
         n_agn = grid.n_agn
-        of_galaxy, of_agn = grid.galaxy_properties, grid.agn_properties
-        both = [n for n in of_galaxy.colnames if n_agn and n in of_agn.colnames]
+        of_galaxy = grid.galaxy_properties
+        of_agn = grid.agn_properties
+        shared = []
+        if n_agn:
+            shared = [name for name in of_galaxy.colnames if name in of_agn.colnames]
         # name, unit and meaning of each
-        found = [("mass", MASS, FORMED_TEXT)]
-        galaxy_scale, agn_scale = [np.ones(grid.n_galaxies)], []
-        mixed_galaxy, mixed_agn = grid.dust_luminosity, np.ones(n_agn)
+        quantities = [("mass", MASS, FORMED_TEXT)]
+        galaxy_scale = [np.ones(grid.n_galaxies)]
+        agn_scale = []
+        mixed_galaxy = grid.dust_luminosity
+        mixed_agn = np.ones(n_agn)
         mixed = ("total_luminosity", LUMINOSITY, "dust luminosity and AGN power")
         for column in of_galaxy.itercols():
-            name, text = column.info.name, _text(column, ", for one solar mass formed")
+            name = column.info.name
+            text = _text(column, ", for one solar mass formed")
             values, unit = _in_watt(column)
-            found.append((f"{name}_galaxy" if name in both else name, unit, text))
+            if name in shared:
+                quantities.append((f"{name}_galaxy", unit, text))
+            else:
+                quantities.append((name, unit, text))
             galaxy_scale.append(values)
-            if name in both[:1]:
-                mixed, mixed_galaxy = (name, LUMINOSITY, f"{text}; and of the AGN"), values
-        for column in of_agn.itercols() if n_agn else ():
-            name, unit = column.info.name, unit_of(column)
-            unit = LUMINOSITY if unit == u.dimensionless_unscaled else unit * LUMINOSITY
+            if name in shared[:1]:
+                mixed = (name, LUMINOSITY, f"{text}; and of the AGN")
+                mixed_galaxy = values
+        agn_columns = []
+        if n_agn:
+            agn_columns = list(of_agn.itercols())
+        for column in agn_columns:
+            name = column.info.name
+            unit = unit_of(column)
+            if unit == u.dimensionless_unscaled:
+                unit = LUMINOSITY
+            else:
+                unit = unit * LUMINOSITY
             text = _text(column, ", W for each W of AGN power")
-            found.append((f"{name}_agn" if name in both else name, unit, text))
-            agn_scale.append(plain(column))
-            if name in both[:1]:
+            if name in shared:
+                quantities.append((f"{name}_agn", unit, text))
+            else:
+                quantities.append((name, unit, text))
+            agn_scale.append(column_values(column))
+            if name in shared[:1]:
                 mixed_agn = agn_scale[-1]
         columns = list(grid.galaxy_shape.itercols())
         of_shape = [(c.info.name, unit_of(c), _text(c, "")) for c in columns]
         fraction = OtherFraction.of_grid(grid)
-        found += [mixed, *of_shape]
+        quantities.append(mixed)
+        quantities += of_shape
         if fraction is not None:
             text = FRACTIONS[fraction.name][0]
-            found.append((fraction.name, u.dimensionless_unscaled, text))
-        values = np.array([plain(c) for c in columns], float).reshape(len(columns), grid.n_galaxies)
+            quantities.append((fraction.name, u.dimensionless_unscaled, text))
+        values = np.array([column_values(c) for c in columns], float).reshape(
+            len(columns), grid.n_galaxies
+        )
+        names, units, descriptions = zip(*quantities, strict=True)
         return cls(
-            *zip(*found, strict=True),
+            names,
+            units,
+            descriptions,
             np.array(galaxy_scale),
             np.array(agn_scale, float).reshape(len(agn_scale), n_agn),
             np.array(mixed_galaxy, float),
             np.array(mixed_agn, float),
-            ShapeQuantities(tuple(name for name, *_ in of_shape), values),
+            ShapeQuantities(tuple(column.info.name for column in columns), values),
             fraction,
         )
 
@@ -280,7 +325,7 @@ class Quantities:
         return self.names[len(self.galaxy_scale) + len(self.agn_scale) + 1 :]
 
     def summarize(self, out):
-        """Moments and quantiles of all quantities, from what the grid engine found for n objects."""
+        """Compute moments and quantiles of all quantities, from the sums of the grid engine for n objects."""
         moments, quantiles = self.shape.summarize(out.galaxy, DERIVED_LEVELS)
         parts = [(out.moments, out.quantiles), (moments, quantiles)]
         if self.fraction is not None:
@@ -290,25 +335,29 @@ class Quantities:
 
     def evaluate(self, name, grid, g, k, frac, scale):
         """
-        Values of a quantity for single models: galaxies, AGN templates, fractions and scales.
+        Evaluate a quantity for single models: galaxies, AGN templates, fractions and scales.
 
         Indices and numbers have one shape, and the values have it too; a scale of NaN gives NaN.
         """
-        i, n, of = self.names.index(name), len(self.galaxy_scale), self.fraction
+        i = self.names.index(name)
+        n = len(self.galaxy_scale)
+        fraction = self.fraction
         if i < n:
             return scale * self.galaxy_scale[i][g]
         # no value where there is no model
         if name in self.shape.names:
             values = self.shape.values[self.shape.names.index(name)][g]
             return np.where(np.isfinite(scale), values, np.nan)
-        if of is not None and name == of.name:
-            y = frac / (1.0 - frac) * of.galaxy[g] * of.agn[k]
+        if fraction is not None and name == fraction.name:
+            y = frac / (1.0 - frac) * fraction.galaxy[g] * fraction.agn[k]
             return np.where(np.isfinite(scale), y / (1.0 + y), np.nan)
         power = scale * frac / (1.0 - frac) * grid.dust_luminosity[g]
         if i < n + len(self.agn_scale):
             return power * self.agn_scale[i - n][k]
         mixed = scale * self.mixed_galaxy[g]
-        return mixed + power * self.mixed_agn[k] if self.mixed_agn.size else mixed
+        if self.mixed_agn.size:
+            return mixed + power * self.mixed_agn[k]
+        return mixed
 
 
 def _text(column, ending):
@@ -317,8 +366,8 @@ def _text(column, ending):
 
 
 def _in_watt(column):
-    """Values of a column for each solar mass, and the unit of the whole: W of luminosities."""
+    """Return the values of a column for each solar mass, and the unit of the total: W of luminosities."""
     unit = unit_of(column) * MASS
     if not unit.is_equivalent(LUMINOSITY):
-        return plain(column), unit
-    return plain(column) * unit.to(LUMINOSITY), LUMINOSITY
+        return column_values(column), unit
+    return column_values(column) * unit.to(LUMINOSITY), LUMINOSITY

@@ -1,4 +1,4 @@
-"""Nested samplers for continuous parameters: what one is given, what it returns, and which there are."""
+"""Nested samplers for continuous parameters: their arguments, what they return, and how to find one by name."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -131,7 +131,9 @@ class Lockstep:
         self._log_like = log_like
         self._turn = threading.Condition()
         self._own = threading.local()
-        self._asked, self._answers, self._running = {}, {}, 0
+        self._asked = {}
+        self._answers = {}
+        self._running = 0
 
     def map(self, function, items):
         """Call ``function`` with each item; list of results in order."""
@@ -140,7 +142,9 @@ class Lockstep:
         with ThreadPoolExecutor(self.size) as threads:
             for rows in chunks(len(items), self.size):
                 part = items[rows]
-                self._asked, self._answers, self._running = {}, {}, len(part)
+                self._asked = {}
+                self._answers = {}
+                self._running = len(part)
                 run = partial(self._run, function)
                 out += list(threads.map(run, range(len(part)), part))
         return out

@@ -11,7 +11,7 @@ from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.data.settings import SamplerSettings
 from miricigale.fitting.posterior.posterior import cell_edges, check_pairs
 from miricigale.fitting.posterior.priors import GridAxis
-from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, FORMED_TEXT, plain
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, FORMED_TEXT, column_values
 from miricigale.fitting.results.results import FitResults
 from miricigale.fitting.samplers import CITATIONS, get_sampler
 from miricigale.fitting.samplers.run import Calls, FluxModel, positive_normal, systematic_draws
@@ -23,9 +23,10 @@ from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
 
-#: Draws from the prior of which every component has to be able to evaluate one, and of which at least one
-#: has to be possible for an object.
-_FEW_TRIALS, _TRIALS = 64, 2048
+#: Draws from the prior of which every component has to be able to evaluate one.
+_N_LIBRARY_TRIALS = 64
+#: Draws from the prior of which at least one has to be possible for an object.
+_N_TRIALS = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +55,15 @@ class SamplerFit:
 
     @classmethod
     def of_model(cls, model, filters, priors, settings, *, sampler, scale_error):
-        """Work out the priors of a model, and set the sampler up."""
+        """Set up the sampler with the priors of a model."""
         check_that(isinstance(model, FluxModel), "model", "an SEDModel", type(model).__name__)
         check_that(isinstance(priors, dict), "priors", "a dict of parameters", repr(priors))
         predict = settings.predict
-        names = tuple(n for some in (filters, predict) for n in getattr(some, "names", some))
-        bands = FilterSet([*filters, *predict]) if isinstance(model, SEDModel) else names
+        names = (*getattr(filters, "names", filters), *getattr(predict, "names", predict))
+        if isinstance(model, SEDModel):
+            bands = FilterSet([*filters, *predict])
+        else:
+            bands = names
         fit = cls(
             model=model,
             bands=bands,
@@ -78,11 +82,14 @@ class SamplerFit:
         """Refuse priors of which no draw can be evaluated by some component."""
         if not isinstance(self.model, SEDModel):
             return
-        points = np.random.default_rng(0).random((_FEW_TRIALS, self.space.n_dim))
+        points = np.random.default_rng(0).random((_N_LIBRARY_TRIALS, self.space.n_dim))
         values = self.space.values(points)
-        rows = [{name: float(v[i]) for name, v in values.items()} for i in range(_FEW_TRIALS)]
+        rows = [{name: float(v[i]) for name, v in values.items()} for i in range(_N_LIBRARY_TRIALS)]
         for component in self.model.components:
-            why = [component.invalid(row) for row in rows] if component.refuses else [None]
+            if component.refuses:
+                why = [component.invalid(row) for row in rows]
+            else:
+                why = [None]
             names = [name for name in component.parameters if name in self.space.free]
             argument = " and ".join(f"priors[{name!r}]" for name in names)
             wanted = f"values that {component.name!r} has, such as a list of them"
@@ -96,8 +103,12 @@ class SamplerFit:
     @property
     def content(self):
         """What makes a fit another one, besides `settings`: name to anything with a checksum."""
-        model, request = self.model, self.request
-        recipe = model.recipe if isinstance(model, SEDModel) else type(model)
+        model = self.model
+        request = self.request
+        if isinstance(model, SEDModel):
+            recipe = model.recipe
+        else:
+            recipe = type(model)
         return {"space": self.space, "model": recipe, "draws": (request.n_draws, request.n_cells)}
 
     @property
@@ -107,10 +118,14 @@ class SamplerFit:
 
     def settings(self):
         """Return the settings of the fit as plain values."""
-        request, fixed = self.request, self.space.fixed.items()
+        request = self.request
+        fixed = self.space.fixed.items()
+        mass = "parameter"
+        if self.profile:
+            mass = "profile"
         return {
             "priors": {name: str(prior) for name, prior in self.space.free.items()},
-            "mass": "profile" if self.profile else "parameter",
+            "mass": mass,
             "scale_error": self.scale_error,
             **{name: getattr(request, name) for name in ("n_live", "n_effective", "max_calls")},
             "options": {name: str(value) for name, value in request.options.items()},
@@ -119,9 +134,11 @@ class SamplerFit:
 
     def provenance(self):
         """Return what results say of the model, and what to cite for it and the sampler."""
-        known = dict(self.model.meta)
-        cited = CITATIONS.get(self.sampler, ()) if isinstance(self.sampler, str) else ()
-        return {"citations": (*known.pop("citations", ()), *cited), "model": known}
+        meta = dict(self.model.meta)
+        cited = ()
+        if isinstance(self.sampler, str):
+            cited = CITATIONS.get(self.sampler, ())
+        return {"citations": (*meta.pop("citations", ()), *cited), "model": meta}
 
     def check_data(self, data):
         """All data will do."""
@@ -132,7 +149,10 @@ class SamplerFit:
 
         See `~miricigale.fitting.grid.grid_fit.GridFit.redshifts`.
         """
-        space, kind = self.space, "free" if "redshift" in self.space.free else "fixed"
+        space = self.space
+        kind = "fixed"
+        if "redshift" in self.space.free:
+            kind = "free"
         if redshift is not None:
             kind = "fixed"
             spaces = space.at_redshifts(self._limits, photometry, redshift, flags)
@@ -146,8 +166,13 @@ class SamplerFit:
         else:
             msg = "'priors' must have 'redshift', or 'redshift' or 'redshift_prior' be given"
             raise ValueError(msg)
-        check_that(all(one.n_dim for one in spaces), "priors", "with a free parameter", "none")
-        n_free = max((one.n_dim for one in spaces), default=0) + self.profile
+        check_that(
+            all(object_space.n_dim for object_space in spaces),
+            "priors",
+            "with a free parameter",
+            "none",
+        )
+        n_free = max((object_space.n_dim for object_space in spaces), default=0) + self.profile
         return spaces, n_free, kind
 
     @property
@@ -169,9 +194,14 @@ class SamplerFit:
 
     def _axes(self, spaces):
         """Cells of all parameters that are free for some object, and of redshift."""
-        model, n_cells = self.model, self.request.n_cells
-        agn = model.component("agn") if isinstance(model, SEDModel) else None
-        kinds = {} if agn is None else dict.fromkeys(agn.parameters, "agn")
+        model = self.model
+        n_cells = self.request.n_cells
+        agn = None
+        if isinstance(model, SEDModel):
+            agn = model.component("agn")
+        kinds = {}
+        if agn is not None:
+            kinds = dict.fromkeys(agn.parameters, "agn")
         kinds |= {"redshift": "redshift", "frac_agn": "frac_agn"}
         axes = {}
         cells = {"redshift": redshift_axis(spaces, self._limits, n_cells)}
@@ -179,7 +209,9 @@ class SamplerFit:
             if name not in ("mass", "redshift"):
                 cells[name] = prior.cells(n_cells)
         for name, (nodes, weights, bounds) in cells.items():
-            unit = 1 if name == "redshift" else model.parameters[name].unit
+            unit = 1
+            if name != "redshift":
+                unit = model.parameters[name].unit
             kind = kinds.get(name, "galaxy")
             axes[name] = GridAxis(name, nodes, unit, kind, weights, None, bounds)
         return axes
@@ -187,10 +219,14 @@ class SamplerFit:
     def _fit_piece(self, axes, pairs, seed, piece):
         """`FitResults` of a piece: its photometry, parameters and priors."""
         data, spaces = piece
-        flags, n, columns = np.array(data.flags), len(data), self.columns
+        flags = np.array(data.flags)
+        n = len(data)
+        columns = self.columns
         quantities = ("mass", *columns)
         size = {name: axis.values.size for name, axis in axes.items()}
-        n_axes, n_derived, n_levels = len(axes), len(quantities), len(DERIVED_LEVELS)
+        n_axes = len(axes)
+        n_derived = len(quantities)
+        n_levels = len(DERIVED_LEVELS)
         shapes = {
             "pdf_2d": (size["redshift"], size.get("frac_agn", 1)),
             "axis_moments": (n_axes, 2),
@@ -210,10 +246,10 @@ class SamplerFit:
             "best": {name: np.full(n, np.nan) for name in (*axes, *quantities)},
         }
         for row in np.flatnonzero((flags & int(FitFlags.UNFITTED)) == 0):
-            found = self._sample(data._take(row), spaces[row], seed, axes, pairs)
-            if found is None:
+            posterior = self._sample(data._take(row), spaces[row], seed, axes, pairs)
+            if posterior is None:
                 flags[row] |= int(FitFlags.NO_MODEL)
-            for name, value in (found or {}).items():
+            for name, value in (posterior or {}).items():
                 if isinstance(value, dict):
                     for key, array in out[name].items():
                         array[row] = value[key]
@@ -252,29 +288,35 @@ class SamplerFit:
         formed, 1 by default.
         """
         n = len(next(iter(values.values())))
-        table = QTable(values | {"mass": np.ones(n) if mass is None else mass}, copy=False)
-        got = self.model.fluxes(table, self.bands)
-        flux = np.column_stack([got[name].value for name in self.filters])
-        return flux, {name: plain(got[name]) for name in self.columns}
+        if mass is None:
+            mass = np.ones(n)
+        table = QTable(values | {"mass": mass}, copy=False)
+        fluxes = self.model.fluxes(table, self.bands)
+        flux = np.column_stack([fluxes[name].value for name in self.filters])
+        return flux, {name: column_values(fluxes[name]) for name in self.columns}
 
     def _sample(self, data, space, seed, axes, pairs):
-        """What results hold of the posterior of one object, by name; None if its prior leaves no model."""
+        """Sample the posterior of one object, as results hold it by name; None if its prior leaves no model."""
         key = str(data.ids)
         with single_threaded():
-            calls, rng = Calls(self, data, space), stream(seed, "fit", "prior", key)
-            trials = (calls(rng.random((256, space.n_dim)))[0] for _ in range(_TRIALS // 256))
+            calls = Calls(self, data, space)
+            rng = stream(seed, "fit", "prior", key)
+            trials = (calls(rng.random((256, space.n_dim)))[0] for _ in range(_N_TRIALS // 256))
             if not any(np.isfinite(log_like).any() for log_like in trials):
                 return None
-            calls, rng = Calls(self, data, space), stream(seed, "fit", key)
+            calls = Calls(self, data, space)
+            rng = stream(seed, "fit", key)
             sampled = get_sampler(self.sampler)(calls, space.n_dim, rng, self.request)
             keep = sampled.weight > 0
-            weight, call = sampled.weight[keep], np.asarray(sampled.call)[keep]
-            # Kish's
+            weight = sampled.weight[keep]
+            call = np.asarray(sampled.call)[keep]
+            # effective sample size of Kish 1965
             n_effective = np.sum(weight) ** 2 / np.sum(np.square(weight))
             weight = weight / weight.sum()
-            # the best of all models that were met, whether or not they are part of the sample
+            # the best of all models that were evaluated, whether or not they are part of the sample
             best = [int(np.argmin(calls.of("chi2", slice(None))))]
-            scale, best_scale = calls.of("scale", call), calls.of("scale", best)
+            scale = calls.of("scale", call)
+            best_scale = calls.of("scale", best)
             if self.profile and self.scale_error:
                 std = np.sqrt(calls.of("variance", call))
                 scale = positive_normal(scale, std, stream(seed, "scale", key))
@@ -300,21 +342,25 @@ class SamplerFit:
         }
 
     def _scaled(self, derived, parameters, scale, fixed):
-        """Derived quantities of models of given masses, from those for one solar mass."""
+        """Scale derived quantities of models from one solar mass to their masses."""
         columns = self.columns
         out = {"mass": scale}
         for name, array in derived.items():
-            out[name] = array * scale if columns[name].extensive else array
-        other = [name for name, column in columns.items() if column.of == "xray"]
-        if other:
+            if columns[name].extensive:
+                out[name] = array * scale
+            else:
+                out[name] = array
+        xray_names = [name for name, column in columns.items() if column.of == "xray"]
+        if xray_names:
             # these are not proportional to mass
-            rest = {n: np.full(scale.size, v) for n, v in fixed.items() if n != "mass"}
-            got = self.models(rest | parameters, scale)[1]
-            out |= {name: got[name] for name in other}
+            constants = {n: np.full(scale.size, v) for n, v in fixed.items() if n != "mass"}
+            _, quantities = self.models(constants | parameters, scale)
+            for name in xray_names:
+                out[name] = quantities[name]
         return out
 
     def _reduced(self, weight, values, derived, flux, axes, pairs, rng):
-        """What results hold of a weighted sample, by name."""
+        """Reduce a weighted sample to what results hold of it, by name."""
         size = {name: axis.values.size for name, axis in axes.items()}
         cells = {name: _cell(axis, values[name]) for name, axis in axes.items()}
         # one cell of the AGN fraction where it is no axis
@@ -328,13 +374,14 @@ class SamplerFit:
 
         columns = [values[name] for name in axes] + list(derived.values())
         moments, quantiles = zip(*(_summary(array, weight) for array in columns), strict=True)
-        n, mean = len(axes), weight @ flux
+        n = len(axes)
+        mean = weight @ flux
         drawn = rng.permutation(systematic_draws(weight, self.request.n_draws, rng))
         return {
             "pdf": {n: np.bincount(cells[n], weight, minlength=size[n]) for n in axes},
             "pdf_2d": joint("redshift", "frac_agn"),
             "pairs": {(x, y): joint(x, y) for x, y in pairs},
-            "axis_moments": [one[:2] for one in moments[:n]],
+            "axis_moments": [pair[:2] for pair in moments[:n]],
             "axis_quantiles": quantiles[:n],
             "moments": moments[n:],
             "quantiles": quantiles[n:],
@@ -345,21 +392,24 @@ class SamplerFit:
 
 
 def _cell(axis, values):
-    """Cell of an axis in which each value lies; the outermost take what is beyond."""
+    """Find the cell of an axis in which each value lies; the outermost take values beyond."""
     edges = cell_edges(axis.values, axis.bounds)
     return np.searchsorted(edges[1:-1], values, side="right")
 
 
 def _summary(values, weight):
-    """Mean, standard deviation and mean of log10, and quantiles, of a weighted sample."""
+    """Compute mean, standard deviation and mean of log10, and quantiles, of a weighted sample."""
     good = np.isfinite(values)
     if not good.any():
         return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
-    values, weight = values[good], weight[good] / weight[good].sum()
+    values = values[good]
+    weight = weight[good] / weight[good].sum()
     mean = weight @ values
     std = np.sqrt(weight @ np.square(values - mean))
     lit = values > 0
-    log_mean = weight[lit] @ np.log10(values[lit]) / weight[lit].sum() if lit.any() else np.nan
+    log_mean = np.nan
+    if lit.any():
+        log_mean = weight[lit] @ np.log10(values[lit]) / weight[lit].sum()
     order = np.argsort(values, kind="stable")
     middle = np.cumsum(weight[order]) - 0.5 * weight[order]
     return np.array([mean, std, log_mean]), np.interp(DERIVED_LEVELS, middle, values[order])

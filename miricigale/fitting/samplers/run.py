@@ -28,8 +28,11 @@ class Calls:
     """All evaluations of the likelihood of one object, in order."""
 
     def __init__(self, fit, data, space):
-        self._fit, self._data, self._space = fit, data, space
-        self._parts, self.n = [], 0
+        self._fit = fit
+        self._data = data
+        self._space = space
+        self._parts = []
+        self.n = 0
         sigma = data.sigma[data.measured]
         self._norm = np.log(sigma).sum() + 0.5 * sigma.size * np.log(2.0 * np.pi)
 
@@ -37,15 +40,17 @@ class Calls:
         values = self._space.values(np.asarray(points))
         mass = values.pop("mass")
         flux, derived = self._fit.models(values)
-        used, data = self._data.used, self._data
+        in_use = self._data.used
+        data = self._data
         good = np.isfinite(flux).all(axis=1)
-        seen = np.where(good[:, None], flux[:, used], 1.0)
-        measured = (data.flux[used], data.sigma[used], data.limit[used])
+        fitted_flux = np.where(good[:, None], flux[:, in_use], 1.0)
+        measured = (data.flux[in_use], data.sigma[in_use], data.limit[in_use])
         if self._fit.profile:
-            scale, variance = best_scale(seen, *measured)
+            scale, variance = best_scale(fitted_flux, *measured)
         else:
-            scale, variance = mass, np.zeros(len(mass))
-        chi2 = chi2_at(scale, seen, *measured)
+            scale = mass
+            variance = np.zeros(len(mass))
+        chi2 = chi2_at(scale, fitted_flux, *measured)
         chi2[~good] = np.inf
         part = {name: values[name] for name in self._space.free if name != "mass"}
         part = {"parameters": part, "derived": derived, "flux": flux}
@@ -66,10 +71,10 @@ def positive_normal(mean, std, rng):
     """Draws from normal distributions, those below 0 drawn again."""
     out = mean + std * rng.standard_normal(mean.size)
     for _ in range(1000):
-        below = np.flatnonzero(out < 0)
-        if not below.size:
+        negative = np.flatnonzero(out < 0)
+        if not negative.size:
             break
-        out[below] = mean[below] + std[below] * rng.standard_normal(below.size)
+        out[negative] = mean[negative] + std[negative] * rng.standard_normal(negative.size)
     return out
 
 
@@ -99,8 +104,8 @@ def chi2_at(scale, model, flux, sigma, limit):
     Sum of ((F - s m) / sigma)^2 and, of limits, of -2 ln(1/2 (1 + erf((F - s m) / (sqrt2 sigma))))
     (Sawicki 2012, PASP 124, 1208, eq. A10; Boquien et al. 2019, section 4.3).
     """
-    apart = (flux - scale[:, None] * model) / sigma
-    return np.sum(np.where(limit, -2.0 * log_ndtr(apart), np.square(apart)), axis=1)
+    residual = (flux - scale[:, None] * model) / sigma
+    return np.sum(np.where(limit, -2.0 * log_ndtr(residual), np.square(residual)), axis=1)
 
 
 def best_scale(model, flux, sigma, limit):
@@ -113,9 +118,11 @@ def best_scale(model, flux, sigma, limit):
     Gaussian with the curvature of chi2 at the minimum; both are 0 for a model without light there.
     """
     unit = model / sigma
-    measured, bound = unit[:, ~limit], unit[:, limit]
+    measured = unit[:, ~limit]
+    bound = unit[:, limit]
     ratio = (flux / sigma)[~limit]
-    p, q = measured @ ratio, np.sum(measured * measured, axis=1)
+    p = measured @ ratio
+    q = np.sum(measured * measured, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = np.where(q > 0, np.maximum(p, 0.0) / q, 0.0)
         if not limit.any():

@@ -43,7 +43,8 @@ class Flat:
 
     def cells(self, n):
         """Nodes of n cells (or the prior's own values), their weights, and the limits of the outermost."""
-        nodes, bounds = self.nodes(n), self.bounds
+        nodes = self.nodes(n)
+        bounds = self.bounds
         total = self.cdf(cell_edges(nodes, bounds)[1:-1])
         return nodes, np.diff(np.concatenate([[0.0], total, [1.0]])), bounds
 
@@ -115,7 +116,9 @@ class Continuous(Flat):
     def nodes(self, n):
         """Middles of n cells: even, or even in the logarithm if they span more than a factor 30."""
         low, high = self.transform(np.array([_TAIL, 1.0 - _TAIL]))
-        return (Log if 0 < 30 * low < high else Flat)(low, high).nodes(n)
+        if 0 < 30 * low < high:
+            return Log(low, high).nodes(n)
+        return Flat(low, high).nodes(n)
 
     def __str__(self):
         law = getattr(getattr(self.law, "dist", None), "name", type(self.law).__name__)
@@ -151,25 +154,31 @@ class Table:
 
     def cut(self, low, high):
         """Leave out what lies outside ``low`` and ``high``; None if nothing is left."""
-        low, high = max(low, self.value[0]), min(high, self.value[-1])
+        low = max(low, self.value[0])
+        high = min(high, self.value[-1])
         if not low < high:
             return None
         inside = self.value[(self.value > low) & (self.value < high)]
         value = np.concatenate([[low], inside, [high]])
         new = Table(value, np.interp(value, self.value, self.density))
-        return new if new.area > 0 else None
+        if new.area > 0:
+            return new
+        return None
 
     def transform(self, unit):
         """Values at which the cumulative prior is ``unit``."""
         target = np.asarray(unit) * self.area
         i = np.clip(np.searchsorted(self._total, target, side="right") - 1, 0, self.value.size - 2)
-        first, last = self.density[i], self.density[i + 1]
+        first = self.density[i]
+        last = self.density[i + 1]
         width = self.value[i + 1] - self.value[i]
-        rest = target - self._total[i]
+        remainder = target - self._total[i]
         # the root of first t + (last - first) t^2 / (2 width) = rest that stays finite
-        root = np.sqrt(np.maximum(first**2 + 2.0 * rest * (last - first) / width, 0.0))
-        below = first + root
-        step = np.divide(2.0 * rest, below, out=np.zeros_like(rest), where=below > 0)
+        root = np.sqrt(np.maximum(first**2 + 2.0 * remainder * (last - first) / width, 0.0))
+        lower_root = first + root
+        step = np.divide(
+            2.0 * remainder, lower_root, out=np.zeros_like(remainder), where=lower_root > 0
+        )
         return self.value[i] + np.clip(step, 0.0, width)
 
     def cdf(self, value):
@@ -229,7 +238,8 @@ def _choice(argument, values, weights, parameter):
     if not (np.all(np.isfinite(weights) & (weights >= 0)) and weights.sum() > 0):
         raise argument_error(argument, "weights that are finite, >= 0 and not all 0", f"{weights}")
     order = np.argsort(values)
-    values, weights = np.array(values)[order], weights[order]
+    values = np.array(values)[order]
+    weights = weights[order]
     check_that(np.all(np.diff(values) != 0), argument, "different values", values)
     if values.size == 1:
         return float(values[0])
@@ -248,17 +258,26 @@ class Space:
         """Take the priors of the parameters of a model; parameters without are at their defaults."""
         declared = model.parameters
         check_names(priors, "parameter", declared)
-        made = {name: make_prior(name, priors[name], declared[name]) for name in priors}
-        free = {name: made[name] for name in declared if not isinstance(made.get(name, 0.0), float)}
-        every = {name: made.get(name, parameter.default) for name, parameter in declared.items()}
-        return cls(free, {name: every[name] for name in every if name not in free})
+        prior_of = {name: make_prior(name, priors[name], declared[name]) for name in priors}
+        free_priors = {}
+        constants = {}
+        for name, parameter in declared.items():
+            prior = prior_of.get(name, parameter.default)
+            if name in prior_of and not isinstance(prior, float):
+                free_priors[name] = prior
+            else:
+                constants[name] = prior
+        return cls(free_priors, constants)
 
     def with_prior(self, name, prior):
         """Copy in which a parameter has another prior, or a value."""
-        free = {key: value for key, value in self.free.items() if key != name}
-        fixed = {key: value for key, value in self.fixed.items() if key != name}
-        (fixed if isinstance(prior, float) else free)[name] = prior
-        return replace(self, free=free, fixed=fixed)
+        free_priors = {key: value for key, value in self.free.items() if key != name}
+        constants = {key: value for key, value in self.fixed.items() if key != name}
+        if isinstance(prior, float):
+            constants[name] = prior
+        else:
+            free_priors[name] = prior
+        return replace(self, free=free_priors, fixed=constants)
 
     @property
     def n_dim(self):
@@ -284,12 +303,14 @@ class Space:
         """
         nodes, density = read_density(redshift_prior, len(flags))
         out = []
-        for row, one in enumerate(np.broadcast_to(density, (len(flags), nodes.size))):
-            known = np.isfinite(one).all()
-            table = Table(nodes, np.array(one)).cut(*limits) if known else None
-            if table is None:
+        for row, heights in enumerate(np.broadcast_to(density, (len(flags), nodes.size))):
+            prior = None
+            if np.isfinite(heights).all():
+                prior = Table(nodes, np.array(heights)).cut(*limits)
+            if prior is None:
                 flags[row] |= int(FitFlags.NO_MODEL)
-            out.append(self.with_prior("redshift", Flat(*limits) if table is None else table))
+                prior = Flat(*limits)
+            out.append(self.with_prior("redshift", prior))
         return out
 
     def values(self, points):
@@ -302,23 +323,27 @@ class Space:
 
 def redshift_axis(spaces, limits, n):
     """
-    Cells of redshift (see `Flat.cells`) for objects that may have a prior, or a redshift, of their own.
+    Make the cells of redshift (see `Flat.cells`) for objects that may each have a prior or a redshift.
 
     The weights are the mean prior of the objects.
     """
-    free = [space.free["redshift"] for space in spaces if "redshift" in space.free]
-    if not free:
+    priors = [space.free["redshift"] for space in spaces if "redshift" in space.free]
+    if not priors:
         values = [space.fixed["redshift"] for space in spaces] or [0.0]
-        low, high = min(values), max(values)
+        low = min(values)
+        high = max(values)
         if high > low:
             return Flat(low, high).cells(n)
         return np.array([low]), np.ones(1), (low, low)
-    if all(prior is free[0] for prior in free):
-        return free[0].cells(n)
-    tables = [prior for prior in free if isinstance(prior, Table)]
+    if all(prior is priors[0] for prior in priors):
+        return priors[0].cells(n)
+    tables = [prior for prior in priors if isinstance(prior, Table)]
     if tables:
-        limits = min(p.bounds[0] for p in tables), max(p.bounds[1] for p in tables)
+        lowest = min(table.bounds[0] for table in tables)
+        highest = max(table.bounds[1] for table in tables)
+        limits = (lowest, highest)
     nodes, _, bounds = Flat(*limits).cells(n)
     edges = cell_edges(nodes, bounds)
-    cdf = np.mean([p.cdf(edges) for p in tables] or [edges], axis=0)
+    # without tables the priors are flat within the limits, and so is their mean
+    cdf = np.mean([table.cdf(edges) for table in tables] or [edges], axis=0)
     return nodes, np.diff(cdf) / (cdf[-1] - cdf[0]), bounds
