@@ -17,7 +17,7 @@ CORNER = ("redshift", "stellar_mass", "sfr", "a_v", "frac_agn")
 
 def samples(results, key):
     """
-    Draws of a sampler from the posterior of the object of this id, all of the same weight.
+    Tabulate the draws of a sampler from the posterior of one object, all of the same weight.
 
     Returns
     -------
@@ -32,30 +32,30 @@ def samples(results, key):
     if results.draws is None:
         msg = "results of a grid hold no draws; BayesFitter.sample makes some"
         raise ValueError(msg)
-    one = results.loc[key]._fitted_one()
-    values = zip(results.parameters, one.draws.T, strict=True)
+    result = results.loc[key]._fitted_one()
+    values = zip(results.parameters, result.draws.T, strict=True)
     columns = {n: (u.Quantity(v, results.unit(n)), results._meaning(n)) for n, v in values}
     return described_table(columns, dict(results.meta) | {"id": str(key)})
 
 
 def best_parameters(results, model):
-    """Parameters of ``model`` in the best fit of one object, without those that have no effect there: dict."""
+    """Return the parameters of ``model`` in the best fit of one object, without those of no effect: dict."""
     best = results._fitted_one().best
     names = dict.fromkeys((*results.axes, "redshift", "mass"))
-    known = {name: best[name].value for name in names if name in best}
+    best_values = {name: best[name].value for name in names if name in best}
     if "agn_power" in best and best["agn_power"].value == 0.0:
-        # of a galaxy without dust that its fraction refers to
-        known.pop("frac_agn", None)
+        # the fraction refers to the dust luminosity, which this galaxy does not have
+        best_values.pop("frac_agn", None)
     return {
         name: u.Quantity(value, model.parameters[name].unit)
-        for name, value in (results.constants | known).items()
+        for name, value in (results.constants | best_values).items()
         if name in model.parameters and np.isfinite(value)
     }
 
 
 def best_sed(results, model=None, **changes):
     """
-    Spectrum of the best model of a single object.
+    Compute the spectrum of the best model of a single object.
 
     Parameters
     ----------
@@ -75,7 +75,8 @@ def best_sed(results, model=None, **changes):
     ValueError
         If no model is known or the object was not fitted.
     """
-    model = results._one("best_sed").model if model is None else model
+    if model is None:
+        model = results._one("best_sed").model
     check_that(model is not None, "model", "an SEDModel (these results know none)", "None")
     sed = model.evaluate(**best_parameters(results, model) | changes)
     if results.distance is None or not np.isfinite(results.distance) or "redshift" in changes:
@@ -85,11 +86,11 @@ def best_sed(results, model=None, **changes):
 
 
 def fitted_curves(results):
-    """The bands of results as a `~miricigale.filters.FilterSet`, with curves of one's own where they are known."""
+    """Return the bands of results as a `~miricigale.filters.FilterSet`, with the user's curves if known."""
     from miricigale.filters import FilterSet
 
-    own = {one.name: one for one in results.curves}
-    return FilterSet([own.get(name, name) for name in results.filters])
+    user_curves = {curve.name: curve for curve in results.curves}
+    return FilterSet([user_curves.get(name, name) for name in results.filters])
 
 
 def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
@@ -117,12 +118,13 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
     from miricigale.plotting.posteriors import plot_sed_fit
 
     results._one("plot_sed")
-    filters = fitted_curves(results) if filters is None else filters
+    if filters is None:
+        filters = fitted_curves(results)
     order = [filters.names.index(name) for name in results.filters]
     if model is not None or results.model is not None:
         sed = results.best_sed(model)
         kwargs.setdefault("spectrum", (sed.wave, sed.fnu))
-    used = np.isfinite(results.sigma)
+    in_fit = np.isfinite(results.sigma)
     if results.outlier is not None and np.any(results.outlier > 0.5):
         kwargs.setdefault("groups", np.where(results.outlier > 0.5, "looks wrong", "fluxes"))
     text = f"{plain_text(results.ids)}: z = {results.best['redshift'].value:.3f}"
@@ -131,9 +133,9 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
         u.Quantity(filters.pivots)[order],
         results.flux * FNU,
         # a band that was left out may have an error that is none
-        np.where(used, results.sigma, np.maximum(results.flux_err, 0.0)) * FNU,
+        np.where(in_fit, results.sigma, np.maximum(results.flux_err, 0.0)) * FNU,
         results.best_flux * FNU,
-        used=used,
+        used=in_fit,
         limit=results.limit,
         ax=ax,
         **kwargs,
@@ -160,10 +162,10 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
         raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
     weights = results._one("plot_pdf2d").joint_pdf(x, y)
     kwargs.setdefault("labels", tuple(labeled(name, results.unit(name)) for name in (x, y)))
-    axes = (results.axes[name] for name in (x, y))
-    # those of the nodes, among which what is absent has a cell that can be seen
-    edges = (cell_edges(axis.values, axis.bounds) for axis in axes)
-    return plot_pdf_2d(*edges, weights, ax=ax, **kwargs)
+    # edges around the nodes: there an absent component has a cell that can be seen
+    x_edges = cell_edges(results.axes[x].values, results.axes[x].bounds)
+    y_edges = cell_edges(results.axes[y].values, results.axes[y].bounds)
+    return plot_pdf_2d(x_edges, y_edges, weights, ax=ax, **kwargs)
 
 
 def plot_corner(results, key=None, names=None, *, truths=None, figure=None):
@@ -193,36 +195,39 @@ def plot_corner(results, key=None, names=None, *, truths=None, figure=None):
     """
     from miricigale.plotting.corner import plot_corner
 
-    one = results if key is None else results.loc[key]
-    one = one._one("plot_corner")._fitted_one()
+    if key is None:
+        result = results
+    else:
+        result = results.loc[key]
+    result = result._one("plot_corner")._fitted_one()
     if names is None:
-        names = _with_joint_posteriors(one)
-    names = [one._named(name) for name in names]
+        names = _with_joint_posteriors(result)
+    names = [result._named(name) for name in names]
     edges = []
     for name in names:
-        check_names([name], "parameter with joint posteriors", one.axes)
-        axis = one.axes[name]
+        check_names([name], "parameter with joint posteriors", result.axes)
+        axis = result.axes[name]
         edges.append(cell_edges(axis.values, axis.bounds))
-    marginals = [(cells, one.pdf[name]) for name, cells in zip(names, edges, strict=True)]
+    marginals = [(cells, result.pdf[name]) for name, cells in zip(names, edges, strict=True)]
     joints = {}
     for row, later in enumerate(names):
         for column, earlier in enumerate(names[:row]):
-            joints[row, column] = edges[column], edges[row], one.joint_pdf(earlier, later)
-    labels = [labeled(name, one.unit(name)) for name in names]
-    marked = {one._named(name): value for name, value in (truths or {}).items()}
+            joints[row, column] = edges[column], edges[row], result.joint_pdf(earlier, later)
+    labels = [labeled(name, result.unit(name)) for name in names]
+    marked = {result._named(name): value for name, value in (truths or {}).items()}
     check_names(marked, "parameter for 'truths'", names)
     values = [marked.get(name) for name in names]
     return plot_corner(labels, marginals, joints, truths=values, figure=figure)
 
 
-def _with_joint_posteriors(one):
-    """Parameters all of whose pairs have a joint posterior, beginning with redshift and AGN fraction."""
-    pairs = {frozenset(pair) for pair in one.pairs}
-    if "frac_agn" in one.axes:
+def _with_joint_posteriors(result):
+    """List parameters all of whose pairs have a joint posterior, beginning with redshift and AGN fraction."""
+    pairs = {frozenset(pair) for pair in result.pairs}
+    if "frac_agn" in result.axes:
         pairs.add(frozenset(("redshift", "frac_agn")))
     names = []
-    for name in dict.fromkeys(("redshift", "frac_agn", *one.axes)):
-        if name in one.axes and all(frozenset((name, other)) in pairs for other in names):
+    for name in dict.fromkeys(("redshift", "frac_agn", *result.axes)):
+        if name in result.axes and all(frozenset((name, partner)) in pairs for partner in names):
             names.append(name)
     return names
 
@@ -253,17 +258,17 @@ def plot_redshift(results, z_spec, ax=None, **kwargs):
     """
     from miricigale.plotting.comparison import plot_redshifts
 
-    some = results._several()
-    check_that(not some.redshift_fixed, "redshift", "free in the fit", "fixed")
-    known = to_array(z_spec, u.one, "z_spec")
-    known = np.atleast_1d(known)
-    wanted = f"{len(some)} redshifts, one for each object"
-    check_that(known.shape == (len(some),), "z_spec", wanted, f"shape {known.shape}")
+    results_list = results._several()
+    check_that(not results_list.redshift_fixed, "redshift", "free in the fit", "fixed")
+    z_known = to_array(z_spec, u.one, "z_spec")
+    z_known = np.atleast_1d(z_known)
+    wanted = f"{len(results_list)} redshifts, one for each object"
+    check_that(z_known.shape == (len(results_list),), "z_spec", wanted, f"shape {z_known.shape}")
     with np.errstate(invalid="ignore"):
-        good = some.fitted & (known > 0)
+        good = results_list.fitted & (z_known > 0)
     check_that(np.any(good), "z_spec", "positive for one fitted object at least", "none")
-    low, middle, high = some[good].percentile("redshift", [0.16, 0.5, 0.84]).value.T
-    true = known[good]
+    low, middle, high = results_list[good].percentile("redshift", [0.16, 0.5, 0.84]).value.T
+    true = z_known[good]
     offset = (middle - true) / (1.0 + true)
     bias = np.median(offset)
     scatter = 1.4826 * np.median(np.abs(offset - bias))
@@ -277,8 +282,10 @@ def plot_redshift(results, z_spec, ax=None, **kwargs):
 
 
 def labeled(name, unit):
-    """Label of an axis of a plot: a name and its unit."""
+    """Format the label of an axis of a plot: a name and its unit."""
     from miricigale.plotting.axes import plain_text
 
-    text = unit.to_string()
-    return plain_text(f"{name} ({text})" if text else name)
+    text = name
+    if unit.to_string():
+        text = f"{name} ({unit.to_string()})"
+    return plain_text(text)

@@ -9,7 +9,8 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 
 #: Unit of star-formation rates, and steps of the history drawn.
-_RATE, _STEPS = u.Msun / u.yr, 400
+_RATE = u.Msun / u.yr
+_STEPS = 400
 
 
 def rates_at(component, values, lookback):
@@ -38,25 +39,25 @@ def sfh_band(samples, key, levels=LEVELS):
         ``p84``), Msun / yr, taken at every time by itself: no draw need be that of a line.
     """
     levels = check_levels(levels)
-    one = samples.loc[key]._fitted_one()
+    draws = samples.loc[key]._fitted_one()
     component = samples._model().component("sfh")
     columns = {}
     for name, parameter in component.parameters.items():
-        columns[name] = np.full(one.n_draws, parameter.default)
+        columns[name] = np.full(draws.n_draws, parameter.default)
         if name in samples.axes:
-            columns[name] = one.values(name).value
+            columns[name] = draws.values(name).value
         elif name in samples.grid.galaxy_parameters.colnames:
             column = samples.grid.galaxy_parameters[name]
-            columns[name] = u.Quantity(column).value[one.index[:, 1]]
-    mass = one.values("mass").to_value(u.Msun)
+            columns[name] = u.Quantity(column).value[draws.index[:, 1]]
+    mass = draws.values("mass").to_value(u.Msun)
     lookback = (np.arange(_STEPS) + 0.5) / _STEPS * np.max(columns["age"])
     rows = np.array([columns[name] for name in columns]).T
-    different, which = np.unique(rows, axis=0, return_inverse=True)
+    distinct, row_of_draw = np.unique(rows, axis=0, return_inverse=True)
     rates = [
         rates_at(component, dict(zip(columns, map(float, row), strict=True)), lookback)
-        for row in different
+        for row in distinct
     ]
-    drawn = np.array(rates)[which.reshape(-1)] * mass[:, None]
+    drawn = np.array(rates)[row_of_draw.reshape(-1)] * mass[:, None]
     table = {"lookback": (lookback * u.Gyr, "time before the light left the galaxy")}
     for level, row in zip(levels, np.quantile(drawn, levels, axis=0), strict=True):
         table[suffix(level)] = (row * _RATE, f"quantile {level:g} of the star-formation rate")
@@ -114,12 +115,15 @@ def plot_best_sfh(results, ax=None, *, model=None, **kwargs):
     from miricigale.fitting.results.drawing import best_parameters
     from miricigale.plotting.posteriors import plot_history
 
-    one = results._one("plot_sfh")
-    model = results.model if model is None else model
-    component = None if model is None else model.component("sfh")
+    result = results._one("plot_sfh")
+    if model is None:
+        model = results.model
+    component = None
+    if model is not None:
+        component = model.component("sfh")
     if component is None:
         raise argument_error("model", "given where results were read from a file", "None")
-    best = best_parameters(one, model)
+    best = best_parameters(result, model)
     values = {name: parameter.default for name, parameter in component.parameters.items()}
     values |= {name: float(best[name].value) for name in values if name in best}
     lookback = (np.arange(_STEPS) + 0.5) / _STEPS * values["age"]

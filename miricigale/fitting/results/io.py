@@ -37,7 +37,8 @@ _FACTS = ("redshift_fixed", "constants", "least_std", "meta")
 
 def write_results(results, path, *, overwrite=False):
     """Write results: their table, a table extension of all arrays, and a text extension of all else."""
-    single, results = results.isscalar, results._several()
+    single = results.isscalar
+    results = results._several()
     ascii_ids(results.ids, "ids")
     table = {n: array for n, array in results._per_object() if isinstance(array, np.ndarray)}
     for name in _DICTS:
@@ -62,10 +63,14 @@ def read_results(path, *, rows=None):
     """Read results, all or these rows (a list or array); see `~miricigale.fitting.FitResults`."""
     mapped = rows is not None
     with open_parts(path, (_RESULTS,), wanted="fit results", memmap=mapped) as parts:
-        text, table = parts.text, parts.table("RESULTS", rows=rows)
+        text = parts.text
+        table = parts.table("RESULTS", rows=rows)
         columns = {}
         for name, shape in text["shapes"].items():
-            full = native(table[name]) if name in table.colnames else np.zeros(0)
+            if name in table.colnames:
+                full = native(table[name])
+            else:
+                full = np.zeros(0)
             columns[name] = full.reshape(len(table), *shape)
         values = {name: tuple(text[name]) for name in _TUPLES}
         values |= {name: text[name] for name in _FACTS} | {name: {} for name in _DICTS}
@@ -80,12 +85,15 @@ def read_results(path, *, rows=None):
         values["units"] = tuple(u.Unit(unit) for unit in text["units"])
         values["axes"] = _axes_from_plain(text["axes"], {})
         results = FitResults(**values)
-        return results._take(0) if text.get("single") else results
+        if text.get("single"):
+            return results._take(0)
+        return results
 
 
 def write_samples(samples, path, *, overwrite=False):
     """Write samples: a table extension of the draws, a text extension, and the axes' shares."""
-    single, samples = samples.isscalar, samples._several()
+    single = samples.isscalar
+    samples = samples._several()
     ascii_ids(samples.ids, "ids")
     text = {
         "meta": samples.meta,
@@ -107,7 +115,8 @@ def read_samples(path, grid, *, model=None):
     if not isinstance(grid, ModelGrid):
         raise argument_error("grid", "the ModelGrid that was fitted", type(grid).__name__)
     with open_parts(path, (_SAMPLES,), wanted="samples") as parts:
-        text, table = parts.text, parts.table("SAMPLES")
+        text = parts.text
+        table = parts.table("SAMPLES")
         shape = len(table), int(text["n_draws"])
         columns = {name: native(table[name]) for name in ("ids", "flags", "index", "scale")}
         columns["index"] = columns["index"].reshape(*shape, 4)
@@ -115,18 +124,25 @@ def read_samples(path, grid, *, model=None):
         names = {name: f"SHARE{i}" for i, name in enumerate(text["axes"])}
         shares = {name: parts.array(key) for name, key in names.items() if key in parts}
         axes = _axes_from_plain(text["axes"], shares)
-        known, whose, meta = text["grid"]["sha256"], text["grid"]["text"], text["meta"]
+        grid_sha256 = text["grid"]["sha256"]
+        grid_text = text["grid"]["text"]
+        meta = text["meta"]
         seed = int(text["seed"])
-    if content_sha256(grid) != known:
-        raise argument_error("grid", f"the one of the samples, {whose}", f"another, {grid!r}")
+    if content_sha256(grid) != grid_sha256:
+        raise argument_error("grid", f"the one of the samples, {grid_text}", f"another, {grid!r}")
     samples = Samples(grid=grid, model=model, meta=meta, axes=axes, seed=seed, **columns)
-    return samples._take(0) if text.get("single") else samples
+    if text.get("single"):
+        return samples._take(0)
+    return samples
 
 
 def _axes_to_plain(axes):
     """Turn axes without their shares into what JSON knows."""
-    plain = {name: {key: getattr(axis, key) for key in _AXIS} for name, axis in axes.items()}
-    return {name: one | {"unit": u.Unit(one["unit"]).to_string()} for name, one in plain.items()}
+    out = {}
+    for name, axis in axes.items():
+        out[name] = {key: getattr(axis, key) for key in _AXIS}
+        out[name]["unit"] = u.Unit(axis.unit).to_string()
+    return out
 
 
 def _axes_from_plain(text, shares):
@@ -134,8 +150,8 @@ def _axes_from_plain(text, shares):
     kinds = {"values": np.array, "weights": np.array, "unit": u.Unit, "kind": str, "bounds": tuple}
     axes = {}
     for name, axis in text.items():
-        made = {key: kind(axis[key]) for key, kind in kinds.items()}
-        axes[name] = GridAxis(name, **made, share=shares.get(name))
+        fields = {key: kind(axis[key]) for key, kind in kinds.items()}
+        axes[name] = GridAxis(name, **fields, share=shares.get(name))
     return axes
 
 
@@ -164,37 +180,38 @@ class FitFolder(RecordFolder):
     remedy = "results of fit_file need a folder of their own"
 
     def parse(self, values):
-        """Facts and records, of which the facts are complete; none before the fit is known."""
+        """Check facts and records of the manifest, whose facts are complete; none before the fit is known."""
         facts, parts = super().parse(values)
         if facts.get("format", FORMAT) != FORMAT:
-            what = (
+            problem = (
                 f"holds results of fit_file in the layout {facts['format']!r} of another version of the package, "
                 f"and this one reads {FORMAT!r}: fit again in another folder, or read it with the version that "
                 "wrote it"
             )
-            raise data_error(self.folder, what)
+            raise data_error(self.folder, problem)
         if facts or parts:
             facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
         return facts, parts
 
 
 def part_name(i):
-    """File name of part ``i``."""
+    """Return the file name of part ``i``."""
     return f"part-{i:05d}.fits"
 
 
 def part_ids(path):
-    """Ids of a part, read without the rest."""
+    """Read the ids of a part, without the rest."""
     with open_fits(path, wanted="fit results", memmap=True) as hdus:
         return native(np.array(hdus["RESULTS"].data["ids"]))
 
 
 def part_chi2(path):
-    """Reduced chi2 of the objects of a part, read without the rest; NaN of a single band."""
+    """Read the reduced chi2 of the objects of a part, without the rest; NaN of a single band."""
     with open_fits(path, wanted="fit results", memmap=True) as hdus:
         data = hdus["RESULTS"].data
-        chi2, free = native(np.array(data["chi2"])), native(np.array(data["n_bands"])) - 1
-    return np.divide(chi2, free, out=np.full(chi2.shape, np.nan), where=free > 0)
+        chi2 = native(np.array(data["chi2"]))
+        degrees = native(np.array(data["n_bands"])) - 1
+    return np.divide(chi2, degrees, out=np.full(chi2.shape, np.nan), where=degrees > 0)
 
 
 def open_results(path, *, partial=False, model=None, curves=()):
@@ -229,8 +246,8 @@ def open_results(path, *, partial=False, model=None, curves=()):
     """
     results = FitResultsFiles(path, model=model, curves=curves)
     if not (partial or results.complete):
-        what = "fit_file with the same arguments resumes; partial=True opens what is there"
-        raise data_error(path, f"holds {len(results.paths)} of {results.n_parts} parts: {what}")
+        remedy = "fit_file with the same arguments resumes; partial=True opens what is there"
+        raise data_error(path, f"holds {len(results.paths)} of {results.n_parts} parts: {remedy}")
     return results
 
 
@@ -279,7 +296,9 @@ class FitResultsFiles:
 
     def __repr__(self):
         n = sum(record["fitted"] for record in self._records)
-        state = "" if self.complete else f" of {self.n_parts}"
+        state = ""
+        if not self.complete:
+            state = f" of {self.n_parts}"
         return (
             f"<FitResultsFiles of {len(self)} objects, {n} fitted, "
             f"{len(self.paths)}{state} parts in {self.path}>"
@@ -295,7 +314,9 @@ class FitResultsFiles:
 
     def _read(self, path, rows=None):
         results = read_results(path, rows=rows)._changed(model=self.model, curves=self.curves)
-        return results if self._chi2_limit is None else with_high_chi2(results, self._chi2_limit)
+        if self._chi2_limit is None:
+            return results
+        return with_high_chi2(results, self._chi2_limit)
 
     def parts(self):
         """Iterate over the parts: one `FitResults` at a time."""
@@ -323,7 +344,8 @@ class FitResultsFiles:
 
     def row(self, key):
         """The file of an id and the row in it."""
-        key = key.item() if isinstance(key, np.generic) else key
+        if isinstance(key, np.generic):
+            key = key.item()
         for path in self.paths:
             ids = part_ids(path).tolist()
             if key in ids:
@@ -333,15 +355,16 @@ class FitResultsFiles:
 
     def _rows(self, rows):
         """Results of rows by number, in their order."""
-        ends = np.cumsum([0, *(record["rows"] for record in self._records)])
+        n_rows = [record["rows"] for record in self._records]
+        ends = np.cumsum([0, *n_rows])
         of_part = np.searchsorted(ends, rows, side="right") - 1
-        found = [
-            self._read(path, rows[of_part == i] - ends[i])
-            for i, path in enumerate(self.paths)
-            if i == 0 or np.any(of_part == i)
-        ]
+        parts = []
+        for i, path in enumerate(self.paths):
+            # the first part also stands for no rows at all
+            if i == 0 or np.any(of_part == i):
+                parts.append(self._read(path, rows[of_part == i] - ends[i]))
         order = np.argsort(of_part, kind="stable")
-        return FitResults.concatenate(found)[np.argsort(order)]
+        return FitResults.concatenate(parts)[np.argsort(order)]
 
     def to_table(self, columns=None):
         """
@@ -369,7 +392,9 @@ class FitResultsFiles:
         for part in self.parts():
             table = part.to_table()
             check_names(columns or (), "column", table.colnames)
-            yield table if columns is None else table[list(columns)]
+            if columns is not None:
+                table = table[list(columns)]
+            yield table
 
     def write_table(self, path, *, columns=None, overwrite=False):
         """

@@ -34,8 +34,8 @@ def draw_objects(objects, filters, titles=None):
     n = len(objects)
     figure = Figure(figsize=(WIDTH, _HEIGHT * n), layout="constrained")
     rows = figure.subfigures(n, 1, squeeze=False)[:, 0]
-    for k, (row, one) in enumerate(zip(rows, objects, strict=True)):
-        fixed = one.redshift_fixed
+    for k, (row, result) in enumerate(zip(rows, objects, strict=True)):
+        fixed = result.redshift_fixed
         mosaic = [["fluxes"], ["residuals"]]
         ratios = {"height_ratios": [3, 1]}
         if not fixed:
@@ -43,11 +43,13 @@ def draw_objects(objects, filters, titles=None):
             ratios["width_ratios"] = [3, 1.2]
         axes = row.subplot_mosaic(mosaic, **ratios)
         axes["residuals"].sharex(axes["fluxes"])
-        options = {} if titles is None else {"title": titles[k]}
-        one.plot_sed((axes["fluxes"], axes["residuals"]), filters=filters, **options)
+        options = {}
+        if titles is not None:
+            options = {"title": titles[k]}
+        result.plot_sed((axes["fluxes"], axes["residuals"]), filters=filters, **options)
         axes["fluxes"].title.set_fontsize("small")
         if not fixed:
-            one.plot_pdf("redshift", axes["redshift"])
+            result.plot_pdf("redshift", axes["redshift"])
     return figure
 
 
@@ -82,26 +84,30 @@ def write_plots(results, folder, ids=None, *, overwrite=False, progress_bar=Fals
         If a file exists and ``overwrite`` is False.
     """
     folder = Path(folder)
-    left = None if ids is None else {str(key) for key in ids}
-    filters, paths = None, []
+    missing_ids = None
+    if ids is not None:
+        missing_ids = {str(key) for key in ids}
+    filters = None
+    paths = []
     with progress(show=progress_bar, total=len(results), desc="plots", unit="objects") as bar:
-        for one in results:
+        for result in results:
             bar.update()
-            key = str(one.ids)
-            if left is not None:
-                if key not in left:
+            key = str(result.ids)
+            if missing_ids is not None:
+                if key not in missing_ids:
                     continue
-                left.remove(key)
-            if not one.fitted:
+                missing_ids.remove(key)
+            if not result.fitted:
                 continue
-            filters = fitted_curves(one) if filters is None else filters
+            if filters is None:
+                filters = fitted_curves(result)
             folder.mkdir(parents=True, exist_ok=True)
             path = folder / f"{quote(key, safe='')}.png"
-            title = f"{plain_text(key)}: reduced chi2 {one.reduced_chi2:.2f}"
+            title = f"{plain_text(key)}: reduced chi2 {result.reduced_chi2:.2f}"
             with replacing(path, overwrite=overwrite) as partial:
-                draw_objects([one], filters, [title]).savefig(partial, format="png", dpi=110)
+                draw_objects([result], filters, [title]).savefig(partial, format="png", dpi=110)
             paths.append(path)
-    if left:
-        msg = f"no object with the id {min(left)!r}"
+    if missing_ids:
+        msg = f"no object with the id {min(missing_ids)!r}"
         raise KeyError(msg)
     return paths

@@ -8,13 +8,16 @@ import numpy as np
 
 from miricigale.utils.exceptions import CatalogWarning, FitWarning, warn
 
-#: Signal-to-noise ratio of the fluxes that count, and how many there have to be.
-_SIGNAL, _LEAST = 5.0, 30
-#: Mean squared residual of the other bands up to which a fit counts, and mean relative variance of its model
-#: fluxes over that of a single model from which it does.
-_FITS, _SEVERAL = 2.0, 1.2
+#: Signal-to-noise ratio of the fluxes that count.
+_MIN_SIGNAL = 5.0
+#: Smallest number of such fluxes in a band.
+_MIN_FLUXES = 30
+#: Mean squared residual of the other bands below which a fit counts.
+_MAX_MEAN_SQUARE = 2.0
+#: Mean relative variance of the model fluxes, over that of a single model, above which a fit counts.
+_MIN_SPREAD = 1.2
 #: Scatter of pulls above which a band is warned of.
-_WIDE = 1.5
+_MAX_SCATTER = 1.5
 _TEXT = "fluxes scatter about what the other bands predict"
 _REMEDY = (
     "'calibrate' measures errors, 'model_error' enlarges them, 'outliers' lets fluxes be wrong"
@@ -23,7 +26,7 @@ _REMEDY = (
 
 def left_out_pulls(results):
     r"""
-    Pulls of fluxes about what the other bands predict, without fits of these.
+    Compute pulls of fluxes about what the other bands predict, without fits of these.
 
     With the flux d, its error in the fit :math:`\sigma` (model error included), and mean m and standard deviation
     s of the model flux over the posterior, the pull is :math:`(d - m) / \sqrt{\sigma^2 - s^2}`. Where the
@@ -50,54 +53,61 @@ def left_out_pulls(results):
     if results.outlier is not None:
         sigma[results.outlier > 0.5] = np.nan
     with np.errstate(all="ignore"):
-        free = np.sqrt(np.square(sigma) - np.square(results.model_flux_std))
-        return np.where(free > 0, (results.flux - results.model_flux) / free, np.nan)
+        pull_error = np.sqrt(np.square(sigma) - np.square(results.model_flux_std))
+        return np.where(pull_error > 0, (results.flux - results.model_flux) / pull_error, np.nan)
 
 
 def wide_bands(results):
     """
-    Bands whose pulls scatter by more than 1.5: name to (scatter, number of fluxes).
+    Find bands whose pulls scatter by more than 1.5: name to (scatter, number of fluxes).
 
     The scatter is 1.48 times the median absolute `left_out_pulls` of fluxes of S/N above 5, of which there have to
     be 30, in fits that describe the other bands (a mean squared residual below 2) by more than one model of the
     grid; to count it also has to be above 1 by twice its error. None if half of the bands or more have it: then
     it is the models that do not fit.
     """
-    out, n_bands, pull = {}, 0, np.abs(left_out_pulls(results))
-    used = np.isfinite(results.sigma) & ~results.limit
-    model, sigma = (np.where(used, one, np.nan) for one in (results.model_flux, results.sigma))
+    out = {}
+    n_bands = 0
+    pull = np.abs(left_out_pulls(results))
+    measured = np.isfinite(results.sigma) & ~results.limit
+    model = np.where(measured, results.model_flux, np.nan)
+    sigma = np.where(measured, results.sigma, np.nan)
     with np.errstate(all="ignore"):
         square = np.nan_to_num(np.square((results.flux - model) / sigma))
-        others = np.sum(square, axis=1, keepdims=True) - square
-        good = others < _FITS * (used.sum(axis=1) - 1)[:, None]
+        others_chi2 = np.sum(square, axis=1, keepdims=True) - square
+        good = others_chi2 < _MAX_MEAN_SQUARE * (measured.sum(axis=1) - 1)[:, None]
         # of a single model only the scale is free, and its relative variance is 1 over this sum
         scale = np.nansum(np.square(model / sigma), axis=1)
         spread = np.sum(np.square(np.nan_to_num(results.model_flux_std / model)), axis=1)
-        several = spread * scale > _SEVERAL * used.sum(axis=1)
-        pull[~(good & several[:, None] & (results.flux > _SIGNAL * results.flux_err))] = np.nan
+        has_several_models = spread * scale > _MIN_SPREAD * measured.sum(axis=1)
+        pull[
+            ~(good & has_several_models[:, None] & (results.flux > _MIN_SIGNAL * results.flux_err))
+        ] = np.nan
     for name, column in zip(results.filters, pull.T, strict=True):
-        some = column[np.isfinite(column)]
-        if some.size >= _LEAST:
+        pulls = column[np.isfinite(column)]
+        if pulls.size >= _MIN_FLUXES:
             n_bands += 1
-            scatter = 1.4826 * np.median(some)
+            scatter = 1.4826 * np.median(pulls)
             # the error of a median absolute deviation is 1.17 / sqrt(n)
-            if scatter > _WIDE and scatter * (1.0 - 2.0 * 1.17 / np.sqrt(some.size)) > 1.0:
-                out[name] = (float(scatter), some.size)
-    return out if 2 * len(out) < n_bands or n_bands == 1 else {}
+            if scatter > _MAX_SCATTER and scatter * (1.0 - 2.0 * 1.17 / np.sqrt(pulls.size)) > 1.0:
+                out[name] = (float(scatter), pulls.size)
+    if 2 * len(out) < n_bands or n_bands == 1:
+        return out
+    return {}
 
 
 def warn_of_pulls(results):
     """Warn of `wide_bands`, by name; not with ``compat``, where errors of model fluxes lack those of scales."""
-    found = wide_bands(results).items()
-    if found and not results.meta["fit"].get("compat"):
-        bands = ", ".join(f"{k} {scatter:.1f} times ({n} fluxes)" for k, (scatter, n) in found)
+    wide = wide_bands(results).items()
+    if wide and not results.meta["fit"].get("compat"):
+        bands = ", ".join(f"{k} {scatter:.1f} times ({n} fluxes)" for k, (scatter, n) in wide)
         text = "fluxes scatter about what the other bands predict by more than errors allow"
         warn(f"{text}: {bands}; {_REMEDY}", FitWarning)
 
 
 @contextlib.contextmanager
 def without_warnings():
-    """Leave out warnings of catalogs and of `warn_of_pulls`: of fits that measure errors themselves."""
+    """Silence warnings of catalogs and of `warn_of_pulls`, for fits that measure errors themselves."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CatalogWarning)
         warnings.filterwarnings("ignore", re.escape(_TEXT), FitWarning)

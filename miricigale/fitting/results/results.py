@@ -203,8 +203,10 @@ class FitResults(FitRows):
 
     def _repr_html_(self):
         table = self._several()[:_SHOWN].to_table()._repr_html_()
-        more = "" if self.isscalar or len(self) <= _SHOWN else f", the first {_SHOWN}"
-        return f"<p>{html.escape(repr(self))}{more}</p>{table}"
+        shown_text = ""
+        if not (self.isscalar or len(self) <= _SHOWN):
+            shown_text = f", the first {_SHOWN}"
+        return f"<p>{html.escape(repr(self))}{shown_text}</p>{table}"
 
     @property
     def fitted(self):
@@ -219,15 +221,19 @@ class FitResults(FitRows):
     @property
     def reduced_chi2(self):
         """Chi2 over the number of bands (limits among them) less one; NaN with a single band."""
-        free = np.asarray(np.maximum(self.n_bands - 1, 0))
-        return np.divide(self.chi2, free, out=np.full(free.shape, np.nan), where=free > 0)[()]
+        degrees = np.asarray(np.maximum(self.n_bands - 1, 0))
+        return np.divide(self.chi2, degrees, out=np.full(degrees.shape, np.nan), where=degrees > 0)[
+            ()
+        ]
 
     @property
     def band_off(self):
         """The band that is off (`FitFlags` ``BAND_OFF``), empty without: array of str, shape (n,)."""
         names = np.array([*self.filters, ""])
-        found = names[worst_bands(self._several())]
-        return found[0] if self.isscalar else found
+        worst = names[worst_bands(self._several())]
+        if self.isscalar:
+            return worst[0]
+        return worst
 
     @property
     def parameters(self):
@@ -240,7 +246,7 @@ class FitResults(FitRows):
         if name in self.axes:
             return u.Unit(self.axes[name].unit)
         if name == "redshift":
-            # a fixed one has no axis
+            # a fixed redshift has no axis
             return u.dimensionless_unscaled
         return self.units[self._quantity(name)]
 
@@ -253,33 +259,40 @@ class FitResults(FitRows):
         return self.quantities.index(name)
 
     def _meaning(self, name):
-        return self.descriptions[self._quantity(name)] if name in self.quantities else name
+        if name in self.quantities:
+            return self.descriptions[self._quantity(name)]
+        return name
 
     # ------------------------------------------------------------------ posteriors
 
     def mean(self, name):
         """Posterior means of a parameter or derived quantity: Quantity, shape (n,)."""
-        return self._moments(name)[0] * self.unit(name)
+        mean, _ = self._moments(name)
+        return mean * self.unit(name)
 
     def std(self, name):
         """Posterior standard deviations: Quantity, shape (n,)."""
-        return self._moments(name)[1] * self.unit(name)
+        _, std = self._moments(name)
+        return std * self.unit(name)
 
     def _moments(self, name):
         name = self._named(name)
-        kept = self._kept(name, "moments")
-        if kept is None:
+        stored = self._stored(name, "moments")
+        if stored is None:
             mean, std = moments(self.axes[name].values, self.pdf[name])
         else:
-            mean, std = kept[..., 0], kept[..., 1]
+            mean = stored[..., 0]
+            std = stored[..., 1]
         return mean, np.maximum(std, self.least_std * np.abs(mean))
 
-    def _kept(self, name, what):
-        """Moments or quantiles that are kept; None of a parameter of which the cells are."""
+    def _stored(self, name, statistic):
+        """Return stored moments or quantiles; None of a parameter whose cells are stored instead."""
         if name not in self.axes:
-            return getattr(self, what)[..., self._quantity(name), :]
-        kept = getattr(self, f"axis_{what}")
-        return None if kept is None else kept[..., list(self.axes).index(name), :]
+            return getattr(self, statistic)[..., self._quantity(name), :]
+        stored = getattr(self, f"axis_{statistic}")
+        if stored is None:
+            return None
+        return stored[..., list(self.axes).index(name), :]
 
     def median(self, name):
         """Posterior medians of a parameter: `~astropy.units.Quantity`, shape (n,)."""
@@ -288,8 +301,8 @@ class FitResults(FitRows):
     def summary(self):
         """Id, names of flags, chi2, and the 16th, 50th and 84th percentiles, as a table."""
         table = self.to_table()
-        kept = [name for name in table.colnames if re.search(r"^(id|chi2_best)$|_p\d\d$", name)]
-        table = table[kept]
+        columns = [name for name in table.colnames if re.search(r"^(id|chi2_best)$|_p\d\d$", name)]
+        table = table[columns]
         table.add_column([", ".join(names) for names in self.flag_names()], 1, "flags")
         return table
 
@@ -300,7 +313,7 @@ class FitResults(FitRows):
         return super()._column(name)
 
     def _value(self, name):
-        # half-made copies have no axes yet
+        # copies that are not complete have no axes yet
         if "axes" in self.__dict__ and name in self.parameters:
             return self.median(name)
         return None
@@ -342,17 +355,21 @@ class FitResults(FitRows):
         ValueError
             If a level is outside.
         """
-        single, levels = np.ndim(levels) == 0, check_levels(levels)
+        single = np.ndim(levels) == 0
+        levels = check_levels(levels)
         name = self._named(name)
-        some = self._several()
-        kept = some._kept(name, "quantiles")
-        if kept is None:
+        rows = self._several()
+        stored = rows._stored(name, "quantiles")
+        if stored is None:
             axis = self.axes[name]
-            out = cell_percentiles(axis.values, some.pdf[name], levels, axis.bounds)
+            out = cell_percentiles(axis.values, rows.pdf[name], levels, axis.bounds)
         else:
-            out = kept_percentiles(name, levels, kept)
-        out = out[:, 0] if single else out
-        return (out[0] if self.isscalar else out) * self.unit(name)
+            out = kept_percentiles(name, levels, stored)
+        if single:
+            out = out[:, 0]
+        if self.isscalar:
+            out = out[0]
+        return out * self.unit(name)
 
     def distribution(self, name):
         """
@@ -372,10 +389,10 @@ class FitResults(FitRows):
             axis = self.axes[name]
             edges = cell_edges(axis.values, axis.bounds)
             if self.axis_quantiles is not None and axis.absent_at_zero:
-                # what is absent has a cell of no width, and what is present begins at 0
+                # an absent component has a cell of no width; the next cell begins at 0
                 edges[:2] = 0.0
             return edges * self.unit(name), self.pdf[name]
-        return self._kept(name, "quantiles") * self.unit(name), np.diff(DERIVED_LEVELS)
+        return self._stored(name, "quantiles") * self.unit(name), np.diff(DERIVED_LEVELS)
 
     def cdf(self, name):
         """
@@ -390,7 +407,9 @@ class FitResults(FitRows):
         """
         name = self._named(name)
         edges, weights = self.distribution(name)
-        first = np.full((*weights.shape[:-1], 1), 0.0 if name in self.axes else DERIVED_LEVELS[0])
+        first = np.zeros((*weights.shape[:-1], 1))
+        if name not in self.axes:
+            first[:] = DERIVED_LEVELS[0]
         # rounding may lift a sum above 1
         levels = np.minimum(first + np.cumsum(weights, axis=-1), 1.0)
         return edges, np.concatenate([first, levels], axis=-1)
@@ -398,23 +417,27 @@ class FitResults(FitRows):
     @property
     def redshift_odds(self):
         r"""
-        How likely the median redshift is no outlier: array, shape (n,).
+        Probability that the median redshift is no outlier: array, shape (n,).
 
         The odds of Benitez 2000 (ApJ 536, 571, section 4.2), the posterior in a window about the redshift given,
         with the window of outliers: the probability that :math:`|z_{50} - z| / (1 + z) < 0.15` for the redshift
         z, from the distribution that is linear within each cell of the redshifts. NaN at known redshifts.
         """
-        some = self._several()
-        out = np.full(len(some), np.nan)
+        rows = self._several()
+        out = np.full(len(rows), np.nan)
         if "redshift" in self.axes and not self.redshift_fixed:
-            z, axis = some.median("redshift").value, self.axes["redshift"]
-            low, high = (z - OUTLIER) / (1.0 + OUTLIER), (z + OUTLIER) / (1.0 - OUTLIER)
-            out = cell_shares(axis.values, some.pdf["redshift"], low, high, axis.bounds)
-        return out[0] if self.isscalar else out
+            z = rows.median("redshift").value
+            axis = self.axes["redshift"]
+            low = (z - OUTLIER) / (1.0 + OUTLIER)
+            high = (z + OUTLIER) / (1.0 - OUTLIER)
+            out = cell_shares(axis.values, rows.pdf["redshift"], low, high, axis.bounds)
+        if self.isscalar:
+            return out[0]
+        return out
 
     def joint_pdf(self, x, y):
         """
-        Joint posteriors of two parameters, summed over all models.
+        Return the joint posterior of two parameters, summed over all models.
 
         Parameters
         ----------
@@ -434,15 +457,15 @@ class FitResults(FitRows):
         """
         x = self._named(x)
         y = self._named(y)
-        known = dict(self.pairs)
+        tables = dict(self.pairs)
         if "frac_agn" in self.axes:
-            known["redshift", "frac_agn"] = self.pdf_2d
-        if (x, y) in known:
-            return known[x, y]
-        if (y, x) in known:
-            return np.swapaxes(known[y, x], -1, -2)
+            tables["redshift", "frac_agn"] = self.pdf_2d
+        if (x, y) in tables:
+            return tables[x, y]
+        if (y, x) in tables:
+            return np.swapaxes(tables[y, x], -1, -2)
         check_names((x, y), "parameter", self.parameters)
-        have = ", ".join(f"{a} and {b}" for a, b in known) or "none"
+        have = ", ".join(f"{a} and {b}" for a, b in tables) or "none"
         msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit)"
         raise KeyError(msg)
 
@@ -450,7 +473,7 @@ class FitResults(FitRows):
 
     def to_table(self):
         """
-        Results as a table.
+        Tabulate the results.
 
         Returns
         -------
@@ -463,31 +486,32 @@ class FitResults(FitRows):
             of log10 (dex, in their unit). Of a fit with ``outliers``, for each band
             ``<band>_outlier``, how likely it is wrong. With free redshifts `redshift_odds`.
         """
-        some = self._several()
+        rows = self._several()
         texts = TEXTS["object"] | {"flags": FitFlags.describe()}
-        columns = {n: (getattr(some, FIELDS.get(n, n)), text) for n, text in texts.items()}
+        columns = {n: (getattr(rows, FIELDS.get(n, n)), text) for n, text in texts.items()}
         columns = {n: value for n, value in columns.items() if value[0] is not None}
-        for name in some.parameters:
-            unit, meaning = some.unit(name), some._meaning(name)
-            percentiles = some.percentile(name, LEVELS)
-            parts = [some.mean(name), some.std(name), *percentiles.T, some.best[name]]
+        for name in rows.parameters:
+            unit = rows.unit(name)
+            meaning = rows._meaning(name)
+            percentiles = rows.percentile(name, LEVELS)
+            parts = [rows.mean(name), rows.std(name), *percentiles.T, rows.best[name]]
             for (suffix, text), value in zip(TEXTS["parameter"].items(), parts, strict=True):
                 columns[f"{name}_{suffix}"] = (value, f"{text} of {meaning}")
-            if some.extensive(name):
-                log_mean = some.moments[:, some._quantity(name), 2] * u.dex
+            if rows.extensive(name):
+                log_mean = rows.moments[:, rows._quantity(name), 2] * u.dex
                 text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
                 columns[f"{name}_logmean"] = (log_mean, text)
-            if name == "redshift" and not some.redshift_fixed:
-                columns["redshift_odds"] = (some.redshift_odds, ODDS)
-        if some.outlier is not None:
-            for name in some.fitted_filters:
-                value = some.outlier[:, some.filters.index(name)]
+            if name == "redshift" and not rows.redshift_fixed:
+                columns["redshift_odds"] = (rows.redshift_odds, ODDS)
+        if rows.outlier is not None:
+            for name in rows.fitted_filters:
+                value = rows.outlier[:, rows.filters.index(name)]
                 columns[f"{name}_outlier"] = (value, f"how likely {name} is wrong")
         return described_table(columns, dict(self.meta))
 
     def predict(self, filters=None):
         """
-        Fluxes of the models over the posterior; `Samples.predict` has those in other bands.
+        Tabulate model fluxes over the posterior in uJy; `Samples.predict` has those in other bands.
 
         Parameters
         ----------
@@ -500,27 +524,33 @@ class FitResults(FitRows):
             ``id`` and, for each filter, mean (by its name), standard deviation (``<name>_err``)
             and flux of the best model (``<name>_best``) in uJy.
         """
-        some = self._several()
-        columns = {"id": (some.ids, "identifier")}
-        names = filter_names("filters", self.filters if filters is None else filters)
+        rows = self._several()
+        columns = {"id": (rows.ids, "identifier")}
+        if filters is None:
+            filters = self.filters
+        names = filter_names("filters", filters)
         check_names(names, "filter of the models", self.filters)
         for name in names:
             for column, array, text in (
-                (name, some.model_flux, "posterior mean of the model flux"),
-                (error_column(name), some.model_flux_std, "its posterior standard deviation"),
-                (f"{name}_best", some.best_flux, "flux of the best model"),
+                (name, rows.model_flux, "posterior mean of the model flux"),
+                (error_column(name), rows.model_flux_std, "its posterior standard deviation"),
+                (f"{name}_best", rows.best_flux, "flux of the best model"),
             ):
                 columns[column] = (array[:, self.filters.index(name)] * FNU, text)
         return described_table(columns, dict(self.meta))
 
-    def _one(self, what):
-        """Refuse several objects where one is needed."""
+    def _one(self, method):
+        """Refuse several objects where a single one is needed."""
         if not self.isscalar:
-            msg = f"{what} is of a single object: results[0].{what}() or results.loc[id].{what}()"
+            msg = f"{method} is of a single object: results[0].{method}() or results.loc[id].{method}()"
             raise TypeError(msg)
         return self
 
-    samples, best_sed, plot_sed = drawing.samples, drawing.best_sed, drawing.plot_sed
-    plot_pdf, plot_pdf2d = drawing.plot_pdf, drawing.plot_pdf2d
-    plot_corner, plot_redshift = drawing.plot_corner, drawing.plot_redshift
+    samples = drawing.samples
+    best_sed = drawing.best_sed
+    plot_sed = drawing.plot_sed
+    plot_pdf = drawing.plot_pdf
+    plot_pdf2d = drawing.plot_pdf2d
+    plot_corner = drawing.plot_corner
+    plot_redshift = drawing.plot_redshift
     plot_sfh = histories.plot_best_sfh

@@ -5,26 +5,30 @@ from scipy.stats import chi2
 
 from miricigale.fitting.data.likelihood import HIGH_CHI2, FitFlags
 
-#: Fewest fits that are a sample, and most that are looked at.
-_SAMPLE, _MOST = 50, 1_000_000
+#: Smallest number of fits that are a sample.
+_MIN_SAMPLE = 50
+#: Largest number of fits that are looked at.
+_MAX_SAMPLE = 1_000_000
 #: Reduced chi2 above which a fit without sample is flagged.
-_ALONE = 10.0
-#: Standard deviations in ln(reduced chi2), by the percentiles above the median, beyond which one of a sample is.
-_BEYOND = 3.0
-#: Probability to exceed above which chi2 is no larger than errors alone make it.
-_CHANCE = 1e-4
-#: Residual, in errors of the fit, and part of chi2 from which a single band is off.
-_OFF, _PART = 4.0, 0.4
+_LIMIT_WITHOUT_SAMPLE = 10.0
+#: Limit of a sample in standard deviations of ln(reduced chi2) above the median, from the percentiles above it.
+_N_SIGMA = 3.0
+#: Probability to exceed below which chi2 is larger than errors alone make it.
+_MIN_PROBABILITY = 1e-4
+#: Residual, in errors of the fit, above which a single band is off.
+_MIN_RESIDUAL = 4.0
+#: Part of chi2 that such a band makes at least.
+_MIN_CHI2_PART = 0.4
 
 
 def chi2_step(n):
-    """Every which of n objects is looked at for `chi2_limit`."""
-    return max(1, -(-n // _MOST))
+    """Return the step between those of n objects that `chi2_limit` looks at."""
+    return max(1, -(-n // _MAX_SAMPLE))
 
 
 def chi2_limit(reduced_chi2):
     """
-    Reduced chi2 above which a fit of a sample is poor.
+    Compute the reduced chi2 above which a fit of a sample is poor.
 
     In a sample it is three standard deviations above the median in the logarithm, of the scatter above the median:
     real galaxies have wider tails than errors, and errors that are too large or small shift the median.
@@ -41,15 +45,15 @@ def chi2_limit(reduced_chi2):
     """
     values = np.asarray(reduced_chi2, dtype=float)
     values = values[np.isfinite(values) & (values > 0.0)]
-    if values.size < _SAMPLE:
-        return _ALONE
+    if values.size < _MIN_SAMPLE:
+        return _LIMIT_WITHOUT_SAMPLE
     median, high = np.percentile(np.log(values), [50.0, 84.0])
-    return float(min(np.exp(median + _BEYOND * (high - median)), HIGH_CHI2))
+    return float(min(np.exp(median + _N_SIGMA * (high - median)), HIGH_CHI2))
 
 
 def with_high_chi2(results, limit):
     """
-    Results with the flag ``HIGH_CHI2`` above a limit, where chi2 is also larger than errors alone make it.
+    Flag results as ``HIGH_CHI2`` above a limit, where chi2 is also larger than errors alone make it.
 
     Parameters
     ----------
@@ -62,7 +66,7 @@ def with_high_chi2(results, limit):
     -------
     results : `~miricigale.fitting.FitResults`
     """
-    unlikely = chi2.sf(results.chi2, results.n_bands) < _CHANCE
+    unlikely = chi2.sf(results.chi2, results.n_bands) < _MIN_PROBABILITY
     with np.errstate(invalid="ignore"):
         poor = results.fitted & unlikely & (results.reduced_chi2 > limit)
     if not poor.any():
@@ -74,7 +78,7 @@ def with_high_chi2(results, limit):
 
 def worst_bands(results):
     """
-    The band that is off, by object.
+    Find the band that is off, by object.
 
     It has the largest residual to the best model in errors of the fit, above 4, which makes at least 40 % of chi2.
     Of 120 galaxies of CEERS with seven bands of S/N above 5 one has one; with a random flux of HST or NIRCam
@@ -94,9 +98,12 @@ def worst_bands(results):
     with np.errstate(invalid="ignore", divide="ignore"):
         residual = np.where(measured, (results.flux - results.best_flux) / results.sigma, 0.0)
         square = np.nan_to_num(np.square(residual))
-        number = square.argmax(axis=1) if square.shape[1] else np.zeros(len(square), int)
+        if square.shape[1]:
+            number = square.argmax(axis=1)
+        else:
+            number = np.zeros(len(square), int)
         largest = np.take_along_axis(square, number[:, None], axis=1)[:, 0]
-        off = (largest > _OFF**2) & (largest > _PART * results.chi2)
-    # with two bands there is none that others speak against
+        off = (largest > _MIN_RESIDUAL**2) & (largest > _MIN_CHI2_PART * results.chi2)
+    # of two bands the other one alone cannot say which is off
     off &= results.fitted & (measured.sum(axis=1) > 2)
     return np.where(off, number, -1)

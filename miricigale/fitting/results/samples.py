@@ -113,7 +113,9 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def _check(self, n):
         """Refuse draws whose shapes do not agree, or that are no models of the grid."""
-        grid, index, shape = self.grid, np.asarray(self.index), np.shape(self.scale)
+        grid = self.grid
+        index = np.asarray(self.index)
+        shape = np.shape(self.scale)
         if len(shape) != 2 or shape[0] != n or shape[1] < 1:
             raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
         for name, wanted in (("index", (*shape, 4)), ("flags", (n,))):
@@ -128,8 +130,12 @@ model : `~miricigale.sed.SEDModel`, optional
             raise argument_error("index", wanted, "none")
 
     def __repr__(self):
-        what = repr(np.asarray(self.ids).item()) if self.isscalar else f"{len(self)} objects"
-        return f"<Samples of {what}, {self.n_draws} draws{'' if self.isscalar else ' each'}>"
+        objects = f"{len(self)} objects"
+        each = " each"
+        if self.isscalar:
+            objects = repr(np.asarray(self.ids).item())
+            each = ""
+        return f"<Samples of {objects}, {self.n_draws} draws{each}>"
 
     @property
     def n_draws(self):
@@ -170,18 +176,18 @@ model : `~miricigale.sed.SEDModel`, optional
         if name in self.axes:
             return u.Unit(self.axes[name].unit)
         check_names([name], "parameter", self.parameters)
-        known = self._quantities
+        quantities = self._quantities
         if name in FRACTIONS:
             return u.dimensionless_unscaled
-        return known.units[known.names.index(name)]
+        return quantities.units[quantities.names.index(name)]
 
     def description(self, name):
         """One line on a parameter or derived quantity."""
-        known = self._quantities
-        texts = dict(zip(known.names, known.descriptions, strict=True))
+        quantities = self._quantities
+        texts = dict(zip(quantities.names, quantities.descriptions, strict=True))
         texts |= {name: parts[0] for name, parts in FRACTIONS.items()}
         for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
-            texts |= {one: table[one].info.description for one in table.colnames}
+            texts |= {column: table[column].info.description for column in table.colnames}
         return texts.get(name) or name
 
     def values(self, name):
@@ -195,38 +201,41 @@ model : `~miricigale.sed.SEDModel`, optional
             draw has none.
         """
         name = self._named(name)
-        some, unit = self._several(), self.unit(name)
-        out = np.where(some.fitted[:, None], some._values(name), np.nan)
+        rows = self._several()
+        unit = self.unit(name)
+        out = np.where(rows.fitted[:, None], rows._values(name), np.nan)
         return out.reshape(self.scale.shape) * unit
 
     def _values(self, name):
         """Values without their unit, shape (n, n_draws); of any model for objects without draws."""
         z, g, k, f = np.moveaxis(self.index, -1, 0)
-        grid, axis = self.grid, self.axes.get(name)
+        grid = self.grid
+        axis = self.axes.get(name)
         if name in self._fractions:
             agn, galaxy = (self._values(part) for part in FRACTIONS[name][1:])
-            whole = agn + galaxy
-            return np.divide(agn, whole, out=np.zeros_like(whole), where=whole != 0)
+            total = agn + galaxy
+            return np.divide(agn, total, out=np.zeros_like(total), where=total != 0)
         if axis is None:
             frac = grid.frac_agn[f]
             return self._quantities.evaluate(name, grid, g, np.maximum(k, 0), frac, self.scale)
         values = {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f]}
         if axis.kind in values:
             return values[axis.kind]
-        return self._of_axis(axis, g if axis.kind == "galaxy" else k)
+        model = {"galaxy": g, "agn": k}[axis.kind]
+        return self._of_axis(axis, model)
 
     def _of_axis(self, axis, model):
         """Values of a parameter; where a model stands for several, drawn as its prior has it."""
         share = axis.share
         out = axis.values[np.argmax(share, axis=0)][model]
-        several = np.count_nonzero(share > 0, axis=0) > 1
-        many = several[model] & (model >= 0)
+        has_several = np.count_nonzero(share > 0, axis=0) > 1
+        is_shared = has_several[model] & (model >= 0)
         total = np.cumsum(share, axis=0)
-        for i in np.flatnonzero(many.any(axis=1)):
+        for i in np.flatnonzero(is_shared.any(axis=1)):
             rng = stream(int(self.seed), "samples", axis.name, str(self.ids[i]))
-            draw = rng.random(model.shape[1])[many[i]]
-            cdf = total[:, model[i][many[i]]]
-            out[i, many[i]] = axis.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
+            draw = rng.random(model.shape[1])[is_shared[i]]
+            cdf = total[:, model[i][is_shared[i]]]
+            out[i, is_shared[i]] = axis.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
         return np.where(model >= 0, out, np.nan)
 
     def to_table(self, names=None):
@@ -245,15 +254,17 @@ model : `~miricigale.sed.SEDModel`, optional
             quantity; the draws of an object follow one another. Objects that could not be
             fitted stay in place with NaN.
         """
-        some = self._several()
-        n, draws = some.scale.shape
+        rows = self._several()
+        n, draws = rows.scale.shape
         columns = {
-            "id": (np.repeat(some.ids, draws), "identifier"),
+            "id": (np.repeat(rows.ids, draws), "identifier"),
             "draw": (np.tile(np.arange(draws), n), "number of the draw"),
-            "flags": (np.repeat(some.flags, draws), FitFlags.describe()),
+            "flags": (np.repeat(rows.flags, draws), FitFlags.describe()),
         }
-        for name in self.parameters if names is None else names:
-            columns[name] = (some.values(name).ravel(), self.description(name))
+        if names is None:
+            names = self.parameters
+        for name in names:
+            columns[name] = (rows.values(name).ravel(), self.description(name))
         return described_table(columns, dict(self.meta))
 
     def mean(self, name):
@@ -276,9 +287,12 @@ model : `~miricigale.sed.SEDModel`, optional
             Levels in (0, 1), or all in percent, of percentiles of shape (n, n_levels); (n,) for a single level.
         """
         values = self.values(name)
-        single, levels = np.ndim(levels) == 0, check_levels(levels)
+        single = np.ndim(levels) == 0
+        levels = check_levels(levels)
         out = np.moveaxis(np.quantile(values.value, levels, axis=-1), 0, -1) * values.unit
-        return out[..., 0] if single else out
+        if single:
+            return out[..., 0]
+        return out
 
     # -------------------------------------------------------------- distributions
 
@@ -329,11 +343,12 @@ model : `~miricigale.sed.SEDModel`, optional
     def _binned(self, name, key):
         """Values in the draws of an object, and edges of the cells."""
         name = self._named(name)
-        values, known = self.loc[key]._fitted_one().values(name).value, self._quantities
+        values = self.loc[key]._fitted_one().values(name).value
+        quantities = self._quantities
         if name in self.axes:
             return values, cell_edges(self.axes[name].values, self.axes[name].bounds)
         check_that(np.isfinite(values).any(), "name", "one with values in the draws", repr(name))
-        extensive = name in known.names and name not in known.intensive
+        extensive = name in quantities.names and name not in quantities.intensive
         return values, bin_edges(values, log=extensive)
 
     # ---------------------------------------------------------- fluxes and spectra
@@ -359,11 +374,14 @@ model : `~miricigale.sed.SEDModel`, optional
             If a band is not one of the grid and no model is known, or the model is another.
         """
         names, extra = grid_spectra.band_names(self.grid, filters)
-        model, some = self._model() if extra else None, self._several()
-        out = np.full((*some.scale.shape, len(names)), np.nan)
-        fitted = some.fitted
+        model = None
+        if extra:
+            model = self._model()
+        rows = self._several()
+        out = np.full((*rows.scale.shape, len(names)), np.nan)
+        fitted = rows.fitted
         out[fitted] = grid_spectra.draw_fluxes(
-            self.grid, some.index[fitted], some.scale[fitted], names, extra, model
+            self.grid, rows.index[fitted], rows.scale[fitted], names, extra, model
         )
         return out.reshape(*self.scale.shape, len(names)) * FNU
 
@@ -391,12 +409,12 @@ model : `~miricigale.sed.SEDModel`, optional
         """
         levels = check_levels(levels)
         names, _ = grid_spectra.band_names(self.grid, filters)
-        some = self._several()
+        rows = self._several()
         columns = {
-            "id": (np.array(some.ids), "identifier"),
-            "flags": (np.array(some.flags), FitFlags.describe()),
+            "id": (np.array(rows.ids), "identifier"),
+            "flags": (np.array(rows.flags), FitFlags.describe()),
         }
-        for name, flux in zip(names, np.moveaxis(some.fluxes(filters), -1, 0), strict=True):
+        for name, flux in zip(names, np.moveaxis(rows.fluxes(filters), -1, 0), strict=True):
             columns[name] = (flux.mean(axis=1), "posterior mean of the model flux")
             columns[error_column(name)] = (flux.std(axis=1), "its standard deviation")
             for level, values in zip(levels, np.quantile(flux, levels, axis=1), strict=True):
@@ -424,10 +442,14 @@ model : `~miricigale.sed.SEDModel`, optional
         spectra : `~astropy.units.Quantity`, shape (n_draws, n_wave)
             In W / Hz or uJy.
         """
-        one = self.loc[key]._fitted_one()
-        function = grid_spectra.rest_spectra if rest else grid_spectra.observed_spectra
-        wave, values = function(self._model(), self.grid, one.index, one.scale)
-        return wave * WAVE, values * (u.W / u.Hz if rest else FNU)
+        draws = self.loc[key]._fitted_one()
+        function = grid_spectra.observed_spectra
+        unit = FNU
+        if rest:
+            function = grid_spectra.rest_spectra
+            unit = u.W / u.Hz
+        wave, values = function(self._model(), self.grid, draws.index, draws.scale)
+        return wave * WAVE, values * unit
 
     def sed_band(self, key, levels=LEVELS, *, rest=True):
         """
@@ -448,9 +470,14 @@ model : `~miricigale.sed.SEDModel`, optional
         """
         levels = check_levels(levels)
         wave, values = self.spectra(key, rest=rest)
-        columns = {"wave": (wave, f"{'rest' if rest else 'observed'} wavelength")}
+        frame = "observed"
+        quantity = "F_nu"
+        if rest:
+            frame = "rest"
+            quantity = "L_nu"
+        columns = {"wave": (wave, f"{frame} wavelength")}
         for level, row in zip(levels, np.quantile(values.value, levels, axis=0), strict=True):
-            text = f"quantile {level:g} of {'L_nu' if rest else 'F_nu'}"
+            text = f"quantile {level:g} of {quantity}"
             columns[suffix(level)] = (row * values.unit, text)
         return described_table(columns, dict(self.meta) | {"id": str(key), "rest": bool(rest)})
 
@@ -462,7 +489,8 @@ model : `~miricigale.sed.SEDModel`, optional
         bands = [table[name] for name in table.colnames[1:]]
         return plot_sed_band(table["wave"], bands, ax=ax, rest=rest, **kwargs)
 
-    sfh_band, plot_sfh = histories.sfh_band, histories.plot_sfh_band
+    sfh_band = histories.sfh_band
+    plot_sfh = histories.plot_sfh_band
 
     def plot_pdf2d(self, key, a="redshift", b="frac_agn", ax=None, **kwargs):
         """Draw the joint distribution of two parameters of an object; returns the axes."""
@@ -499,8 +527,8 @@ model : `~miricigale.sed.SEDModel`, optional
             names = [name for name in CORNER if name in self.parameters]
         names = [self._named(name) for name in names]
         check_names(names, "parameter", self.parameters)
-        some = self.loc[key]._fitted_one()
-        panels = [some._panel(name) for name in names]
+        draws = self.loc[key]._fitted_one()
+        panels = [draws._panel(name) for name in names]
         marginals = [(edges, np.histogram(x, edges)[0] / self.n_draws) for x, edges, _ in panels]
         joints = {}
         for row, (y, y_edges, _) in enumerate(panels):
@@ -510,7 +538,9 @@ model : `~miricigale.sed.SEDModel`, optional
         labels = []
         for name, (_, _, log) in zip(names, panels, strict=True):
             label = labeled(name, self.unit(name))
-            labels.append(f"log {label}" if log else label)
+            if log:
+                label = f"log {label}"
+            labels.append(label)
         marked = {self._named(name): value for name, value in (truths or {}).items()}
         check_names(marked, "parameter for 'truths'", names)
         values = [marked.get(name) for name in names]
