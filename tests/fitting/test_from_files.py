@@ -315,7 +315,7 @@ def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_p
     written = write_plots(results, tmp_path / "plots", table["id"][:2])
     assert [unquote(path.stem) for path in written] == table["id"][:2].tolist()
     refuses("no object with the id 'x'", write_plots, results, tmp_path, ["x"], error=KeyError)
-    monkeypatch.setattr("miricigale.fitting.catalogs.page._MOST", 2)
+    monkeypatch.setattr("miricigale.fitting.catalogs.page._MAX_OBJECTS", 2)
     few = fit_page(results, tmp_path / "cat.fits").to_html()
     assert "numbers and figures are of one object in 3, 2 of them" in few
     refuses("z_phot", fit_page, results, tmp_path / "cat.fits", z_spec="z_phot")

@@ -1,6 +1,7 @@
 """Errors of the bands of a catalog, measured on the catalog itself, with or without known redshifts."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 from astropy.table import QTable, vstack
@@ -31,8 +32,9 @@ from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE
 
-#: Sources that are fitted to measure the bands, and those of them that long bands such as MIRI's may see.
+#: Largest number of sources that are fitted to measure the bands.
 MAX_SOURCES = 500
+#: Largest number of them chosen because long bands such as MIRI's should detect them.
 _MAX_LONG_SOURCES = 250
 #: Sources below which nothing is measured.
 MIN_SOURCES = 100
@@ -49,10 +51,9 @@ class SourceSample:
     Sources of a catalog that say how large the errors of its bands are, chosen from pieces of it.
 
     They have S/N above 5 in five of the bands that predict the others (in all if these are four). Of 500, half are
-    sources that bands of `~miricigale.fitting.survey.band_errors.long_instruments` should see: a flux above five
-    times
-    their error in the longest of the other bands. The choice is random by the number of the row, so that neither
-    pieces nor workers change it.
+    sources that bands of `~miricigale.fitting.survey.band_errors.long_instruments` should detect: a flux above
+    five times their error in the longest of the other bands. The choice is random by the number of the row, so
+    that neither pieces nor workers change it.
 
     Parameters
     ----------
@@ -66,7 +67,7 @@ class SourceSample:
 
     def __init__(self, bands, redshift_range, seed):
         self.bands = list(bands)
-        long = [band for group in long_instruments(bands) for band in group]
+        long = list(itertools.chain.from_iterable(long_instruments(bands)))
         wave = dict(zip(self.bands, pivots(self.bands).to_value(WAVE), strict=True))
         predicting = [band for band in self.bands if band not in long]
         #: Bands that predict the others, by wavelength.
@@ -98,7 +99,7 @@ class SourceSample:
         key = self._random.random(n)
         row = np.arange(self._n_rows, self._n_rows + n)
         self._n_rows += n
-        used = data.used
+        in_use = data.used
         with np.errstate(invalid="ignore"):
             signal = data.measured & (data.flux > MIN_SIGNAL * data.flux_err)
         n_signal = signal[:, self._short].sum(axis=1)
@@ -106,46 +107,46 @@ class SourceSample:
         columns = {
             "row": row,
             "key": key,
-            "flux": np.where(used, data.flux, np.nan),
-            "flux_err": np.where(used, data.flux_err, np.nan),
+            "flux": np.where(in_use, data.flux, np.nan),
+            "flux_err": np.where(in_use, data.flux_err, np.nan),
             "limit": data.limit,
             "long": self._seen_by_long_bands(data),
         }
         if redshift is not None:
-            known = known_redshifts(table, redshift)
+            known_z = known_redshifts(table, redshift)
             with np.errstate(invalid="ignore"):
-                eligible &= (known >= self._range[0]) & (known <= self._range[1])
-            columns["redshift"] = known
+                eligible &= (known_z >= self._range[0]) & (known_z <= self._range[1])
+            columns["redshift"] = known_z
         if density is not None:
             columns["density"] = np.asarray(density, dtype=float)
         columns = {name: values[eligible] for name, values in columns.items()}
         if self._columns is not None:
             columns = {k: np.concatenate([self._columns[k], v]) for k, v in columns.items()}
-        # of the others all may be needed, if no more sources are seen by long bands
-        long, others = self._by_key(columns)
-        kept = np.sort(np.concatenate([long, others[:MAX_SOURCES]]))
-        self._columns = {name: values[kept] for name, values in columns.items()}
+        # all others may be needed, if long bands detect no more sources
+        long, short_only = self._by_key(columns)
+        rows_to_keep = np.sort(np.concatenate([long, short_only[:MAX_SOURCES]]))
+        self._columns = {name: values[rows_to_keep] for name, values in columns.items()}
 
     def _seen_by_long_bands(self, data):
-        """Rows whose flux in the longest of the other bands is above five times the error of a long band."""
+        """Find rows whose flux in the longest of the other bands is above five times the error of a long band."""
         flux = np.full(len(data), np.nan)
         for i in self._short:
             flux = np.where(data.measured[:, i], data.flux[:, i], flux)
         with np.errstate(invalid="ignore"):
-            seen = flux[:, None] > MIN_SIGNAL * data.flux_err[:, self._long]
-        return np.any(seen & data.measured[:, self._long], axis=1)
+            is_detectable = flux[:, None] > MIN_SIGNAL * data.flux_err[:, self._long]
+        return np.any(is_detectable & data.measured[:, self._long], axis=1)
 
     @staticmethod
     def _by_key(columns):
-        """Rows that long bands see, at most 250, and all others: two arrays of int, by ascending key."""
+        """Sort rows by key: those that long bands detect, at most 250, and all others, two arrays of int."""
         order = np.argsort(columns["key"], kind="stable")
         long = order[columns["long"][order]][:_MAX_LONG_SOURCES]
         return long, order[~np.isin(order, long)]
 
     def _chosen(self, name):
-        """Values of a column for the sources of the sample, in the order of the catalog."""
-        long, others = self._by_key(self._columns)
-        rows = np.concatenate([long, others])[:MAX_SOURCES]
+        """Select a column for the sources of the sample, in the order of the catalog."""
+        long, short_only = self._by_key(self._columns)
+        rows = np.concatenate([long, short_only])[:MAX_SOURCES]
         return self._columns[name][np.sort(rows)]
 
     def __len__(self):
@@ -174,12 +175,16 @@ class SourceSample:
     @property
     def redshift(self):
         """Known redshifts of the sources, or None."""
-        return self._chosen("redshift") if "redshift" in self._columns else None
+        if "redshift" in self._columns:
+            return self._chosen("redshift")
+        return None
 
     @property
     def density(self):
         """Densities of redshift of the sources, or None."""
-        return self._chosen("density") if "density" in self._columns else None
+        if "density" in self._columns:
+            return self._chosen("density")
+        return None
 
     def photometry(self):
         """Fluxes and errors as in the catalog: `~miricigale.fitting.data.likelihood.FitData`."""
@@ -202,12 +207,10 @@ def calibrate_bands(
     No redshifts have to be known. Up to 500 sources are fitted on the nodes of the grid, without bands of
     instruments that have none below 5 um, such as MIRI's. The fit predicts these bands, and each other band with
     its own flux taken out (`~miricigale.fitting.survey.band_errors.left_out_predictions`). What is measured at
-    rest
-    wavelengths of starlight is compared with that: the greatest posterior of a factor of the errors, a part of the
-    flux, a share of wrong fluxes and a zero point (`~miricigale.fitting.survey.band_errors.estimate_band_errors`).
-    A
-    second turn has the zero points and errors of the first. The median of the zero points is 1, for masses take up
-    a common factor; MIRI's stay at 1.
+    rest wavelengths of starlight is compared with that: the greatest posterior of a factor of the errors, a part
+    of the flux, a share of wrong fluxes and a zero point
+    (`~miricigale.fitting.survey.band_errors.estimate_band_errors`). A second turn has the zero points and
+    errors of the first. The median of the zero points is 1, for masses take up a common factor; MIRI's stay at 1.
 
     Where a band has no such fluxes, or the catalog fewer than 100 such sources, the errors are those of the prior:
     for MIRI 3.3 times those of the catalog and 15 % of the flux, for others 1 and 2 %.
@@ -265,7 +268,7 @@ def calibrate_bands(
 
 
 def sample_of(fitter, columns, seed):
-    """Return an empty `SourceSample` for a fitter and a catalog with these columns."""
+    """Make an empty `SourceSample` for a fitter and a catalog with these columns."""
     bands = [band for band in fitter.filters or fitter.bands if band in columns]
     return SourceSample(bands, (fitter.grid.redshift[0], fitter.grid.redshift[-1]), seed)
 
@@ -296,7 +299,7 @@ def with_errors_of(fitter, calibration):
 
 
 def _calibration_of(fitter):
-    """Calibration of a fitter, or one without bands that has its errors of models."""
+    """Return the calibration of a fitter, or one without bands that has its errors of models."""
     if fitter.calibration is not None:
         return fitter.calibration
     error = fitter.backend.template_error
@@ -304,13 +307,13 @@ def _calibration_of(fitter):
         parts = set(fitter._reader.model_error.values())
         wanted = "with a calibration, a template error or one model error for all bands"
         check_that(len(parts) == 1, "fitter", wanted, f"model errors of {sorted(parts)}")
-        error = TemplateError([1.0] * WAVE, [*parts])
+        error = TemplateError([1.0] * WAVE, list(parts))
     return SurveyCalibration.without_bands("", error)
 
 
 def calibrate_file(fitter, rows, output, *, column=None, options):
     """
-    Fitter with the errors of the bands of a catalog on disk, measured on it unless a file says them already.
+    Return a fitter with the errors of the bands of a catalog on disk, measured on it or read from a file.
 
     They are kept in ``calibration.ecsv``, whose name has a checksum of the catalog, of its units and redshifts,
     and of the models.
@@ -342,28 +345,31 @@ def calibrate_file(fitter, rows, output, *, column=None, options):
     path = output / FILE_NAME
     name = _name_of(fitter, rows, column, options)
     if path.exists() and options.get("resume", True):
-        found = SurveyCalibration.read(path)
-        if found.name != name:
-            msg = (
-                f"{output} holds a calibration of another fit: {found.name!r} in place of {name!r}"
-            )
+        calibration = SurveyCalibration.read(path)
+        if calibration.name != name:
+            msg = f"{output} holds a calibration of another fit: {calibration.name!r} in place of {name!r}"
             raise OtherResultsError(msg, "resume=False to replace it")
     else:
         if column is None:
-            found = _bands_of_file(fitter, rows, name, options)
+            calibration = _bands_of_file(fitter, rows, name, options)
         else:
-            found = _redshifts_of_file(fitter, rows, column, name, options)
+            calibration = _redshifts_of_file(fitter, rows, column, name, options)
         output.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
-            found.write(partial, overwrite=True)
-    return with_errors_of(fitter, found) if column is None else with_calibration(fitter, found)
+            calibration.write(partial, overwrite=True)
+    if column is None:
+        return with_errors_of(fitter, calibration)
+    return with_calibration(fitter, calibration)
 
 
 def _name_of(fitter, rows, column, options):
-    """Name of a calibration: the file, how it was measured, and a checksum of all that it follows from."""
+    """Name a calibration: the file, how it was measured, and a checksum of all that it follows from."""
+    map_settings = None
+    if isinstance(rows, MappedRows):
+        map_settings = rows.map.settings()
     content = {
         "catalog": rows.sha256,
-        "map": rows.map.settings() if isinstance(rows, MappedRows) else None,
+        "map": map_settings,
         "hdu": options.get("hdu"),
         "unit": str(options.get("flux_unit")),
         "redshift": options.get("redshift"),
@@ -374,42 +380,43 @@ def _name_of(fitter, rows, column, options):
     checksum = content_sha256(content)[:8]
     if column is not None:
         return f"{rows.path.name} by {column} ({checksum})"
-    models = "" if fitter.calibration is None else f"{fitter.calibration.name}, "
+    models = ""
+    if fitter.calibration is not None:
+        models = f"{fitter.calibration.name}, "
     return f"{models}bands of {rows.path.name} ({checksum})"
 
 
 def _take_rows(fitter, rows, options):
-    """Function of the number of a piece: its table, with units, and what is known of redshifts."""
-    known = {"redshift": None, "redshift_prior": None} | options
-    known = {name: known[name] for name in ("redshift", "redshift_prior")}
+    """Return a function of the number of a piece: its table, with units, and the redshift options of `fit`."""
+    redshift_options = {name: options.get(name) for name in ("redshift", "redshift_prior")}
     fluxes = {column for band in fitter.bands for column in (band, error_column(band))}
-    return row_pieces(rows, known, options.get("flux_unit"), fluxes)
+    return row_pieces(rows, redshift_options, options.get("flux_unit"), fluxes)
 
 
 def _bands_of_file(fitter, rows, name, options):
-    """Calibration of the bands of a catalog on disk, of which one piece is in memory at a time."""
+    """Calibrate the bands of a catalog on disk, of which one piece is in memory at a time."""
     take = _take_rows(fitter, rows, options)
     sample = sample_of(fitter, rows.colnames, seed=0)
     nodes = None
     for i in range(rows.n_chunks):
-        table, known = take(i)
+        table, redshift_options = take(i)
         density = None
-        if known["redshift_prior"] is not None:
-            nodes, density = known["redshift_prior"]
+        if redshift_options["redshift_prior"] is not None:
+            nodes, density = redshift_options["redshift_prior"]
             density = np.broadcast_to(density, (len(table), np.shape(density)[-1]))
-        sample.add(table, redshift=known["redshift"], density=density)
+        sample.add(table, redshift=redshift_options["redshift"], density=density)
     executor = options.get("executor")
     return calibrate_sample(fitter, sample, name=name, density_nodes=nodes, executor=executor)
 
 
 def _redshifts_of_file(fitter, rows, column, name, options):
-    """Calibration by the sources of known redshift of a catalog on disk."""
+    """Calibrate by the sources of known redshift of a catalog on disk."""
     take = _take_rows(fitter, rows, options | {"redshift": None, "redshift_prior": None})
-    known = []
+    tables = []
     for i in range(rows.n_chunks):
         table, _ = take(i)
-        known.append(table[np.isfinite(known_redshifts(table, column))])
-    table = vstack(known, metadata_conflicts="silent")
+        tables.append(table[np.isfinite(known_redshifts(table, column))])
+    table = vstack(tables, metadata_conflicts="silent")
     executor = options.get("executor")
     with without_warnings():
         # the fit of the catalog warns of it
@@ -418,7 +425,7 @@ def _redshifts_of_file(fitter, rows, column, name, options):
 
 def measured_calibration(results):
     """
-    The calibration that was measured on a catalog and that its results have.
+    Find the calibration that was measured on a catalog and that its results have.
 
     Parameters
     ----------
@@ -434,5 +441,7 @@ def measured_calibration(results):
     name = results.job["settings"].get("calibration")
     if name is None or not path.exists():
         return None
-    found = SurveyCalibration.read(path)
-    return found if found.name == name else None
+    calibration = SurveyCalibration.read(path)
+    if calibration.name == name:
+        return calibration
+    return None

@@ -12,29 +12,40 @@ from miricigale.utils.row_files import open_rows
 
 def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None, flux_unit=None):
     """Open a catalog by rows (`~miricigale.utils.row_files.RowFile`), under our names or those of a map."""
-    known = None if catalog_map is None else as_catalog_map(catalog_map)
-    id_names = () if known is None else known.id_names
+    column_map = None
+    id_names = ()
+    if catalog_map is not None:
+        column_map = as_catalog_map(catalog_map)
+        id_names = column_map.id_names
     rows = open_rows(path, chunk_rows, hdu=hdu, id_names=id_names)
-    if known is not None:
+    if column_map is not None:
         if flux_unit is not None:
-            known = dataclasses.replace(known, units={"flux": flux_unit, **known.units})
-        rows = MappedRows(rows, known)
+            column_map = dataclasses.replace(
+                column_map, units={"flux": flux_unit, **column_map.units}
+            )
+        rows = MappedRows(rows, column_map)
     else:
         rows = _named_rows(rows, flux_unit)
-    return rows if "id" in rows.colnames else CountedRows(rows)
+    if "id" in rows.colnames:
+        return rows
+    return CountedRows(rows)
 
 
 def _named_rows(rows, flux_unit):
     """Rows under our names; with magnitudes by a map that makes fluxes of them."""
     first = rows.chunk(0)
     names, magnitudes = band_columns(first, rows.path.name)
-    unit = None if flux_unit is None else unit_of_fluxes(flux_unit, "flux_unit")
+    unit = None
+    if flux_unit is not None:
+        unit = unit_of_fluxes(flux_unit, "flux_unit")
     is_ab = unit == u.ABmag
     if not magnitudes and not is_ab:
         rows.rename(names)
         return rows
     columns = {ours: theirs for theirs, ours in names.items()}
-    units = {} if unit is None else {"flux": unit}
+    units = {}
+    if unit is not None:
+        units = {"flux": unit}
     return MappedRows(rows, CatalogMap(columns, units | dict.fromkeys(magnitudes, u.ABmag)))
 
 

@@ -81,7 +81,9 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     seed = check_seed(seed)
     fitter = fitter.for_photometry(photometry)
     filters = results.fitted_filters
-    columns = [c for name in filters for c in (name, error_column(name))]
+    columns = []
+    for name in filters:
+        columns += [name, error_column(name)]
     require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
     if not np.array_equal(read_ids(photometry), results.ids):
         raise argument_error("photometry", "of the objects of 'results', in order", "others")
@@ -90,14 +92,19 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     n_bands = len(results.filters)
     noise = [stream(seed, "mock", str(key)).normal(size=n_bands) for key in results.ids]
     noise = np.reshape(noise, results.flux.shape)
-    error = results.sigma if model_error else results.flux_err
-    used = np.isfinite(results.sigma) & results.fitted[:, None] & np.isfinite(error)
-    change, drawn = used & ~results.limit, results.best_flux + noise * error
+    if model_error:
+        error = results.sigma
+    else:
+        error = results.flux_err
+    in_fit = np.isfinite(results.sigma) & results.fitted[:, None] & np.isfinite(error)
+    redrawn = in_fit & ~results.limit
+    noisy_flux = results.best_flux + noise * error
     mock = QTable(photometry, copy=True)
     for name in filters:
-        i, point = results.filters.index(name), fitter.zero_points.get(name, 1.0)
-        measured = drawn[:, i] / point
-        mock[name] = np.where(change[:, i], measured, flux_column(photometry, name)) * FNU
+        i = results.filters.index(name)
+        point = fitter.zero_points.get(name, 1.0)
+        measured = noisy_flux[:, i] / point
+        mock[name] = np.where(redrawn[:, i], measured, flux_column(photometry, name)) * FNU
     meta = {"seed": seed, "model_error": bool(model_error)}
     return MockResult(results, fitter.fit(mock, **options), mock, seed, meta)
 
@@ -160,7 +167,7 @@ class MockResult:
 
     def to_table(self):
         """
-        True and recovered values.
+        Tabulate true and recovered values.
 
         Returns
         -------
@@ -169,7 +176,8 @@ class MockResult:
             derived quantity, ``<name>_true``, ``_mean``, ``_std``, ``_p16``, ``_p50`` and
             ``_p84``.
         """
-        table, names = self.recovered.to_table(), ["id", "flags"]
+        table = self.recovered.to_table()
+        names = ["id", "flags"]
         for name in self.parameters:
             table[f"{name}_true"] = self.true(name)
             table[f"{name}_true"].info.description = f"true value of {name}: the best model's"
@@ -180,7 +188,7 @@ class MockResult:
 
     def metrics(self, parameters=None):
         """
-        How well parameters are recovered.
+        Measure how well parameters are recovered.
 
         Parameters
         ----------
@@ -197,19 +205,25 @@ class MockResult:
             parameters of the grid, whose truth lies on a node, the coverage counts randomized
             ranks.
         """
-        names = self.parameters if parameters is None else parameters
+        if parameters is None:
+            names = self.parameters
+        else:
+            names = parameters
         rows = [self._metric(name) for name in names]
         table = described_rows(rows, _COLUMNS["mock"])
         table.meta["mock"] = dict(self.meta)
         return table
 
     def _metric(self, name):
-        true, mean = self.true(name).value, self.recovered.mean(name).value
+        true = self.true(name).value
+        mean = self.recovered.mean(name).value
         good = np.isfinite(true) & np.isfinite(mean)
-        unit, difference = self.truth.unit(name).to_string(), (mean - true)[good]
+        unit = self.truth.unit(name).to_string()
+        difference = (mean - true)[good]
         if self.truth.extensive(name):
-            both = good & (true > 0) & (mean > 0)
-            unit, difference = "dex", np.log10(mean[both] / true[both])
+            positive = good & (true > 0) & (mean > 0)
+            unit = "dex"
+            difference = np.log10(mean[positive] / true[positive])
         return {
             "parameter": name,
             "unit": unit,
@@ -236,15 +250,18 @@ class MockResult:
         """Draw recovered against true values of a parameter; returns the axes."""
         from miricigale.plotting.posteriors import plot_recovery
 
-        found, unit = self.recovered, self.truth.unit(name).to_string()
+        recovered = self.recovered
+        unit = self.truth.unit(name).to_string()
         kwargs = {"name": name, "unit": unit, "log": self.truth.extensive(name), "ax": ax} | kwargs
-        values = (self.true(name), found.mean(name), found.std(name))
-        return plot_recovery(*(quantity.value for quantity in values), **kwargs)
+        true = self.true(name).value
+        return plot_recovery(true, recovered.mean(name).value, recovered.std(name).value, **kwargs)
 
 
 def _statistic(function, values):
-    """A number that sums up some values; NaN of none."""
-    return float(function(values)) if len(values) else np.nan
+    """Evaluate a statistic of values; NaN of none."""
+    if len(values):
+        return float(function(values))
+    return np.nan
 
 
 @without_warnings()
@@ -302,13 +319,17 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     bands = tuple(known_filter(name, fitter.bands, "filter of the models") for name in bands)
     check_that(len(set(bands)) == len(bands), "bands", "different names", list(bands))
     data = fitter._read_bands(photometry, bands)
-    groups = [(name,) for name in bands] if separately else [bands]
+    if separately:
+        groups = [(name,) for name in bands]
+    else:
+        groups = [bands]
     fitted = [f for f in fitter.filters or fitter.bands if f in photometry.colnames]
     for group in groups:
         if len(set(fitted) - set(group)) < fitter.n_bands_min:
             wanted = f"such that n_bands_min = {fitter.n_bands_min} or more of {fitted} are left"
             raise argument_error("bands", wanted, f"{list(group)}")
-    empty = [name for name, known in zip(bands, data.used.any(axis=0), strict=True) if not known]
+    has_flux = data.used.any(axis=0)
+    empty = [name for i, name in enumerate(bands) if not has_flux[i]]
     check_that(not (empty and len(photometry)), "bands", "measured for one object at least", empty)
     results = {}
     for group in groups:
@@ -317,13 +338,18 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
             blank[name] = np.full(len(blank), np.nan) * FNU
             blank[f"{name}_limit"] = np.zeros(len(blank), dtype=bool)
         results |= dict.fromkeys(group, fitter.fit(blank, **options))
-    fits = [(found, found.filters.index(name)) for name, found in results.items()]
+    predicted = np.empty((len(photometry), len(bands)))
+    predicted_std = np.empty_like(predicted)
+    for i, name in enumerate(bands):
+        column = results[name].filters.index(name)
+        predicted[:, i] = results[name].model_flux[:, column]
+        predicted_std[:, i] = results[name].model_flux_std[:, column]
     return LeaveOutResult(
         bands=bands,
         flux=np.where(data.measured, data.flux, np.nan),
         flux_err=np.where(data.measured, data.flux_err, np.nan),
-        predicted=np.array([found.model_flux[:, i] for found, i in fits]).T,
-        predicted_std=np.array([found.model_flux_std[:, i] for found, i in fits]).T,
+        predicted=predicted,
+        predicted_std=predicted_std,
         results=results,
     )
 
@@ -387,7 +413,7 @@ class LeaveOutResult:
 
     def to_table(self):
         """
-        Measured and predicted fluxes.
+        Tabulate measured and predicted fluxes.
 
         Returns
         -------
@@ -396,8 +422,8 @@ class LeaveOutResult:
             ``<name>_predicted_err``, ``<name>_pull`` and ``<name>_flags``, those of the fit
             without it.
         """
-        some = self.results[self.bands[0]]
-        columns = {"id": (np.array(some.ids), "identifier")}
+        first_fit = self.results[self.bands[0]]
+        columns = {"id": (np.array(first_fit.ids), "identifier")}
         pull = self.pull * u.dimensionless_unscaled
         text = "measured less predicted, over both errors in quadrature"
         for i, name in enumerate(self.bands):
@@ -409,11 +435,11 @@ class LeaveOutResult:
                 f"{name}_pull": (pull[:, i], text),
                 f"{name}_flags": (np.array(self.results[name].flags), FitFlags.describe()),
             }
-        return described_table(columns, dict(some.meta) | {"left_out": [*self.bands]})
+        return described_table(columns, dict(first_fit.meta) | {"left_out": list(self.bands)})
 
     def metrics(self):
         """
-        How well each band is predicted.
+        Measure how well each band is predicted.
 
         Returns
         -------
@@ -428,7 +454,9 @@ class LeaveOutResult:
 
     def _metric(self, i):
         good = np.isfinite(self.pull[:, i])
-        pull, flux, model = self.pull[good, i], self.flux[good, i], self.predicted[good, i]
+        pull = self.pull[good, i]
+        flux = self.flux[good, i]
+        model = self.predicted[good, i]
         offset = _statistic(np.median, flux[model > 0] / model[model > 0]) - 1.0
         return {
             "band": self.bands[i],
@@ -444,7 +472,10 @@ class LeaveOutResult:
         from miricigale.plotting.axes import plain_text
         from miricigale.plotting.posteriors import plot_pulls
 
-        check_names(() if band is None else [band], "band that was left out", self.bands)
-        pull = self.pull if band is None else self.pull[:, self.bands.index(band)]
-        label = None if band is None else plain_text(band)
+        pull = self.pull
+        label = None
+        if band is not None:
+            check_names([band], "band that was left out", self.bands)
+            pull = self.pull[:, self.bands.index(band)]
+            label = plain_text(band)
         return plot_pulls(pull.ravel(), ax=ax, **{"label": label, **kwargs})

@@ -35,12 +35,15 @@ def chosen_classes(classes, *, quasars=False, red_dots=False, stars=None):
     ValueError
         If stars are asked for without spectra.
     """
-    asked = classes.replace("-", "_").split(",") if isinstance(classes, str) else list(classes)
-    names = {name.strip() for name in asked if name.strip()}
-    every = "all" in names
+    if isinstance(classes, str):
+        requested = classes.replace("-", "_").split(",")
+    else:
+        requested = list(classes)
+    names = {name.strip() for name in requested if name.strip()}
+    all_classes = "all" in names
     names.discard("all")
     check_names(names, "class", CLASSES)
-    if every:
+    if all_classes:
         names |= set(CLASSES)
         if stars is None:
             names.discard("stars")

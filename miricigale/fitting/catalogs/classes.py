@@ -54,7 +54,7 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
 
     Returns
     -------
-    found : dict of str to `~miricigale.fitting.FitResultsFiles`
+    fits : dict of str to `~miricigale.fitting.FitResultsFiles`
         ``galaxy``, ``quasar``, ``red_dot``, ``star``.
 
     Warns
@@ -73,33 +73,33 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
         # a file that cannot be read is refused before hours of fitting
         spectra = read_spectra(stars)
     with _each_once():
-        found = {"galaxy": fit_catalog(path, output, **options)}
+        fits = {"galaxy": fit_catalog(path, output, **options)}
         options.pop("calibrate", None)
         # after the fit, which refuses what it cannot read before it loads the models
         from miricigale.fitting.catalogs.catalog_calibration import measured_calibration
         from miricigale.fitting.posterior.populations import red_dot_prior
         from miricigale.sed import SEDModel, quasar_axes, red_dot_axes, template_grid
 
-        measured = measured_calibration(found["galaxy"])
+        measured = measured_calibration(fits["galaxy"])
         if measured is not None:
             options["calibration"] = measured
         # of parameters of galaxies
         options.pop("pairs", None)
         options.pop("priors", None)
 
-        def fit(name, models, **more):
-            own = options | more
-            found[name] = fit_catalog(path, Path(output) / name, models=models, **own)
+        def fit(name, models, **class_options):
+            keywords = options | class_options
+            fits[name] = fit_catalog(path, Path(output) / name, models=models, **keywords)
 
-        # what is of another class has large residuals
+        # sources of another class have large residuals
         with without_warnings():
             if "quasars" in names:
                 fit("quasar", lambda _: (SEDModel.survey(), quasar_axes()))
             if "red_dots" in names:
                 # lines that cross the bands are exact at the nodes, and these lie close
-                own = {"priors": {"redshift": red_dot_prior(red_dot_axes()["redshift"])}}
+                priors = {"redshift": red_dot_prior(red_dot_axes()["redshift"])}
                 models = partial(red_dot_grid, ebv=options.get("ebv", 0.0))
-                fit("red_dot", models, interpolate=0, agn_error=0.0, **own)
+                fit("red_dot", models, interpolate=0, agn_error=0.0, priors=priors)
             options.pop("redshift", None)
             if spectra is not None:
 
@@ -107,12 +107,12 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
                     return template_grid(spectra, bands, beyond="rayleigh-jeans"), None
 
                 fit("star", stars_in)
-    return found
+    return fits
 
 
 def red_dot_grid(bands, *, ebv=0.0):
     """
-    Grid of little red dots, for ``models`` of `~miricigale.fitting.fit_catalog`.
+    Make a grid of little red dots, for ``models`` of `~miricigale.fitting.fit_catalog`.
 
     Parameters
     ----------
@@ -140,51 +140,52 @@ def red_dot_grid(bands, *, ebv=0.0):
 @contextmanager
 def _each_once():
     """Show each text of a warning once, for it holds for all classes."""
-    show, shown = warnings.showwarning, set()
+    show = warnings.showwarning
+    shown = set()
 
-    def once(message, *args, **kwargs):
+    def show_once(message, *args, **kwargs):
         if str(message) not in shown:
             shown.add(str(message))
             show(message, *args, **kwargs)
 
-    warnings.showwarning = once
+    warnings.showwarning = show_once
     try:
         yield
     finally:
         warnings.showwarning = show
 
 
-def write_table(found, path, *, overwrite=False):
+def write_table(fits, path, *, overwrite=False):
     """
     Write the table of all results, with the columns of the classes where there are several.
 
     Parameters
     ----------
-    found : dict of str to `~miricigale.fitting.FitResultsFiles`
+    fits : dict of str to `~miricigale.fitting.FitResultsFiles`
         As `fit_classes` returned it.
     path, overwrite
         As for `~miricigale.fitting.FitResultsFiles.write_table`.
     """
     # redshifts and how well a model fits are those of the class; all else of the table is of the fit as a galaxy
-    first = found["galaxy"]
-    if len(found) == 1:
-        first.write_table(path, overwrite=overwrite)
+    galaxies = fits["galaxy"]
+    if len(fits) == 1:
+        galaxies.write_table(path, overwrite=overwrite)
         return
-    width = max(part.ids.dtype.itemsize for part in first.parts())
-    write_rows(path, _tables(found), len(first), id_width=width, overwrite=overwrite)
+    width = max(part.ids.dtype.itemsize for part in galaxies.parts())
+    write_rows(path, _tables(fits), len(galaxies), id_width=width, overwrite=overwrite)
 
 
-def _parts(found, step=1):
+def _parts(fits, step=1):
     """Iterate over the parts of the results, or every ``step``-th of their objects: `FitResults` by class."""
-    thin = (thinned(results.parts(), step) for results in found.values())
-    for parts in zip(*thin, strict=True):
-        yield dict(zip(found, parts, strict=True))
+    by_class = [thinned(results.parts(), step) for results in fits.values()]
+    for parts in zip(*by_class, strict=True):
+        yield dict(zip(fits, parts, strict=True))
 
 
-def _tables(found):
-    for some in _parts(found):
-        table = some["galaxy"].to_table()
-        columns = class_columns(some)
+def _tables(fits):
+    for class_results in _parts(fits):
+        table = class_results["galaxy"].to_table()
+        columns = class_columns(class_results)
         for name in table.colnames:
             if name not in columns and name not in _OF_ALL:
                 table[name].info.description += ", of the fit as a galaxy"
@@ -194,15 +195,15 @@ def _tables(found):
         yield table[first + [name for name in table.colnames if name not in first]]
 
 
-def classes_of(found, step=1):
-    """Columns of `~miricigale.fitting.compare_classes` for every ``step``-th object: dict of name to array."""
-    parts = [class_columns(some) for some in _parts(found, step)]
+def classes_of(fits, step=1):
+    """Compute the columns of `~miricigale.fitting.compare_classes` for every ``step``-th object, by name."""
+    parts = [class_columns(class_results) for class_results in _parts(fits, step)]
     return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
 
 
 def classes_section(page, columns, names, ids):
     """
-    The part of a page on classes.
+    Write the section of a page on classes.
 
     Parameters
     ----------
@@ -215,21 +216,34 @@ def classes_section(page, columns, names, ids):
     ids : `~numpy.ndarray`, shape (n,)
         Ids of the objects.
     """
-    label, others = columns["class"], names[1:]
-    chi2, free = columns["reduced_chi2_galaxy"], "redshift_p50" in columns
-    page.section("classes", others=" or ".join(others))
+    label = columns["class"]
+    non_galaxies = names[1:]
+    has_redshifts = "redshift_p50" in columns
+    page.section("classes", others=" or ".join(non_galaxies))
+    missing_redshift = "given"
+    if has_redshifts:
+        missing_redshift = "no object"
+    # probability of odds exp(_SURE) to 1
+    sure_probability = 1.0 / (1.0 + np.exp(-_SURE))
     rows = []
     for name in names:
-        mine, own = label == name, columns[f"reduced_chi2_{name}"]
-        sure = columns[f"probability_{name}"][mine] > 1.0 / (1.0 + np.exp(-_SURE))
-        middle = number(np.median(own[mine]) if mine.any() else np.nan, ".2f", "no object")
-        z = np.median(columns["redshift_p50"][mine]) if free and mine.any() else np.nan
-        z = number(z, ".2f", "no object" if free else "given")
-        rows.append({"class": name, "n": mine.sum(), "sure": sure.sum(), "chi2": middle, "z": z})
-    lost = {"class": "not fitted with all classes", "n": np.sum(label == "")}
-    page.table("counts", [*rows, lost | {"sure": "", "chi2": "", "z": ""}])
-    figure, axes = new_figure(1, len(others), size=(WIDTH / 2, 3.2))
-    for ax, name in zip(axes[0], others, strict=True):
+        in_class = label == name
+        sure = columns[f"probability_{name}"][in_class] > sure_probability
+        median_chi2 = np.nan
+        median_z = np.nan
+        if in_class.any():
+            median_chi2 = np.median(columns[f"reduced_chi2_{name}"][in_class])
+            if has_redshifts:
+                median_z = np.median(columns["redshift_p50"][in_class])
+        row = {"class": name, "n": in_class.sum(), "sure": sure.sum()}
+        row["chi2"] = number(median_chi2, ".2f", "no object")
+        row["z"] = number(median_z, ".2f", missing_redshift)
+        rows.append(row)
+    unsorted = {"class": "not fitted with all classes", "n": np.sum(label == "")}
+    rows.append(unsorted | {"sure": "", "chi2": "", "z": ""})
+    page.table("counts", rows)
+    figure, axes = new_figure(1, len(non_galaxies), size=(WIDTH / 2, 3.2))
+    for ax, name in zip(axes[0], non_galaxies, strict=True):
         ratio = columns[f"log_ratio_{name}"]
         ratio = ratio[np.isfinite(ratio)]
         ax.hist(np.clip(ratio, -_SPAN, _SPAN), np.linspace(-_SPAN, _SPAN, 61), color="0.75")
@@ -237,13 +251,18 @@ def classes_section(page, columns, names, ids):
         ax.set(xlabel=f"ln evidence, {name} over galaxy", ylabel="objects")
     page.figure("figure", figure)
     surest = []
-    for name in others:
-        ratio, own = columns[f"log_ratio_{name}"], columns[f"reduced_chi2_{name}"]
-        mine = np.flatnonzero(label == name)
-        for i in mine[np.argsort(-ratio[mine], kind="stable")][:_LISTED]:
+    for name in non_galaxies:
+        ratio = columns[f"log_ratio_{name}"]
+        in_class = np.flatnonzero(label == name)
+        for i in in_class[np.argsort(-ratio[in_class], kind="stable")][:_LISTED]:
             row = {"id": str(ids[i]), "class": name, "ratio": ratio[i]}
-            row["z"] = columns["redshift_p50"][i] if free else np.nan
-            row["z_galaxy"] = columns["redshift_p50_galaxy"][i] if free else np.nan
-            surest.append(row | {"own": own[i], "galaxy": chi2[i]})
+            row["z"] = np.nan
+            row["z_galaxy"] = np.nan
+            if has_redshifts:
+                row["z"] = columns["redshift_p50"][i]
+                row["z_galaxy"] = columns["redshift_p50_galaxy"][i]
+            row["own"] = columns[f"reduced_chi2_{name}"][i]
+            row["galaxy"] = columns["reduced_chi2_galaxy"][i]
+            surest.append(row)
     if surest:
         page.table("surest", surest, n=_LISTED)

@@ -25,7 +25,7 @@ _OF_FIT = {
 
 def compare_classes(results, *, prior=None):
     r"""
-    Class of every object, from the evidences of fits of the same photometry.
+    Classify every object, from the evidences of fits of the same photometry.
 
     The evidence of a class is its posterior's normalization, ``log_evidence`` of `FitResults`: prior times
     likelihood summed over the models of the class, each at its best scale. The fits share fluxes, errors, limits
@@ -91,7 +91,7 @@ def compare_classes(results, *, prior=None):
 
 
 def class_columns(results, *, prior=None):
-    """Columns of `compare_classes` but the id: dict of name to values and description."""
+    """Compute the columns of `compare_classes` but the id: dict of name to values and description."""
     check_that(len(results) >= 2, "results", "a dict of two classes at least", list(results))
     names = list(results)
     first = results[names[0]]
@@ -99,28 +99,29 @@ def class_columns(results, *, prior=None):
         _check_same(names[0], first, name, results[name])
     weight = _prior(prior, names, len(first))
     evidence = np.array([results[name].log_evidence for name in names], dtype=float)
-    known = np.isfinite(evidence).all(axis=0)
+    in_all_fits = np.isfinite(evidence).all(axis=0)
+    # P_c = pi_c Z_c / sum of pi_k Z_k, shifted by the largest exponent so that it cannot overflow
     with np.errstate(divide="ignore", invalid="ignore"):
-        log_posterior = np.where(known, evidence, np.nan) + np.log(weight)
+        log_posterior = np.where(in_all_fits, evidence, np.nan) + np.log(weight)
         shifted = np.exp(log_posterior - log_posterior.max(axis=0))
         probability = shifted / shifted.sum(axis=0)
-    place = np.where(known, np.argmax(shifted, axis=0), -1)
-    label = np.where(known, np.array(names)[place], "")
-    chosen = np.where(known, probability.max(axis=0), np.nan)
+    class_number = np.where(in_all_fits, np.argmax(shifted, axis=0), -1)
+    label = np.where(in_all_fits, np.array(names)[class_number], "")
+    best_probability = np.where(in_all_fits, probability.max(axis=0), np.nan)
     out = {
         "class": (label, "class of the highest probability; none where a fit is missing"),
-        "class_probability": (chosen, "probability of the class"),
+        "class_probability": (best_probability, "probability of the class"),
     }
     fits = list(results.values())
-    # the first class stands for what has none
-    place = np.maximum(place, 0)
-    out |= _redshifts_of_class(fits, place)
+    # objects without a class get the columns of the first
+    class_number = np.maximum(class_number, 0)
+    out |= _redshifts_of_class(fits, class_number)
     for name, text in _OF_FIT.items():
         attribute = {"chi2_best": "chi2"}.get(name, name)
         values = np.array([np.asarray(getattr(fit, attribute)) for fit in fits])
-        out[name] = (_of_class(values, place), text)
-    other = np.where(place > 0, int(FitFlags.OTHER_CLASS), 0)
-    out["flags"] = (out["flags"][0] | other, out["flags"][1])
+        out[name] = (_of_class(values, class_number), text)
+    class_flag = np.where(class_number > 0, int(FitFlags.OTHER_CLASS), 0)
+    out["flags"] = (out["flags"][0] | class_flag, out["flags"][1])
     for name, values in zip(names, probability, strict=True):
         out[f"probability_{name}"] = (values, f"probability of the class {name}")
     for name, values in zip(names[1:], evidence[1:], strict=True):
@@ -148,13 +149,13 @@ def _has_free_redshift(fit):
 
 
 def _of_class(values, place):
-    """Values of the class of each object: of shape (n,), from (n_classes, n)."""
+    """Select the values of the class of each object: of shape (n,), from (n_classes, n)."""
     return np.take_along_axis(values, place[None], axis=0)[0]
 
 
 def _redshifts_of_class(fits, place):
     """
-    Redshift columns of the class of each object, by name: values and descriptions.
+    Select the redshift columns of the class of each object, by name: values and descriptions.
 
     There are none where the redshifts of the first class were given. Those of a class with a single redshift, such
     as stars, are that one, without odds.
@@ -163,19 +164,16 @@ def _redshifts_of_class(fits, place):
         return {}
     of_fits = [_redshift_columns(fit) for fit in fits]
     out = {}
-    for name, meaning in (*_MEANINGS.items(), ("odds", ODDS)):
+    texts = {name: f"{meaning} of the redshift of the class" for name, meaning in _MEANINGS.items()}
+    texts["odds"] = f"{ODDS}, of the class"
+    for name, text in texts.items():
         values = np.array([columns[name] for columns in of_fits])
-        text = (
-            f"{meaning}, of the class"
-            if name == "odds"
-            else f"{meaning} of the redshift of the class"
-        )
         out[f"redshift_{name}"] = (_of_class(values, place), text)
     return out
 
 
 def _redshift_columns(fit):
-    """Redshift columns of one fit by what stands behind ``redshift_``."""
+    """Compute the redshift columns of a fit, by the part of the name after ``redshift_``."""
     best = np.asarray(fit.best["redshift"].value, dtype=float)
     if not _has_free_redshift(fit):
         spread = np.where(np.isfinite(best), 0.0, np.nan)
@@ -186,24 +184,27 @@ def _redshift_columns(fit):
     return columns | {"odds": fit.redshift_odds}
 
 
-def _check_same(whose, first, name, other):
+def _check_same(whose, first, name, second):
     """Refuse fits of other objects or of other data."""
-    bands, got = first.fitted_filters, None
-    if not np.array_equal(first.ids, other.ids):
+    bands = first.fitted_filters
+    got = None
+    if not np.array_equal(first.ids, second.ids):
         got = "other objects"
-    elif set(bands) != set(other.fitted_filters):
-        got = f"the bands {list(other.fitted_filters)}"
+    elif set(bands) != set(second.fitted_filters):
+        got = f"the bands {list(second.fitted_filters)}"
     else:
-        mine, theirs = ([one.filters.index(band) for band in bands] for one in (first, other))
+        first_columns = [first.filters.index(band) for band in bands]
+        second_columns = [second.filters.index(band) for band in bands]
         for values in ("flux", "flux_err", "limit"):
-            a, b = getattr(first, values)[:, mine], getattr(other, values)[:, theirs]
+            a = getattr(first, values)[:, first_columns]
+            b = getattr(second, values)[:, second_columns]
             if not np.array_equal(a, b, equal_nan=values != "limit"):
                 got = f"other values of {values!r}"
     check_that(got is None, "results", f"{name!r} of the same data as {whose!r}", got)
 
 
 def _prior(prior, names, n):
-    """Shares of the classes, shape (n_classes, n)."""
+    """Return the prior shares of the classes, shape (n_classes, n)."""
     if prior is None:
         return np.ones((len(names), n))
     check_that(set(prior) == set(names), "prior", f"of the classes {names}", sorted(prior))

@@ -130,14 +130,15 @@ def fit_catalog(
     warn_of_unfitted(unused)
     axes = grid_name(axes)
     if models is None:
-        model, nodes = SEDModel.for_axes(axes), axes
+        model = SEDModel.for_axes(axes)
+        nodes = axes
     else:
         model, nodes = models(bands)
     if ebv and isinstance(model, SEDModel):
         model = model.with_components(GalacticExtinction(ebv_galactic=ebv, beyond="transparent"))
-    known = first_calibration(calibration, axes, model_error)
-    if models is not None and known is not None:
-        known = known.without_priors()
+    given_calibration = first_calibration(calibration, axes, model_error)
+    if models is not None and given_calibration is not None:
+        given_calibration = given_calibration.without_priors()
     fitter = BayesFitter(
         model,
         bands,
@@ -145,7 +146,7 @@ def fit_catalog(
         axes=nodes,
         model_error=model_error,
         outliers=outliers,
-        calibration=known,
+        calibration=given_calibration,
         nuclei=nuclei,
         settings=GridSettings(
             interpolate=interpolate,
@@ -216,7 +217,9 @@ def calibrated(fitter, rows, calibrate, output, options):
 
     # which a long calibration should not come before
     fitter.backend.check_pairs(options.get("pairs"))
-    column = calibrate if isinstance(calibrate, str) else None
+    column = None
+    if isinstance(calibrate, str):
+        column = calibrate
     path = output / FILE_NAME
     if not path.exists() or not options.get("resume", True):
         log.info("measuring the errors of the bands on the catalog")

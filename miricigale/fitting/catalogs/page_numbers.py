@@ -44,12 +44,13 @@ def fit_numbers(results, step=1):
 def _numbers(part):
     n = len(part)
     bands = [part.filters.index(name) for name in part.fitted_filters]
-    used = np.isfinite(part.sigma[:, bands]) & ~part.limit[:, bands]
+    measured = np.isfinite(part.sigma[:, bands]) & ~part.limit[:, bands]
     error = part.flux_err[:, bands]
     with np.errstate(invalid="ignore", divide="ignore"):
-        model, flux = part.best_flux[:, bands], part.flux[:, bands]
-        ratio = np.where(used & (model > 0), flux / model, np.nan)
-        pull = np.where(used, (flux - model) / part.sigma[:, bands], np.nan)
+        model = part.best_flux[:, bands]
+        flux = part.flux[:, bands]
+        ratio = np.where(measured & (model > 0), flux / model, np.nan)
+        pull = np.where(measured, (flux - model) / part.sigma[:, bands], np.nan)
     out = {
         "ids": np.array(part.ids).astype(str),
         "flags": np.array(part.flags),
@@ -63,12 +64,12 @@ def _numbers(part):
     }
     if part.outlier is not None:
         out["wrong"] = part.outlier[:, bands] > 0.5
-    for name, of in (("z", "redshift"), ("frac", "frac_agn"), ("mass", "stellar_mass")):
+    for name, parameter in (("z", "redshift"), ("frac", "frac_agn"), ("mass", "stellar_mass")):
         values = np.full((n, 3), np.nan)
-        if of in part.parameters:
-            values = np.asarray(part.percentile(of, [0.16, 0.5, 0.84]).value)
-        elif of in part.constants:
-            values[:] = np.where(part.fitted, part.constants[of], np.nan)[:, None]
+        if parameter in part.parameters:
+            values = np.asarray(part.percentile(parameter, [0.16, 0.5, 0.84]).value)
+        elif parameter in part.constants:
+            values[:] = np.where(part.fitted, part.constants[parameter], np.nan)[:, None]
         out[name] = values
     return out
 
@@ -100,7 +101,7 @@ def known_redshifts(rows, name, step=1):
     """
     names = rows.colnames
     if name is None:
-        name = next((one for one in KNOWN_REDSHIFTS if one in names), None)
+        name = next((column for column in KNOWN_REDSHIFTS if column in names), None)
     if name is None:
         return None, np.full(len(range(0, rows.n_rows, step)), np.nan)
     check_that(name in names, "z_spec", f"one of the columns {list(names)}", repr(name))

@@ -139,7 +139,9 @@ def fit_file(
     check_that(isinstance(fitter, BayesFitter), "fitter", "a BayesFitter", type(fitter).__name__)
     if not isinstance(path_in, (str, os.PathLike)):
         raise argument_error("path_in", "the path of a catalog", type(path_in).__name__)
-    unit = None if flux_unit is None else unit_of_fluxes(flux_unit, "flux_unit")
+    unit = None
+    if flux_unit is not None:
+        unit = unit_of_fluxes(flux_unit, "flux_unit")
     rows = open_catalog(path_in, chunk_rows, hdu=hdu, catalog_map=catalog_map, flux_unit=unit)
     if fitter.waits:
         bands = bands_with_errors(rows.colnames, "path_in")
@@ -166,23 +168,27 @@ def fit_file(
     for i in range(rows.n_chunks):
         with _noted(rows, i):
             ids = ascii_ids(read_ids(rows.chunk(i)), "photometry")
-            kinds |= {ids.dtype.kind} if ids.size else set()
+            if ids.size:
+                kinds.add(ids.dtype.kind)
             got = "whole numbers in earlier rows, and others here"
             check_that(len(kinds) < 2, "photometry", "a table with ids of one kind", got)
-    given = {"hdu": hdu, "flux_unit": None if unit is None else unit.to_string()}
-    given |= {} if not mapped else {"map": rows.map.settings()}
-    job = _job(fitter, rows, options | {"seed": seed}, given)
+    catalog_settings = {"hdu": hdu, "flux_unit": None}
+    if unit is not None:
+        catalog_settings["flux_unit"] = unit.to_string()
+    if mapped:
+        catalog_settings["map"] = rows.map.settings()
+    job = _job(fitter, rows, options | {"seed": seed}, catalog_settings)
     with FitFolder(path_out) as folder:
         _begin(folder, job, resume)
         _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar)
-        # which depends on all of the sample
+        # the limit depends on the whole sample
         folder.facts["chi2_limit"] = _chi2_limit(folder, rows.n_chunks)
         folder.write_manifest()
     return open_results(path_out, model=fitter.model, curves=fitter.curves)
 
 
 def _chi2_limit(folder, n_parts):
-    """Reduced chi2 above which a fit is poor, of all parts."""
+    """Compute the reduced chi2 above which a fit is poor, from all parts."""
     parts = [part_chi2(folder.path(part_name(i))) for i in range(n_parts)]
     step = chi2_step(sum(len(chi2) for chi2 in parts))
     return chi2_limit(np.concatenate(parts)[::step])
@@ -201,31 +207,34 @@ def _noted(rows, i):
 
 def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
     """Fit the pieces whose parts are not there, and write them."""
-    n_new, waiting, duplicates = 0, deque(), Duplicates()
+    n_new = 0
+    waiting = deque()
+    duplicates = Duplicates()
 
-    def finish(i, made):
-        (products, n_rows, n_fitted), name = made, part_name(i)
-        what = "was written by a worker to a folder that cannot be seen from here"
-        check_data(folder.path(name).is_file(), folder.path(name), what)
+    def finish(i, part):
+        products, n_rows, n_fitted = part
+        name = part_name(i)
+        problem = "was written by a worker to a folder that cannot be seen from here"
+        check_data(folder.path(name).is_file(), folder.path(name), problem)
         folder.finish(name, "", products, rows=n_rows, fitted=n_fitted)
         bar.update(n_rows)
 
-    def collect(most):
-        while len(waiting) > most:
+    def collect(n_allowed):
+        while len(waiting) > n_allowed:
             i, future = waiting.popleft()
             with _noted(rows, i):
                 finish(i, future.result())
 
     with (
         progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar,
-        _seen_ids(folder) as seen,
+        _seen_ids(folder) as seen_before,
     ):
-        submit, most = _workers(fitter, folder, rows.n_chunks, executor)
+        submit, n_waiting = _workers(fitter, folder, rows.n_chunks, executor)
         for i in range(rows.n_chunks):
             name = part_name(i)
             if name in folder.records and folder.is_whole(name):
                 ids = part_ids(folder.path(name))
-                duplicates.add(ids, seen(ids))
+                duplicates.add(ids, seen_before(ids))
                 bar.update(len(ids))
                 continue
             if name in folder.records:
@@ -233,39 +242,45 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
             with _noted(rows, i):
                 table, options = take(i)
                 ids = read_ids(table)
-                repeated = seen(ids)
+                repeated = seen_before(ids)
                 duplicates.add(ids, repeated)
                 options |= {"seed": seed, "repeated": repeated}
                 if n_new and submit:
                     waiting.append((i, submit(name, table, options)))
                 else:
                     if not n_new:
-                        # which holds for all pieces: to the caller of fit_file
+                        # what the first piece warns of holds for all pieces
                         fitter._warn_of_bands(table)
                     results = fitter._fit_part(table, **options, parallel={"executor": executor})
                     if not n_new:
                         warn_of_pulls(results)
                     finish(i, _save_part(folder, name, results))
             n_new += 1
-            # no more are in memory than are worked on
-            collect(most)
+            # only pieces that workers are busy with stay in memory
+            collect(n_waiting)
         collect(0)
     duplicates.warn(rows.path.name)
     logger.info("%s: %d parts, %d of them new", folder.folder, rows.n_chunks, n_new)
 
 
 def _workers(fitter, folder, n_chunks, executor):
-    """Function that sends a piece to a worker of dask, and how many are to be sent; none if there are too few."""
+    """
+    Return a function that sends a piece to a worker of dask, and the largest number of pieces to send.
+
+    None if there are fewer pieces than workers.
+    """
     # dask's executor has no public way to its client
     client = getattr(executor, "_client", None)
-    n_workers = 0 if client is None else sum(client.nthreads().values())
+    n_workers = 0
+    if client is not None:
+        n_workers = sum(client.nthreads().values())
     if not 0 < n_workers <= n_chunks:
         return None, 0
-    # one of them may be lost
-    known = client.scatter(fitter, broadcast=True)
+    # every worker has the fitter, in case one is lost
+    shared_fitter = client.scatter(fitter, broadcast=True)
     place = FileFolder(folder.folder.absolute())
 
-    return partial(executor.submit, _make_part, known, place), 2 * n_workers
+    return partial(executor.submit, _make_part, shared_fitter, place), 2 * n_workers
 
 
 def _make_part(fitter, folder, name, table, options):
@@ -274,7 +289,7 @@ def _make_part(fitter, folder, name, table, options):
 
 
 def _save_part(folder, name, results):
-    """Write a part: what the manifest says of it, its rows, and how many were fitted."""
+    """Write a part; return its record for the manifest, its rows, and how many were fitted."""
     # the same bytes, whenever they and the grid are made
     results = results._changed(meta=undated(results.meta))
     with _WRITING:
@@ -284,26 +299,26 @@ def _save_part(folder, name, results):
 
 @contextlib.contextmanager
 def _seen_ids(folder):
-    """Function of ids: which of them there were in earlier calls, for they are kept on disk."""
+    """Open a function of ids that says which of them occurred in earlier calls; they are kept on disk."""
     path = folder.folder.absolute() / f"{PARTIAL}ids"
     try:
         # the folder is locked, and its file system may know no locks of parts of files
         place = f"{path.as_uri()}?nolock=1"
-        with contextlib.closing(sqlite3.connect(place, uri=True, isolation_level=None)) as known:
+        with contextlib.closing(sqlite3.connect(place, uri=True, isolation_level=None)) as database:
 
-            def seen(ids):
+            def seen_before(ids):
                 keys = [(_key(value),) for value in ids.tolist()]
                 select = "SELECT 1 FROM seen WHERE id = ?"
-                rows = [known.execute(select, key).fetchone() for key in keys]
-                known.executemany("INSERT OR IGNORE INTO seen VALUES (?)", keys)
+                rows = [database.execute(select, key).fetchone() for key in keys]
+                database.executemany("INSERT OR IGNORE INTO seen VALUES (?)", keys)
                 return np.array([row is not None for row in rows], dtype=bool)
 
             # nothing is read by a later process; 64 MB of them are in memory
-            for what in ("journal_mode = OFF", "synchronous = OFF", "cache_size = -64000"):
-                known.execute(f"PRAGMA {what}")
-            known.execute("BEGIN")
-            known.execute("CREATE TABLE seen (id PRIMARY KEY) WITHOUT ROWID")
-            yield seen
+            for pragma in ("journal_mode = OFF", "synchronous = OFF", "cache_size = -64000"):
+                database.execute(f"PRAGMA {pragma}")
+            database.execute("BEGIN")
+            database.execute("CREATE TABLE seen (id PRIMARY KEY) WITHOUT ROWID")
+            yield seen_before
     except sqlite3.Error as err:
         msg = f"{path} could not be written: {err}"
         raise OSError(msg) from err
@@ -312,61 +327,80 @@ def _seen_ids(folder):
 
 
 def _key(value):
-    """An id as the database knows it: numbers that are NaN are one, and those beyond 64 bits are text."""
+    """Turn an id into a key of the database: all NaN are one key, integers beyond 64 bits are text."""
     if value != value:
         return b""
-    return str(value) if isinstance(value, int) and value >= 1 << 63 else value
+    if isinstance(value, int) and value >= 1 << 63:
+        return str(value)
+    return value
 
 
 def row_pieces(rows, options, unit, fluxes):
-    """Function of the number of a piece: its table, and the arguments of `fit` that go with it."""
-    redshift, prior = options["redshift"], options["redshift_prior"]
+    """Return a function of the number of a piece: its table, and the arguments of `fit` for its rows."""
+    redshift = options["redshift"]
+    prior = options["redshift_prior"]
     if prior is not None and (isinstance(prior, str) or len(prior) != 2):
         raise argument_error("redshift_prior", "redshifts and densities", repr(prior))
-    nodes, density = (None, None) if prior is None else prior
+    if prior is None:
+        nodes = None
+        density = None
+    else:
+        nodes, density = prior
     for name, value in (("redshift", redshift), ("redshift_prior", density)):
         if _is_of_rows(name, value) and len(value) != rows.n_rows:
             raise argument_error(name, f"{rows.n_rows} values", f"shape {np.shape(value)}")
 
     def take(i):
-        table, piece = rows.chunk(i), slice(*rows.span(i))
+        table = rows.chunk(i)
+        start, stop = rows.span(i)
+        piece = slice(start, stop)
         give_units(table, fluxes, unit)
-        given = options | {}
+        piece_options = options | {}
         if _is_of_rows("redshift", redshift):
-            given["redshift"] = redshift[piece]
+            piece_options["redshift"] = redshift[piece]
         if isinstance(density, str):
             require_columns(table, [density], "photometry")
-            given["redshift_prior"] = (nodes, table[density])
+            piece_options["redshift_prior"] = (nodes, table[density])
         elif _is_of_rows("redshift_prior", density):
-            given["redshift_prior"] = (nodes, density[piece])
-        return table, given
+            piece_options["redshift_prior"] = (nodes, density[piece])
+        return table, piece_options
 
     return take
 
 
 def _is_of_rows(name, value):
     """Whether what is known of redshifts is given row by row, not for all or by a column."""
-    return not isinstance(value, str) and np.ndim(value) == (1 if name == "redshift" else 2)
+    if isinstance(value, str):
+        return False
+    n_axes = {"redshift": 1, "redshift_prior": 2}[name]
+    return np.ndim(value) == n_axes
 
 
-def _job(fitter, rows, options, given):
-    """What makes a fit another one, in plain values."""
-    redshift, prior = options["redshift"], options["redshift_prior"]
+def _job(fitter, rows, options, catalog_settings):
+    """Collect what makes a fit another one, in plain values."""
+    redshift = options["redshift"]
+    prior = options["redshift_prior"]
+    redshift_content = redshift
+    if not isinstance(redshift, str):
+        redshift_content = content_sha256(redshift)
     job = {
         "catalogue": {
             "sha256": rows.sha256,
             "bytes": rows.path.stat().st_size,
             "rows": rows.n_rows,
-            **given,
+            **catalog_settings,
         },
         "chunk_rows": rows.chunk_rows,
-        "redshift": redshift if isinstance(redshift, str) else content_sha256(redshift),
+        "redshift": redshift_content,
         "redshift_prior": content_sha256(prior),
         "fitter": {name: content_sha256(value) for name, value in fitter.backend.content.items()},
         "settings": fitter.settings() | {"max_reduced_chi2": HIGH_CHI2},
     }
-    job |= {"pairs": [list(names) for names in options["pairs"]]} if options["pairs"] else {}
-    return job if options["seed"] is None else job | {"seed": options["seed"]}
+    if options["pairs"]:
+        job |= {"pairs": [list(names) for names in options["pairs"]]}
+    if options["seed"] is None:
+        return job
+    return job | {"seed": options["seed"]}
 
 
 def _begin(folder, job, resume):
@@ -375,9 +409,9 @@ def _begin(folder, job, resume):
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     # a call that failed before its first part leaves nothing to keep
     if resume and folder.records:
-        other = _differences(folder.facts["job"], job)
-        if other:
-            msg = f"{folder.folder} holds results of another fit: {', '.join(other)} differ"
+        changes = _differences(folder.facts["job"], job)
+        if changes:
+            msg = f"{folder.folder} holds results of another fit: {', '.join(changes)} differ"
             remedy = "resume=False to replace them"
             begun = folder.facts["versions"]["miricigale"]
             if begun != versions["miricigale"]:
@@ -394,10 +428,11 @@ def _begin(folder, job, resume):
 
 
 def _differences(old, new, prefix=""):
-    """Names of what differs between two dicts of plain values."""
+    """List the names of what differs between two dicts of plain values."""
     out = []
-    for name in sorted({*old, *new}):
-        a, b = old.get(name), new.get(name)
+    for name in sorted(old.keys() | new.keys()):
+        a = old.get(name)
+        b = new.get(name)
         if isinstance(a, dict) and isinstance(b, dict):
             out += _differences(a, b, f"{prefix}{name}.")
         elif a != b:
