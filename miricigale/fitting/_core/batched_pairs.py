@@ -17,7 +17,8 @@ from miricigale.utils.compilation import njit
 @njit(**PART)
 def galaxy_products(tables, target, z, block, pq):
     """Fill ``Lanes.pq`` with <G, wF> and <G, wG> of a block of the galaxies of one redshift."""
-    p, q = pq[0, block * BLOCK : (block + 1) * BLOCK], pq[1, block * BLOCK : (block + 1) * BLOCK]
+    p = pq[0, block * BLOCK : (block + 1) * BLOCK]
+    q = pq[1, block * BLOCK : (block + 1) * BLOCK]
     p[:] = 0.0
     q[:] = 0.0
     for b in target.bands:
@@ -75,13 +76,20 @@ def gather(tables, target, limits, pairs, lanes, r, start, floor, filled):
     They are marked as done. Returned are how many lanes are filled then, and the next galaxy,
     `BLOCK` if none is left.
     """
-    key, row = pairs.run_key[r], pairs.bound[r]
-    z, block, k = key >> (2 * KEY_BITS), (key >> KEY_BITS) & KEY_MASK, key & KEY_MASK
-    if lanes.known[block] != z + 1:
-        lanes.known[block] = z + 1
+    key = pairs.run_key[r]
+    row = pairs.bound[r]
+    z = key >> (2 * KEY_BITS)
+    block = (key >> KEY_BITS) & KEY_MASK
+    k = key & KEY_MASK
+    if lanes.products_at[block] != z + 1:
+        lanes.products_at[block] = z + 1
         galaxy_products(tables, target, z, block, lanes.pq)
-    buffer, of_galaxy, weighted = lanes.buffer, tables.of_galaxy, pairs.agn_weighted[k]
-    a, b, share = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1], tables.of_agn[at.SHARE_AGN, k]
+    buffer = lanes.buffer
+    of_galaxy = tables.of_galaxy
+    weighted = pairs.agn_weighted[k]
+    a = pairs.agn_pq[k, 0]
+    b = pairs.agn_pq[k, 1]
+    share = tables.of_agn[at.SHARE_AGN, k]
     log_prior = target.log_prior[z] + tables.of_agn[at.LOG_AGN, k]
     i = start
     while i < BLOCK and filled < BLOCK:
@@ -107,7 +115,8 @@ def gather(tables, target, limits, pairs, lanes, r, start, floor, filled):
                 # fluxes of galaxy and AGN model (for c = 1) in bands with limits
                 n = limits.bands.size
                 for m in range(n):
-                    band, t = limits.bands[m], limits.inverse[m]
+                    band = limits.bands[m]
+                    t = limits.inverse[m]
                     lanes.limit[m, filled] = galaxy[band] * t
                     lanes.limit[n + m, filled] = tables.agn[z, k, band] * t * d
             filled += 1
@@ -139,18 +148,21 @@ def likelihoods(of_frac, lanes, reference, scale_error, record):
     counts. Returned is the number of pairs whose largest R reaches ``record`` (counted, for the largest
     of all would not be found side by side).
     """
-    buffer, weight = lanes.buffer, lanes.weight
+    buffer = lanes.buffer
+    weight = lanes.weight
     n_dark = 0.0
-    c_0, c_1 = of_frac[at.RATIO, 0], of_frac[at.RATIO, -1]
+    c_0 = of_frac[at.RATIO, 0]
+    c_1 = of_frac[at.RATIO, -1]
     for i in range(BLOCK):
         # the numerator of the scale is linear in c
-        p, a = buffer[at.P + i], buffer[at.A + i]
+        p = buffer[at.P + i]
+        a = buffer[at.A + i]
         n_dark += 1.0 if p > -1e29 and min(p + c_0 * a, p + c_1 * a) <= 0.0 else 0.0
     buffer[at.W0 : at.T] = 0.0
     for j in range(of_frac.shape[1]):
         c = of_frac[at.RATIO, j]
         f = of_frac[at.PRIOR_FRAC, j]
-        now = weight[j * BLOCK : (j + 1) * BLOCK]
+        frac_weight = weight[j * BLOCK : (j + 1) * BLOCK]
         for i in range(BLOCK):
             p = max(buffer[at.P + i] + c * buffer[at.A + i], 0.0)
             q = buffer[at.Q + i] + c * (buffer[at.X2 + i] + c * buffer[at.B + i])
@@ -158,9 +170,9 @@ def likelihoods(of_frac, lanes, reference, scale_error, record):
             q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
             # one division for both 1 / q and y / (1 + y)
             y = c * buffer[at.SHARE + i]
-            both = 1.0 / (q * (1.0 + y))
-            inverse = both * (1.0 + y)
-            phi = y * both * q
+            inverse_both = 1.0 / (q * (1.0 + y))
+            inverse = inverse_both * (1.0 + y)
+            phi = y * inverse_both * q
             s = p * inverse
             r = p * s
             e = 0.5 * (r + buffer[at.PRIOR + i] - reference)
@@ -184,7 +196,7 @@ def likelihoods(of_frac, lanes, reference, scale_error, record):
             f_sum += buffer[at.T + i]
         lanes.frac_sum[j] = f_sum
         for i in range(BLOCK):
-            now[i] = buffer[at.T + i]
+            frac_weight[i] = buffer[at.T + i]
     reached = 0.0
     for i in range(BLOCK):
         # sum of l R, with R = (p + c a) s; lanes without weight have no p either

@@ -53,11 +53,16 @@ def _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_err
     In a first pass the best of them becomes the reference, for nothing has been summed up yet, and
     what their weights sum up to is estimated, for the histograms.
     """
-    best, total, draws = sums.best, sums.total, sums.draws
-    about = 0.0
+    best = sums.best
+    total = sums.total
+    draws = sums.draws
+    weight_estimate = 0.0
     carry = 0.0
     for sums_up in (False, True):
-        floor = best[2] - tables.log_zero - (delta if sums_up else _NEAR)
+        depth = _NEAR
+        if sums_up:
+            depth = delta
+        floor = best[2] - tables.log_zero - depth
         for z in range(target.log_prior.size):
             log_prior = target.log_prior[z]
             if log_prior < -1e200:
@@ -65,29 +70,30 @@ def _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_err
             # what no galaxy of this redshift exceeds, priors being at most 1
             if pairs.promise[z] + 1e-5 * target.norm[z] < floor:
                 continue
-            some = False
+            any_kept = False
             for block in range(tables.tiles.shape[1]):
-                known = False
+                has_products = False
                 for g in range(block * BLOCK, min((block + 1) * BLOCK, tables.galaxy.shape[1])):
                     p32 = max(pairs.p32[z, g], np.float32(0)) + 3e-6
                     prior = log_prior + tables.log_usable[z, g]
                     if p32 * p32 * target.norm[z] + prior < floor:
                         continue
-                    if not known:
-                        known = True
+                    if not has_products:
+                        has_products = True
                         galaxy_products(tables, target, z, block, lanes.pq)
                     galaxy = tables.galaxy[z, g]
-                    p, q = lanes.pq[0, g], lanes.pq[1, g]
+                    p = lanes.pq[0, g]
+                    q = lanes.pq[1, g]
                     s, r, inverse = best_scale(limits, p, q, galaxy, galaxy, 0.0, 0.0)
                     value = r + prior + tables.log_zero
                     if not sums_up:
                         if value > best[2]:
-                            about *= math.exp(0.5 * (best[2] - value))
+                            weight_estimate *= math.exp(0.5 * (best[2] - value))
                             best[2] = value
                             floor = value - tables.log_zero - _NEAR
-                        about += math.exp(max(0.5 * (value - best[2]), -700.0))
+                        weight_estimate += math.exp(max(0.5 * (value - best[2]), -700.0))
                         continue
-                    some = True
+                    any_kept = True
                     keep_best(sums, r + target.level[z], s, z, g, np.int64(0), np.int64(0))
                     t = math.exp(max(0.5 * (value - best[2]), -700.0))
                     lanes.galaxy_z[0, g] += t
@@ -99,28 +105,32 @@ def _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_err
                         sums.joint.fg[0, g] += t
                     total[0] += t
                     total[1] += t * s * s / inverse
-                    total[2] += t if s == 0.0 else 0.0
+                    if s == 0.0:
+                        total[2] += t
                     for d in range(draws.next.size):
                         while draws.next[d] <= total[0]:
-                            now = max(total[0], draws.next[d])
-                            take_draw(draws, d, now, z, g, np.int64(-1), np.int64(0), s, inverse)
+                            reached = max(total[0], draws.next[d])
+                            take_draw(
+                                draws, d, reached, z, g, np.int64(-1), np.int64(0), s, inverse
+                            )
                     carry += t
-                    if carry >= max(total[0], about) / PARTS:
+                    if carry >= max(total[0], weight_estimate) / PARTS:
                         add_model(tables, sums.hist, g, np.int64(-1), np.int64(0), s, carry)
                         carry = 0.0
-            if some:
+            if any_kept:
                 finish_redshift(tables, lanes, sums, z)
 
 
 @njit(**PART)
 def _rescale(sums, lanes, factor):
     """Multiply all weights, when a better model becomes the reference."""
-    table, used = sums.hist.table, sums.hist.used
+    table = sums.hist.table
+    span = sums.hist.span
     for array in (sums.flat, sums.hist.share, sums.draws.next):
         for i in range(array.size):
             array[i] *= factor
-    for row in range(used.shape[0]):
-        for i in range(used[row, 0], used[row, 1] + 1):
+    for row in range(span.shape[0]):
+        for i in range(span[row, 0], span[row, 1] + 1):
             table[row, i] *= factor
     for array in (lanes.galaxy_z, lanes.agn_z):
         for m in range(array.shape[0]):
@@ -138,14 +148,16 @@ def _evaluate_runs(
     They are marked as done in the list. The best model met so far, of R + 2 ln(prior) = ``reference``,
     gets weight 1. ``single``: whether single precision will do.
     """
-    best, total, of_frac = sums.best, sums.total, tables.of_frac
+    best = sums.best
+    total = sums.total
+    of_frac = tables.of_frac
     if reference > best[2]:
         if total[0] > 0.0:
             _rescale(sums, lanes, math.exp(0.5 * (best[2] - reference)))
         best[2] = reference
     light = single and limits is None
-    lanes.left[:] = 1.0
-    lanes.known[:] = 0
+    lanes.limit_share[:] = 1.0
+    lanes.products_at[:] = 0
     n_listed = 1.0
     for r in range(n):
         if pairs.top[r] >= floor:
@@ -208,7 +220,8 @@ def _begin(tables, target, limits, pairs, lanes, sums, delta, scale_error):
     Returned is the best R + 2 ln(prior) met, -1e300 if there is no model that may be used.
     """
     project(tables, target, pairs)
-    order, promise = pairs.order, pairs.promise
+    order = pairs.order
+    promise = pairs.promise
     # sorted by insertion: numba's argsort takes memory, which these kernels are compiled without
     for z in range(order.size):
         i = z
@@ -230,8 +243,12 @@ def _begin(tables, target, limits, pairs, lanes, sums, delta, scale_error):
             q = 0.0
             for b in range(target.flux.size):
                 q += tables.galaxy[z, g, b] ** 2 * target.weight[z, b]
-            # where the best has no light others have about what one sigma allows
-            scale = s if s > 0.0 else (1.0 / math.sqrt(q) if q > 1e-290 else 1.0)
+            scale = 1.0
+            if s > 0.0:
+                scale = s
+            elif q > 1e-290:
+                # where the best has no light others have about what one sigma allows
+                scale = 1.0 / math.sqrt(q)
     if reference < -1e299:
         return reference
     origin = sums.hist.origin
@@ -264,33 +281,42 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
     found : bool
         Whether there is any model with weight.
     """
-    best, total, given = sums.best, sums.total, (tables, target, limits, pairs)
-    reference = _begin(*given, lanes, sums, request.delta, request.scale_error)
+    best = sums.best
+    total = sums.total
+    arguments = (tables, target, limits, pairs)
+    reference = _begin(*arguments, lanes, sums, request.delta, request.scale_error)
     n_agn = tables.agn.shape[1]
     if reference < -1e299 or n_agn == 0:
         return total[0] > 0.0
     # a bound holds the largest prior of the fractions above 0, a weight those of all
     prior = tables.of_frac[at.PRIOR_FRAC]
-    prior_sum, prior_top = prior.sum(), prior.max(initial=0.0)
-    end = tables.tiles.shape[0] * tables.tiles.shape[1] if prior_top > 0.0 else 0
+    prior_sum = prior.sum()
+    prior_top = prior.max(initial=0.0)
+    end = 0
+    if prior_top > 0.0:
+        end = tables.tiles.shape[0] * tables.tiles.shape[1]
     position = 0
     share = 1.0
     if limits is not None:
         highest = np.square(limits.level).max()
     while position < end:
-        n, position, reference = list_runs(*given, request.delta, reference, position)
+        n, position, reference = list_runs(*arguments, request.delta, reference, position)
         share *= 0.5
         if limits is not None:
             # a probability many sigma out is not one for single precision
             single = single and max(target.top + limits.dark - reference, highest) < _MODEST
-        floor, few = first_floor(pairs, n, reference)
-        light = single and not few
-        _evaluate_runs(*given, lanes, sums, request, n, reference, floor, light)
+        floor, in_double = first_floor(pairs, n, reference)
+        light = single and not in_double
+        _evaluate_runs(*arguments, lanes, sums, request, n, reference, floor, light)
         allowed = share * request.rtol * total[0]
         tail = (target.norm.max() + 1.0) / request.tail
         rise = math.exp(min(0.5 * (reference - best[2]), 600.0))
-        asked = allowed, rise * prior_sum / max(prior_top, 1e-300), request.delta, tail
-        wide = widest(scales, sums) if allowed > 0.0 else None
-        floor = second_floor(tables, target, pairs, n, reference, *asked, wide)
-        _evaluate_runs(*given, lanes, sums, request, n, reference, floor, single)
+        rise = rise * prior_sum / max(prior_top, 1e-300)
+        wide = None
+        if allowed > 0.0:
+            wide = widest(scales, sums)
+        floor = second_floor(
+            tables, target, pairs, n, reference, allowed, rise, request.delta, tail, wide
+        )
+        _evaluate_runs(*arguments, lanes, sums, request, n, reference, floor, single)
     return total[0] > 0.0

@@ -61,10 +61,10 @@ def first_floor(pairs, n, reference):
     # a bin more than are looked at, for rounding
     _count(pairs, n, reference, np.float32(reference - _FIRST - 1.0), count)
     total = np.cumsum(count[:2, : int(_FIRST * _PER_UNIT)].sum(axis=0))
-    many = np.flatnonzero(total > _MOST)
-    if many.size == 0:
+    crowded = np.flatnonzero(total > _MOST)
+    if crowded.size == 0:
         return reference - _FIRST, True
-    return reference - (many[0] + 1) / _PER_UNIT, bool(total[many[0]] < _FEW * _MOST)
+    return reference - (crowded[0] + 1) / _PER_UNIT, bool(total[crowded[0]] < _FEW * _MOST)
 
 
 @njit(**KERNEL)
@@ -80,7 +80,8 @@ def _raise_bounds(tables, target, pairs, n, allowed, tail_galaxy, tail_agn, refe
     top = 0.0
     z_now = np.int64(-1)
     for r in range(n):
-        key, row = pairs.run_key[r], pairs.bound[r]
+        key = pairs.run_key[r]
+        row = pairs.bound[r]
         z = key >> (2 * KEY_BITS)
         if z != z_now:
             z_now = z
@@ -100,10 +101,10 @@ def _raise_bounds(tables, target, pairs, n, allowed, tail_galaxy, tail_agn, refe
                 amp = tail_agn[k] * allowed / b2 if b2 > 0.0 else 0.0
                 pairs.tail_agn[k] = _TWO_LN_10 * log10(amp) if amp > 1.0 else 0.0
         start = ((key >> KEY_BITS) & KEY_MASK) * BLOCK
-        more = pairs.tail_agn[key & KEY_MASK]
+        raised = pairs.tail_agn[key & KEY_MASK]
         highest = DONE
         for i in range(BLOCK):
-            value = row[i] + (pairs.tail_galaxy[start + i] + more)
+            value = row[i] + (pairs.tail_galaxy[start + i] + raised)
             row[i] = value if row[i] > DONE else DONE
             highest = max(highest, row[i])
         pairs.top[r] = highest
@@ -124,6 +125,6 @@ def second_floor(tables, target, pairs, n, reference, allowed, unit, delta, tail
     count = _make_count()
     _raise_bounds(tables, target, pairs, n, tail, *widest, reference, count)
     # from the lowest up
-    left = np.cumsum((count[:2, :_N_LEVELS].sum(axis=0) * _DECAY * unit)[::-1])
-    last = _N_LEVELS - np.searchsorted(left, allowed, side="right")
+    weight_above = np.cumsum((count[:2, :_N_LEVELS].sum(axis=0) * _DECAY * unit)[::-1])
+    last = _N_LEVELS - np.searchsorted(weight_above, allowed, side="right")
     return reference - min(last / _PER_UNIT, delta)

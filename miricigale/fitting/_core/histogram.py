@@ -42,8 +42,8 @@ def _add_bin(hist, row, y, t):
     part = (y - column) * t
     hist.table[row, column] += t - part
     hist.table[row, column + 1] += part
-    hist.used[row, 0] = min(hist.used[row, 0], column)
-    hist.used[row, 1] = max(hist.used[row, 1], column + 1)
+    hist.span[row, 0] = min(hist.span[row, 0], column)
+    hist.span[row, 1] = max(hist.span[row, 1], column + 1)
 
 
 @njit(**PART)
@@ -67,11 +67,18 @@ def _add_share(change, low, high, weight):
 @njit(**PART)
 def add_model(tables, hist, g, k, j, s, t):
     """Add a model of scale s and weight t; without AGN its k is -1."""
-    of_galaxy, of_agn, of_frac = tables.of_galaxy, tables.of_agn, tables.of_frac
+    of_galaxy = tables.of_galaxy
+    of_agn = tables.of_agn
+    of_frac = tables.of_frac
     # what is spread over the cell of f = 0 need not be as many pieces as there are AGN models
-    y, low, high, power = tables.share_mean, 0.0, tables.edge_zero, 0.0
+    y = tables.share_mean
+    low = 0.0
+    high = tables.edge_zero
+    power = 0.0
     if k >= 0:
-        y, low, high = of_agn[at.SHARE_AGN, k], of_frac[at.EDGE_LOW, j], of_frac[at.EDGE_HIGH, j]
+        y = of_agn[at.SHARE_AGN, k]
+        low = of_frac[at.EDGE_LOW, j]
+        high = of_frac[at.EDGE_HIGH, j]
         power = of_frac[at.RATIO, j] * of_galaxy[at.DUST, g]
     y *= of_galaxy[at.SHARE_GALAXY, g]
     _add_share(hist.share, y * low / (1.0 + y * low), y * high / (1.0 + y * high), t)
@@ -93,16 +100,16 @@ def add_model(tables, hist, g, k, j, s, t):
 
 
 @njit(**KERNEL)
-def clear_rows(table, used):
+def clear_rows(table, span):
     """Set the used bins of every row to zero and mark the rows as empty."""
-    for i in range(used.shape[0]):
-        table[i, used[i, 0] : used[i, 1] + 1] = 0.0
-        used[i, 0] = N_BINS
-        used[i, 1] = -1
+    for i in range(span.shape[0]):
+        table[i, span[i, 0] : span[i, 1] + 1] = 0.0
+        span[i, 0] = N_BINS
+        span[i, 1] = -1
 
 
 @njit(**{**KERNEL, "fastmath": False})
-def _log_quantiles(hists, row, log, weight, least, zero, width, levels, origin, quantiles):
+def _log_quantiles(hists, row, log, weight, min_weight, zero, width, levels, origin, quantiles):
     """
     Mean logarithm and quantiles of a quantity.
 
@@ -112,8 +119,11 @@ def _log_quantiles(hists, row, log, weight, least, zero, width, levels, origin, 
     the third row of ``Histograms.work``, by which histograms are broadened; its first two rows are zeros, and are
     again when this returns. ``quantiles`` are filled; NaN where there is no weight.
     """
-    hist, wide, kernel = hists.work[0], hists.work[1], hists.work[2]
-    table, used = hists.table[row:], hists.used[row:]
+    hist = hists.work[0]
+    wide = hists.work[1]
+    kernel = hists.work[2]
+    table = hists.table[row:]
+    span = hists.span[row:]
     low = np.int64(N_BINS)
     high = np.int64(0)
     top = 0.0
@@ -124,8 +134,9 @@ def _log_quantiles(hists, row, log, weight, least, zero, width, levels, origin, 
             middle = log[i]
     nothing = zero
     for i in range(len(weight)):
-        first, last = used[i, 0], used[i, 1]
-        if weight[i, 0] <= least or last < 0:
+        first = span[i, 0]
+        last = span[i, 1]
+        if weight[i, 0] <= min_weight or last < 0:
             continue
         if log[i] <= NO_SCALE:
             for j in range(first, last + 1):
@@ -161,10 +172,14 @@ def _log_quantiles(hists, row, log, weight, least, zero, width, levels, origin, 
     for i in range(levels.size):
         quantiles[i] = 10.0 ** (middle + (quantiles[i] - _HALF) / PER_DEX)
         if levels[i] * (total + nothing) <= nothing or total == 0.0:
-            quantiles[i] = 0.0 if total + nothing > 0.0 else np.nan
+            quantiles[i] = np.nan
+            if total + nothing > 0.0:
+                quantiles[i] = 0.0
     hist[low:high] = 0.0
     wide[low : high + 2 * width] = 0.0
-    return middle + (moment / total - _HALF) / PER_DEX if total > 0.0 else np.nan
+    if total > 0.0:
+        return middle + (moment / total - _HALF) / PER_DEX
+    return np.nan
 
 
 @njit(**{**PART, "fastmath": False})
@@ -175,16 +190,18 @@ def _places(bins, first, last, start, total, levels, out):
     Weights from the ``first`` to the ``last`` bin are looked at, and ``start`` lies below them.
     """
     j = first
-    below = start
+    weight_below = start
     for i in range(levels.size):
         target = levels[i] * total
-        if target <= below:
+        if target <= weight_below:
             j = first
-            below = start
-        while j < last and below + bins[j] < target:
-            below += bins[j]
+            weight_below = start
+        while j < last and weight_below + bins[j] < target:
+            weight_below += bins[j]
             j += 1
-        out[i] = j + (min(max((target - below) / bins[j], 0.0), 1.0) if bins[j] > 0.0 else 0.0)
+        out[i] = j + (
+            min(max((target - weight_below) / bins[j], 0.0), 1.0) if bins[j] > 0.0 else 0.0
+        )
 
 
 @njit(**{**KERNEL, "fastmath": False})
@@ -209,15 +226,26 @@ def make_scales(galaxy, agn):
 @njit(**KERNEL)
 def _moments(scales, sums, out):
     """Fill means and standard deviations, scales' own variances included, of the derived quantities: (n, 2)."""
-    total, n, m = sums.total[0], len(scales.galaxy) - 1, len(scales.agn) - 1
+    total = sums.total[0]
+    n = len(scales.galaxy) - 1
+    m = len(scales.agn) - 1
     for i in range(n + m + 1):
         first = 0.0
-        second = 2.0 * sums.total[3] if i == n + m else 0.0
-        for g in range(scales.galaxy.shape[1] if i < n or i == n + m else 0):
+        second = 0.0
+        n_galaxy = 0
+        n_agn = 0
+        if i == n + m:
+            # twice the product of the galaxy's and the AGN's part
+            second = 2.0 * sums.total[3]
+        if i < n or i == n + m:
+            n_galaxy = scales.galaxy.shape[1]
+        if i >= n:
+            n_agn = scales.agn.shape[1]
+        for g in range(n_galaxy):
             x = scales.galaxy[min(i, n), g]
             first += x * sums.galaxy[g, 1]
             second += x * x * sums.galaxy[g, 2]
-        for k in range(scales.agn.shape[1] if i >= n else 0):
+        for k in range(n_agn):
             x = scales.agn[i - n, k]
             first += x * sums.agn[k, 1]
             second += x * x * sums.agn[k, 2]
@@ -249,14 +277,21 @@ def summarize(scales, sums, scale_error, levels, out, quantiles):
     The order is the galaxy's quantities, the AGN model's, then the one of both; ``out`` has means,
     standard deviations and means of log10 in its rows.
     """
-    total, hist, kernel = sums.total[0], sums.hist, sums.hist.work[2]
-    n, m, ng, na = len(scales.galaxy) - 1, len(scales.agn) - 1, len(sums.galaxy), len(sums.agn)
+    total = sums.total[0]
+    hist = sums.hist
+    kernel = sums.hist.work[2]
+    n = len(scales.galaxy) - 1
+    m = len(scales.agn) - 1
+    ng = len(sums.galaxy)
+    na = len(sums.agn)
     _moments(scales, sums, out)
     sigma = scale_error / math.sqrt(max(sums.total[1] / total, 1.0))
     width = min(sigma * _LOG10_E * PER_DEX, _WIDEST)
     # what bins of equal density, and sharing between two of them, have added is left out
     width = math.sqrt(max(width * width - _BINNED, 0.0))
-    reach = np.int64(math.ceil(4.0 * width) if width > 0.15 else 0.0)
+    reach = np.int64(0)
+    if width > 0.15:
+        reach = np.int64(math.ceil(4.0 * width))
     norm = 0.0
     for i in range(2 * reach + 1):
         kernel[i] = math.exp(-0.5 * ((i - reach) / max(width, 0.15)) ** 2)
@@ -264,26 +299,25 @@ def summarize(scales, sums, scale_error, levels, out, quantiles):
     for i in range(2 * reach + 1):
         kernel[i] /= norm
     # models without light, or any without AGN power, or without either
-    dark, least = sums.total[2], 1e-6 * total / ng
-    no_power, neither = (
-        _without(hist, ng, ng + na, total),
-        _without(hist, ng + na, ng + na + 1, total),
-    )
+    dark = sums.total[2]
+    min_weight = 1e-6 * total / ng
+    no_power = _without(hist, ng, ng + na, total)
+    neither = _without(hist, ng + na, ng + na + 1, total)
     for i in range(n):
-        given = hist, 0, scales.log_galaxy[i], sums.galaxy, least, dark, reach, levels
-        out[i, 2] = _log_quantiles(*given, hist.origin[0], quantiles[i])
+        arguments = hist, 0, scales.log_galaxy[i], sums.galaxy, min_weight, dark, reach, levels
+        out[i, 2] = _log_quantiles(*arguments, hist.origin[0], quantiles[i])
     for i in range(m):
-        given = hist, ng, scales.log_agn[i], sums.agn, 0.0, no_power, reach, levels
-        out[n + i, 2] = _log_quantiles(*given, hist.origin[1], quantiles[n + i])
+        arguments = hist, ng, scales.log_agn[i], sums.agn, 0.0, no_power, reach, levels
+        out[n + i, 2] = _log_quantiles(*arguments, hist.origin[1], quantiles[n + i])
     hist.work[3, 0] = total
-    given = hist, ng + na, hist.work[4], hist.work[3:4], 0.0, neither, reach, levels
-    out[n + m, 2] = _log_quantiles(*given, hist.origin[2], quantiles[n + m])
+    arguments = hist, ng + na, hist.work[4], hist.work[3:4], 0.0, neither, reach, levels
+    out[n + m, 2] = _log_quantiles(*arguments, hist.origin[2], quantiles[n + m])
 
 
 @njit(**PART)
 def _without(hist, first, end, total):
     """Weight that is not in these rows of the histograms."""
     for i in range(first, end):
-        for j in range(hist.used[i, 0], hist.used[i, 1] + 1):
+        for j in range(hist.span[i, 0], hist.span[i, 1] + 1):
             total -= hist.table[i, j]
     return max(total, 0.0)

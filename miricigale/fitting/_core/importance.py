@@ -43,34 +43,38 @@ def _to_unit(space, labels, label, y, x):
     """Put the place of scores ``y`` in the unit intervals of a `Space`; returns -ln of the proposal's density."""
     log = 0.0
     for c in range(len(x)):
-        first, below = labels.first[label, c], labels.below[c]
+        first = labels.first[label, c]
+        share_below = labels.below[c]
         last = first + labels.count[label, c] - 1
-        start = below[first]
-        whole = below[last + 1] - start
-        t = start + whole * 0.5 * math.erfc(-y[c] * _ROOT_HALF)
-        low, high = first, last
+        start = share_below[first]
+        range_share = share_below[last + 1] - start
+        t = start + range_share * 0.5 * math.erfc(-y[c] * _ROOT_HALF)
+        low = first
+        high = last
         while low < high:
             middle = (low + high + 1) // 2
-            if below[middle] <= t:
+            if share_below[middle] <= t:
                 low = middle
             else:
                 high = middle - 1
-        own = below[low + 1] - below[low]
-        part = (t - below[low]) / own if own > 0.0 else 0.5
+        cell_share = share_below[low + 1] - share_below[low]
+        part = 0.5
+        if cell_share > 0.0:
+            part = (t - share_below[low]) / cell_share
         part = min(max(part, _INSIDE), 1.0 - _INSIDE)
         x[c] = (low + part) / space.size[c]
-        log += math.log(whole) - labels.log_share[c, low]
+        log += math.log(range_share) - labels.log_share[c, low]
     return log
 
 
 @njit(**KERNEL)
-def evaluate_places(space, labels, one, label, y, x, known, work):
+def evaluate_places(space, labels, target, label, y, x, evaluated, work):
     """
     Evaluate the posterior of an object at places.
 
     Parameters
     ----------
-    space, labels, one : `Space`, `Labels`, `Object`
+    space, labels, target : `Space`, `Labels`, `Object`
         What places are in, and the object.
     label : `~numpy.ndarray` of int, shape (n,)
         Labels of the places.
@@ -78,7 +82,7 @@ def evaluate_places(space, labels, one, label, y, x, known, work):
         Their scores.
     x : `~numpy.ndarray`, shape (n, n_axes)
         Gets the places in unit intervals.
-    known : `~numpy.ndarray`, shape (n, 5)
+    evaluated : `~numpy.ndarray`, shape (n, 5)
         Gets ln of the posterior in scores over the standard normal distribution of the axes that are not active,
         best scale, its variance, AGN power, and ln of the likelihood.
     work : `Work`
@@ -86,14 +90,17 @@ def evaluate_places(space, labels, one, label, y, x, known, work):
     """
     for i in range(len(y)):
         log = _to_unit(space, labels, label[i], y[i], x[i])
-        prior, like, scale, variance = _evaluate(space, one, x[i], work)
+        prior, like, scale, variance = _evaluate(space, target, x[i], work)
         for a in range(labels.n_active[label[i]]):
             score = y[i, labels.axes[label[i], a]]
             log -= 0.5 * score * score + _LOG_ROOT_TWO_PI
-        known[i, 0] = log + prior + like if prior > 0.5 * NEVER else NEVER
-        known[i, 1], known[i, 2] = scale, variance
-        known[i, 3] = work.flux[0, len(work.flux[0]) - 1]
-        known[i, 4] = like
+        evaluated[i, 0] = NEVER
+        if prior > 0.5 * NEVER:
+            evaluated[i, 0] = log + prior + like
+        evaluated[i, 1] = scale
+        evaluated[i, 2] = variance
+        evaluated[i, 3] = work.flux[0, len(work.flux[0]) - 1]
+        evaluated[i, 4] = like
 
 
 @njit(**KERNEL)
@@ -113,15 +120,17 @@ def propose(labels, parts, choice, normal, spread, label, y):
     """
     n_axes = y.shape[1]
     for i in range(len(y)):
-        p, upto = 0, parts.share[0]
+        p = 0
+        upto = parts.share[0]
         while upto < choice[i] and p + 1 < len(parts.share):
             p += 1
             upto += parts.share[p]
-        own = parts.label[p]
-        label[i] = own
+        part_label = parts.label[p]
+        label[i] = part_label
         for c in range(n_axes):
             y[i, c] = normal[i, c]
-        axes, n = labels.axes[own], labels.n_active[own]
+        axes = labels.axes[part_label]
+        n = labels.n_active[part_label]
         for a in range(n):
             total = 0.0
             for b in range(a + 1):
@@ -133,7 +142,8 @@ def propose(labels, parts, choice, normal, spread, label, y):
 def _copy_active(y, first, n, axes, n_active, coordinate):
     """Copy active axes of n points, from point ``first`` on, to rows of ``coordinate``."""
     for a in range(n_active):
-        row, axis = coordinate[a], axes[a]
+        row = coordinate[a]
+        axis = axes[a]
         for i in range(n):
             row[i] = y[first + i, axis]
 
@@ -145,7 +155,9 @@ def _squares(coordinate, n, n_active, mean, inverse, row, square):
     for a in range(n_active):
         row[:n] = 0.0
         for b in range(a + 1):
-            factor, middle, values = inverse[a, b], mean[b], coordinate[b]
+            factor = inverse[a, b]
+            middle = mean[b]
+            values = coordinate[b]
             for i in range(n):
                 row[i] += factor * (values[i] - middle)
         for i in range(n):
@@ -187,16 +199,17 @@ def add_density(labels, parts, column, ends, y, coordinate, density):
         Is added to.
     """
     n_axes = y.shape[1]
-    row, square = coordinate[n_axes], coordinate[n_axes + 1]
+    row = coordinate[n_axes]
+    square = coordinate[n_axes + 1]
     for block in range(len(ends)):
-        for own in range(len(labels.n_active)):
-            first = ends[block, own]
-            n = ends[block, own + 1] - first
+        for own_label in range(len(labels.n_active)):
+            first = ends[block, own_label]
+            n = ends[block, own_label + 1] - first
             if n == 0:
                 continue
-            n_active = labels.n_active[own]
-            _copy_active(y, first, n, labels.axes[own], n_active, coordinate)
-            for p in range(parts.start[own], parts.start[own + 1]):
+            n_active = labels.n_active[own_label]
+            _copy_active(y, first, n, labels.axes[own_label], n_active, coordinate)
+            for p in range(parts.start[own_label], parts.start[own_label + 1]):
                 _squares(coordinate, n, n_active, parts.mean[p], parts.inverse[p], row, square)
                 out = density[column[p], first : first + n]
                 _add_t_density(n, n_active, parts.share[p], parts.top[p], square, row, out)
@@ -233,48 +246,57 @@ def _set_part(labels, parts, p, label, cov):
     log = _invert(cov, n, parts.root[p], parts.inverse[p])
     half = 0.5 * (FREEDOM + n)
     log = math.lgamma(half) - math.lgamma(0.5 * FREEDOM) - log - 0.5 * n * _LOG_FREEDOM_PI
-    parts.label[p], parts.top[p] = label, math.exp(log)
+    parts.label[p] = label
+    parts.top[p] = math.exp(log)
 
 
 @njit(**KERNEL)
-def add_widest(labels, parts, places, mean, cov, own):
+def add_widest(labels, parts, places, mean, cov, cov_active):
     """Set a part for each label, at ``places`` of the mixture, of a mean and covariance of all axes."""
     for label in range(len(places)):
-        axes, p = labels.axes[label], places[label]
+        axes = labels.axes[label]
+        p = places[label]
         for a in range(labels.n_active[label]):
             parts.mean[p, a] = mean[axes[a]]
             for b in range(a + 1):
-                own[a, b] = cov[axes[a], axes[b]]
-        _set_part(labels, parts, p, label, own)
+                cov_active[a, b] = cov[axes[a], axes[b]]
+        _set_part(labels, parts, p, label, cov_active)
 
 
 @njit(**PART)
 def _moments(coordinate, n, n_active, weight, mean, cov, row):
     """Mean and covariance of n points with weights; returned are the sum of weights and of their squares."""
-    total, square = 0.0, 0.0
+    total = 0.0
+    square = 0.0
     for i in range(n):
         total += weight[i]
         square += weight[i] * weight[i]
     inverse = 1.0 / max(total, 1e-300)
     for a in range(n_active):
-        values, first = coordinate[a], 0.0
+        values = coordinate[a]
+        first = 0.0
         for i in range(n):
             first += weight[i] * values[i]
         mean[a] = first * inverse
     for a in range(n_active):
-        values, middle = coordinate[a], mean[a]
+        values = coordinate[a]
+        middle = mean[a]
         for i in range(n):
             row[i] = inverse * weight[i] * (values[i] - middle)
         for b in range(a + 1):
-            others, other, second = coordinate[b], mean[b], 0.0
+            b_values = coordinate[b]
+            b_mean = mean[b]
+            second = 0.0
             for i in range(n):
-                second += row[i] * (others[i] - other)
+                second += row[i] * (b_values[i] - b_mean)
             cov[a, b] = second
     return total, square
 
 
 @njit(**KERNEL)
-def fit_parts(labels, parts, p, label, n_parts, rounds, wide, y, weight, middle, around, scratch):
+def fit_parts(
+    labels, parts, p, label, n_parts, rounds, wide, y, weight, prior_mean, prior_cov, scratch
+):
     """
     Fit parts of a mixture to points of one label, by expectation and maximization of normal distributions.
 
@@ -290,13 +312,17 @@ def fit_parts(labels, parts, p, label, n_parts, rounds, wide, y, weight, middle,
         Scores of the points.
     weight : `~numpy.ndarray`, shape (n,)
         Their weights.
-    middle, around : `~numpy.ndarray`, shapes (n_axes,) and (n_axes, n_axes)
+    prior_mean, prior_cov : `~numpy.ndarray`, shapes (n_axes,) and (n_axes, n_axes)
         Mean and covariance of all axes that those of few points are drawn to.
     scratch : tuple of `~numpy.ndarray`, shapes (n_axes + 2, n), (n_parts + 1, n), (n_axes, n_axes) and (n_parts,)
     """
-    coordinate, each, cov, of_part = scratch
-    n, n_axes, n_active = len(weight), y.shape[1], labels.n_active[label]
-    axes, row, square = labels.axes[label], coordinate[n_axes], coordinate[n_axes + 1]
+    coordinate, part_weight, cov, of_part = scratch
+    n = len(weight)
+    n_axes = y.shape[1]
+    n_active = labels.n_active[label]
+    axes = labels.axes[label]
+    row = coordinate[n_axes]
+    square = coordinate[n_axes + 1]
     _copy_active(y, 0, n, axes, n_active, coordinate)
     # begin with slices along the axis in which the points scatter most
     total, _ = _moments(coordinate, n, n_active, weight, parts.mean[p], cov, row)
@@ -304,53 +330,64 @@ def fit_parts(labels, parts, p, label, n_parts, rounds, wide, y, weight, middle,
     for a in range(n_active):
         if cov[a, a] > cov[longest, longest]:
             longest = a
-    center, width = parts.mean[p, longest], math.sqrt(max(cov[longest, longest], 1e-300))
+    center = parts.mean[p, longest]
+    width = math.sqrt(max(cov[longest, longest], 1e-300))
     for i in range(n):
-        d = (coordinate[longest, i] - center) / width if n_active > 0 else 0.0
+        d = 0.0
+        if n_active > 0:
+            d = (coordinate[longest, i] - center) / width
         # of equal weight if these are normal
         k = min(int(n_parts * 0.5 * math.erfc(-d * _ROOT_HALF)), n_parts - 1)
         for j in range(n_parts):
-            each[j, i] = weight[i] if j == k else 0.0
-    n_rounds = rounds if n_parts > 1 else 1
+            part_weight[j, i] = 0.0
+        part_weight[k, i] = weight[i]
+    n_rounds = 1
+    if n_parts > 1:
+        n_rounds = rounds
     for turn in range(n_rounds):
         last = turn == n_rounds - 1
-        factor = wide * wide if last else 1.0
+        factor = 1.0
+        if last:
+            factor = wide * wide
         for j in range(n_parts):
-            own, squares = _moments(coordinate, n, n_active, each[j], parts.mean[p + j], cov, row)
-            of_part[j] = own / total
+            part_total, squares = _moments(
+                coordinate, n, n_active, part_weight[j], parts.mean[p + j], cov, row
+            )
+            of_part[j] = part_total / total
             # few points say little of a covariance
-            few = n_active / (n_active + own * own / max(squares, 1e-300))
+            shrinkage = n_active / (n_active + part_total * part_total / max(squares, 1e-300))
             for a in range(n_active):
                 for b in range(a + 1):
-                    from_all = around[axes[a], axes[b]]
-                    cov[a, b] = factor * ((1.0 - few) * cov[a, b] + few * from_all)
+                    from_all = prior_cov[axes[a], axes[b]]
+                    cov[a, b] = factor * ((1.0 - shrinkage) * cov[a, b] + shrinkage * from_all)
             if n_parts == 1:
                 for a in range(n_active):
-                    parts.mean[p, a] += few * (middle[axes[a]] - parts.mean[p, a])
+                    parts.mean[p, a] += shrinkage * (prior_mean[axes[a]] - parts.mean[p, a])
             _set_part(labels, parts, p + j, label, cov)
             parts.share[p + j] = of_part[j]
         if last:
             return
         # points belong to parts by the normal densities of these
-        sums = each[n_parts]
+        sums = part_weight[n_parts]
         sums[:n] = 1e-280
         for j in range(n_parts):
-            inverse, density = parts.inverse[p + j], of_part[j]
+            inverse = parts.inverse[p + j]
+            density = of_part[j]
             for a in range(n_active):
                 density *= inverse[a, a]
             _squares(coordinate, n, n_active, parts.mean[p + j], inverse, row, square)
             for i in range(n):
-                each[j, i] = density * exponential(max(-0.5 * square[i], -600.0))
+                part_weight[j, i] = density * exponential(max(-0.5 * square[i], -600.0))
             for i in range(n):
-                sums[i] += each[j, i]
+                sums[i] += part_weight[j, i]
         for j in range(n_parts):
             for i in range(n):
-                each[j, i] *= weight[i] / sums[i]
+                part_weight[j, i] *= weight[i] / sums[i]
 
 
 @njit(**PART)
-def _farthest_of(distance, n, near):
-    """Return a distance within which ``near`` of n points are, or a few more, and their number."""
+def _farthest_of(distance, n, n_near):
+    """Return a distance within which ``n_near`` of n points are, or a few more, and their number."""
     low = 0.0
     high = 0.0
     for i in range(n):
@@ -362,18 +399,18 @@ def _farthest_of(distance, n, near):
         for i in range(n):
             if distance[i] <= middle:
                 inside += 1
-        if inside < near:
+        if inside < n_near:
             low = middle
         else:
             high = middle
             count = inside
-            if count < _ENOUGH * near:
+            if count < _ENOUGH * n_near:
                 break
     return high, count
 
 
 @njit(**KERNEL)
-def add_local_parts(labels, parts, first, n_base, n_local, share, near, wide, points, scratch):
+def add_local_parts(labels, parts, first, n_base, n_local, share, n_near, wide, points, scratch):
     """
     Add narrow parts where the others would leave places of a group with large weights.
 
@@ -389,7 +426,7 @@ def add_local_parts(labels, parts, first, n_base, n_local, share, near, wide, po
         follow.
     share : float
         Share of the new parts.
-    near : int
+    n_near : int
         Number of places next to the center of a part.
     wide : float
         What widths are multiplied by.
@@ -399,14 +436,14 @@ def add_local_parts(labels, parts, first, n_base, n_local, share, near, wide, po
     scratch : tuple of `~numpy.ndarray`, shapes (n_axes + 2, n), (4, n), and two of (n_axes, n_axes)
     """
     y, weight, target = points
-    coordinate, each, cov, own = scratch
+    coordinate, rows_of_points, cov, cov_inverse = scratch
     n = len(weight)
     n_axes = y.shape[1]
     label = parts.label[first]
     n_active = labels.n_active[label]
     row = coordinate[n_axes]
     square = coordinate[n_axes + 1]
-    base, local, near_weight, distance = each
+    base, local, near_weight, distance = rows_of_points
     _copy_active(y, 0, n, labels.axes[label], n_active, coordinate)
     base[:] = 1e-290
     for p in range(first, first + n_base):
@@ -419,7 +456,7 @@ def add_local_parts(labels, parts, first, n_base, n_local, share, near, wide, po
     for a in range(n_active):
         cov[a, a] += 1e-6
     # what distances are measured in
-    inverse = own
+    inverse = cov_inverse
     _invert(cov, n_active, parts.root[p], inverse)
     for t in range(n_local):
         p = first + n_base + t
@@ -435,7 +472,7 @@ def add_local_parts(labels, parts, first, n_base, n_local, share, near, wide, po
         for a in range(n_active):
             mean[a] = coordinate[a, center]
         _squares(coordinate, n, n_active, mean, inverse, row, distance)
-        farthest, count = _farthest_of(distance, n, near)
+        farthest, count = _farthest_of(distance, n, n_near)
         total = 0.0
         for i in range(n):
             near_weight[i] = weight[i] if distance[i] <= farthest else 0.0
@@ -473,7 +510,8 @@ def flatten(log, wanted, weight):
         top = max(top, log[i])
     power = 1.0
     while True:
-        total, square = 0.0, 0.0
+        total = 0.0
+        square = 0.0
         for i in range(len(log)):
             w = exponential(max(power * (log[i] - top), -600.0))
             weight[i] = w

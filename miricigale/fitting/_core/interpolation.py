@@ -83,7 +83,9 @@ def _on_scale(value, power):
     while root < 1.0:
         x = math.sqrt(x)
         root *= 2.0
-    return x if power > 0.0 else -1.0 / x
+    if power > 0.0:
+        return x
+    return -1.0 / x
 
 
 @njit(**PART)
@@ -96,7 +98,9 @@ def _axis_weights(a, n, stride, scaled, x, work):
     if t > 0.5:
         center += 1
     # the nodes on both sides, at an end the next two
-    first = 1 if center == 0 else -1
+    first = -1
+    if center == 0:
+        first = 1
     if n == 2:
         second = 0
     elif center == n - 1:
@@ -156,7 +160,9 @@ def find_nodes(part_table, value, work):
             if abs(part[a, k]) > _LEAST_WEIGHT:
                 m = model[nearest_place + step[a, k]]
                 # where there is no model the nearest stands for it
-                work.row[count] = m if m >= 0 else nearest
+                if m < 0:
+                    m = nearest
+                work.row[count] = m
                 work.weight[count] = part[a, k]
                 work.weight[0] -= part[a, k]
                 work.slot[a, k] = count
@@ -186,17 +192,20 @@ def add_up(part_table, log_z, count, work, out):
     n_z = table.shape[0]
     n_columns = table.shape[2]
     z, t = place_between(part_table.log_z, n_z, log_z)
-    other = min(z + 1, n_z - 1)
+    next_z = min(z + 1, n_z - 1)
     for j in range(n_columns):
         out[j] = 0.0
     for r in range(count):
-        far = work.weight[r] * t
-        near = work.weight[r] - far
+        high_weight = work.weight[r] * t
+        low_weight = work.weight[r] - high_weight
         low = table[z, work.row[r]]
-        high = table[other, work.row[r]]
+        high = table[next_z, work.row[r]]
         for j in range(n_columns):
-            out[j] += near * low[j] + far * high[j]
-    nearest = table[other if t > 0.5 else z, work.row[0]]
+            out[j] += low_weight * low[j] + high_weight * high[j]
+    nearest_z = z
+    if t > 0.5:
+        nearest_z = next_z
+    nearest = table[nearest_z, work.row[0]]
     for j in range(n_columns):
         out[j] = min(max(out[j], nearest[j] - _STEEPEST), nearest[j] + _STEEPEST)
         out[j] += part_table.offset[j]
@@ -213,11 +222,11 @@ def mixed(part_table, burst, share, log_z, value, work, out):
     for j in range(n):
         out[j] = exponential(out[j])
     if share > 0.0:
-        other = work.flux[2]
+        burst_columns = work.flux[2]
         count = find_nodes(burst, value, work)
-        add_up(burst, log_z, count, work, other)
+        add_up(burst, log_z, count, work, burst_columns)
         for j in range(n):
-            out[j] = (1.0 - share) * out[j] + share * exponential(other[j])
+            out[j] = (1.0 - share) * out[j] + share * exponential(burst_columns[j])
     return True
 
 
@@ -260,7 +269,10 @@ def galaxy_light(light, value, log_z, work):
         add_up(light.dust, log_z, count, work, template)
         for j in range(last):
             flux[j] += power * exponential(template[j])
-    flux[last] = power if light.by_dust else flux[last - 1]
+    if light.by_dust:
+        flux[last] = power
+    else:
+        flux[last] = flux[last - 1]
     return True
 
 
@@ -304,8 +316,11 @@ def interpolate_light(light, values, redshift, frac, work, flux, power):
             exists = with_agn(light, values[i], frac[i], log_z, work)
         power[1, i] = work.flux[0, last]
         nearer = max(redshift[i], 1e-6) ** -2.0
-        for j in range(flux.shape[1]):
-            flux[i, j] = work.flux[0, j] * nearer if exists else np.nan
+        if exists:
+            for j in range(flux.shape[1]):
+                flux[i, j] = work.flux[0, j] * nearer
+        else:
+            flux[i, :] = np.nan
 
 
 @njit(**KERNEL)

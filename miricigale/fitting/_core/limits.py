@@ -39,8 +39,9 @@ _ROOT_HALF = 0.70710678118654752
 _ROOT_TWO_OVER_PI = 0.79788456080286536
 # Below this a term is 0 in double precision.
 _NOTHING = -9.0
-# Steps of Newton's method, and the size of the last, over the scale or its error.
-_MOST = 60
+# Largest number of steps of Newton's method.
+_MAX_STEPS = 60
+# Size of the last step over the scale or its error, in double and in single precision.
 _CLOSE = 1e-5
 _CLOSE_32 = 5e-3
 # The third derivative is taken into account in steps of less than one sigma, where it matters by
@@ -48,8 +49,9 @@ _CLOSE_32 = 5e-3
 _BEND = 0.1
 # Minus logarithm of a weight for which a step may be seven times as large.
 _SLIGHT = 10.0
-# Factors multiplied before they could be too small, and largest flux ratio of single precision.
+# Number of factors that can be multiplied before the product could be too small.
 _FACTORS = 8
+# Largest flux ratio of single precision.
 _LARGEST = 1e15
 # What single precision may miss of the largest R.
 _ROUNDING = 1e-3
@@ -86,20 +88,22 @@ def _limit(u):
     exponent of the probability factor exp(exponent).
     """
     real = type(u)
-    zero, one, half = real(0.0), real(1.0), real(0.5)
+    zero = real(0.0)
+    unity = real(1.0)
+    half = real(0.5)
     mills = _mills(u)
     # of what is smaller than exp(-80) nothing is left compared with 1
     bell = exponential(max(-half * u * u, real(-80.0)))
     above = mills if u > zero else real(2.0) - mills * bell
-    hazard = real(_ROOT_TWO_OVER_PI) * (one if u > zero else bell) / above
+    hazard = real(_ROOT_TWO_OVER_PI) * (unity if u > zero else bell) / above
     first = hazard * (hazard - u)
-    third = first * (hazard - u) + hazard * (first - one)
+    third = first * (hazard - u) + hazard * (first - unity)
     # far out differences have no digits
-    t = one / max(u * u, one)
-    rest = t * (one - t * (real(3.0) - t * (real(15.0) - t * (real(105.0) - t * real(945.0)))))
+    t = unity / max(u * u, unity)
+    series = t * (unity - t * (real(3.0) - t * (real(15.0) - t * (real(105.0) - t * real(945.0)))))
     far = u > real(15.0)
-    first = hazard * hazard * rest if far else first
-    third = real(2.0) * t / max(u, one) if far else third
+    first = hazard * hazard * series if far else first
+    third = real(2.0) * t / max(u, unity) if far else third
     return hazard, first, third, half * above, (-half * u * u if u > zero else zero)
 
 
@@ -114,15 +118,17 @@ def _mixed(u, wrong, i):
         return _limit(u)
     first, second, third, factor, exponent = _limit(u)
     real = type(u)
-    zero, one, p = real(0.0), real(1.0), real(wrong[i])
-    good = (one - p) * factor * exponential(max(exponent, real(-80.0)))
-    some = p > zero
-    total = good + p if some else one
-    share = good / total if some else one
-    second = share * (second - (one - share) * first * first)
+    zero = real(0.0)
+    unity = real(1.0)
+    p = real(wrong[i])
+    good = (unity - p) * factor * exponential(max(exponent, real(-80.0)))
+    may_be_wrong = p > zero
+    total = good + p if may_be_wrong else unity
+    share = good / total if may_be_wrong else unity
+    second = share * (second - (unity - share) * first * first)
     return (
-        share * first, max(second, zero), third if share == one else zero,
-        total if some else factor, zero if some else exponent,
+        share * first, max(second, zero), third if share == unity else zero,
+        total if may_be_wrong else factor, zero if may_be_wrong else exponent,
     )  # fmt: skip
 
 
@@ -154,7 +160,7 @@ def limited_scale(p, q, limits):
     s = max(p, 0.0) / q
     d = q
     chi2 = 0.0
-    for _ in range(_MOST):
+    for _ in range(_MAX_STEPS):
         g = q * s - p
         d = q
         h = 0.0
@@ -173,8 +179,8 @@ def limited_scale(p, q, limits):
         # the last step is small enough for a series
         chi2 += step * (2.0 * g + step * (d + step * h / 3.0))
         d += step * h
-        near = _CLOSE * _CLOSE
-        if step * step <= near * max(near * s * s, 1.0 / d):
+        tolerance = _CLOSE * _CLOSE
+        if step * step <= tolerance * max(tolerance * s * s, 1.0 / d):
             break
     return s, max(limits.dark - chi2, 0.0) if s > 0.0 else 0.0, 1.0 / d
 
@@ -197,7 +203,7 @@ def _best_scales(buffer, work, terms, limit, c, level, wrong, reference, close):
     n = level.size
     far = 1.0
     steps = 0
-    while far > 0.0 and steps < _MOST:
+    while far > 0.0 and steps < _MAX_STEPS:
         steps += 1
         for i in range(BLOCK):
             terms[_S + i] = real(work[_SCALE + i] * work[_UNIT + i])
@@ -206,7 +212,8 @@ def _best_scales(buffer, work, terms, limit, c, level, wrong, reference, close):
         terms[_G : _H + BLOCK] = 0.0
         terms[_SUM : _SUM + BLOCK] = 0.0
         for j in range(n):
-            galaxy, agn = limit[j], limit[n + j]
+            galaxy = limit[j]
+            agn = limit[n + j]
             top = real(level[j])
             for i in range(BLOCK):
                 m = galaxy[i] + ratio * agn[i]
@@ -240,8 +247,8 @@ def _best_scales(buffer, work, terms, limit, c, level, wrong, reference, close):
             # what the series misses goes with the fourth power of the step
             e = chi2 - terms[_SUM + i] - 0.5 * max(buffer[at.PRIOR + i], -1e200)
             e = min(max(e - reference, 0.0), _SLIGHT)
-            near = close * (1.0 + e * (0.25 + 0.03125 * e))
-            work[_V + i] = step * step - near * near * max(s * s, 1.0 / d)
+            tolerance = close * (1.0 + e * (0.25 + 0.03125 * e))
+            work[_V + i] = step * step - tolerance * tolerance * max(s * s, 1.0 / d)
         far = 0.0
         for i in range(BLOCK):
             far += 1.0 if work[_V + i] > 0.0 and work[_DETECTED + i] > 0.0 else 0.0
@@ -258,7 +265,10 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, record, 
     Returned are the number of models whose R reaches ``record``, to rounding (in single precision
     somewhat more), and the largest exponent of a weight; where it is large the reference must be raised.
     """
-    buffer, work, level, n = lanes.buffer, lanes.limited, limits.level, limits.level.size
+    buffer = lanes.buffer
+    work = lanes.limited
+    level = limits.level
+    n = limits.level.size
     for i in range(BLOCK):
         # of the order of the signal-to-noise ratio of a scale of 1
         unit = np.sqrt(max(buffer[at.Q + i] + buffer[at.B + i], NO_LIGHT))
@@ -273,12 +283,12 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, record, 
     over = 0.0
     warm = False
     zero_level = 0.5 * (limits.dark - reference)
-    least = max(reference - delta, -1e200)
+    min_value = max(reference - delta, -1e200)
     for j in range(of_frac.shape[1]):
         c = of_frac[at.RATIO, j]
         f = of_frac[at.PRIOR_FRAC, j]
         lanes.frac_sum[j] = 0.0
-        now = lanes.left[j * BLOCK : (j + 1) * BLOCK]
+        limit_share = lanes.limit_share[j * BLOCK : (j + 1) * BLOCK]
         weight = lanes.weight[j * BLOCK : (j + 1) * BLOCK]
         for i in range(BLOCK):
             q = buffer[at.Q + i] + c * (buffer[at.X2 + i] + c * buffer[at.B + i])
@@ -287,11 +297,11 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, record, 
             s = p / q
             # limits only lower R: what has no weight without them has none with them
             value = max(p * s, 0.0) + buffer[at.PRIOR + i]
-            work[_ALIVE + i] = 1.0 if value >= least else 0.0
-            work[_DETECTED + i] = s if value >= least else 0.0
+            work[_ALIVE + i] = 1.0 if value >= min_value else 0.0
+            work[_DETECTED + i] = s if value >= min_value else 0.0
             # begin where limits leave as much of the scale as of the last pair's at this fraction,
             # but for what was different at the last fraction
-            part = now[i] * (work[_CHANGE + i] if warm else 1.0)
+            part = limit_share[i] * (work[_CHANGE + i] if warm else 1.0)
             work[_SCALE + i] = s * min(part, 1.0)
         some = 0.0
         for i in range(BLOCK):
@@ -310,11 +320,13 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, record, 
                 buffer, work, work[_TERMS:], lanes.limit, c, level, limits.wrong, zero_level, _CLOSE
             )
         for i in range(BLOCK):
-            whole = work[_DETECTED + i]
-            whole = whole if whole > 0.0 else max(work[_SCALE + i], NO_LIGHT)
-            part = min(max(work[_SCALE + i] / whole, 1e-3), 1.0)
-            work[_CHANGE + i] = min(part / now[i], 4.0)
-            now[i] = part
+            detected_scale = work[_DETECTED + i]
+            detected_scale = (
+                detected_scale if detected_scale > 0.0 else max(work[_SCALE + i], NO_LIGHT)
+            )
+            part = min(max(work[_SCALE + i] / detected_scale, 1e-3), 1.0)
+            work[_CHANGE + i] = min(part / limit_share[i], 4.0)
+            limit_share[i] = part
         some = 0.0
         for i in range(BLOCK):
             # half of R but for the product of probabilities

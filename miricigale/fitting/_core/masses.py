@@ -38,7 +38,9 @@ def weigh_masses(tables, target, pq, log_stars, table, per_dex, log_usable, chan
         change[z] = 0.0
         if target.log_prior[z] < _NONE:
             continue
-        row, given, values = log_usable[z], tables.log_usable[z], table[z]
+        row = log_usable[z]
+        prior_row = tables.log_usable[z]
+        values = table[z]
         for block in range(tables.tiles.shape[1]):
             galaxy_products(tables, target, z, block, pq)
             for i in range(block * BLOCK, (block + 1) * BLOCK):
@@ -49,7 +51,7 @@ def weigh_masses(tables, target, pq, log_stars, table, per_dex, log_usable, chan
             place = min(max(row[i] * per_dex, 0.0), np.float64(n_last + 1))
             k = min(np.int64(place), n_last)
             part = place - k
-            row[i] = given[i] + 2.0 * ((1.0 - part) * values[k] + part * values[k + 1])
+            row[i] = prior_row[i] + 2.0 * ((1.0 - part) * values[k] + part * values[k + 1])
         top = -1e300
         for i in range(row.size):
             top = max(top, row[i])
@@ -58,8 +60,8 @@ def weigh_masses(tables, target, pq, log_stars, table, per_dex, log_usable, chan
         before = 0.0
         after = 0.0
         for i in range(row.size):
-            before += exponential(min(max(0.5 * given[i], -700.0), 0.0))
+            before += exponential(min(max(0.5 * prior_row[i], -700.0), 0.0))
             after += exponential(max(0.5 * (row[i] - top), -700.0))
         change[z] = 0.5 * top + np.log(after / before)
         for i in range(row.size):
-            row[i] = row[i] - 2.0 * change[z] if given[i] > _NONE else -1e300
+            row[i] = row[i] - 2.0 * change[z] if prior_row[i] > _NONE else -1e300

@@ -47,25 +47,27 @@ def project(tables, target, pairs):
     and ``galaxy_of`` (the one that does).
     """
     zero = np.float32(0)
-    one = np.float32(1)
+    unity = np.float32(1)
     for z in range(target.log_prior.size):
         pairs.promise[z] = -1e30
         pairs.galaxy_of[z] = -1
         if target.log_prior[z] < -1e200:
             continue
-        p, norm = pairs.p32[z], pairs.inverse_norm[z]
+        p = pairs.p32[z]
+        norm = pairs.inverse_norm[z]
         p[:] = 0.0
         norm[:] = 0.0
         for j in range(target.bands.size):
             row = tables.galaxy32[z, target.bands[j]]
-            s, d = target.root32[z, j], target.data32[z, j]
+            s = target.root32[z, j]
+            d = target.data32[z, j]
             for i in range(p.size):
                 t = row[i] * s
                 norm[i] += t * t
                 p[i] += t * d
         for i in range(p.size):
             q = norm[i]
-            r = one / np.sqrt(max(q, _TINY))
+            r = unity / np.sqrt(max(q, _TINY))
             norm[i] = zero if q < _TINY else r
             p[i] = _ALWAYS if q < _TINY else p[i] * r
         top = np.float32(-2)
@@ -88,7 +90,8 @@ def project(tables, target, pairs):
 @njit(**PART)
 def agn_products(agn, target, z, agn_pq, agn_weighted):
     """Fill agn_pq[k] = <A, wF>, <A, wA> and agn_weighted[k] = w A for all AGN models of one redshift."""
-    weight, flux = target.weight[z], target.flux
+    weight = target.weight[z]
+    flux = target.flux
     for k in range(agn_pq.shape[0]):
         for b in range(agn.shape[1]):
             agn_weighted[k, b] = agn[k, b] * weight[b]
@@ -111,8 +114,12 @@ def best_of_galaxy(tables, target, limits, pairs, z, g):
     ``pairs.agn_pq`` must hold that redshift's. Returned are the largest R + 2 ln(prior) and the scale
     of the model that has it.
     """
-    galaxy, agn, of_frac = tables.galaxy[z, g], tables.agn[z], tables.of_frac
-    weight, bands, agn_pq = target.weight[z], target.bands, pairs.agn_pq
+    galaxy = tables.galaxy[z, g]
+    agn = tables.agn[z]
+    of_frac = tables.of_frac
+    weight = target.weight[z]
+    bands = target.bands
+    agn_pq = pairs.agn_pq
     log_prior = target.log_prior[z] + tables.log_usable[z, g]
     p = 0.0
     q = 0.0
@@ -188,16 +195,31 @@ def _project_tori(agn, target, z, unit, of_torus):
 def _products(unit_galaxy, unit_agn, k, n_used, rows):
     """Fill rows[m * BLOCK + i] = <galaxy i, AGN model k + m> for GROUP AGN models (register blocking)."""
     rows[: GROUP * BLOCK] = 0.0
-    t0, t1, t2, t3 = unit_agn[k], unit_agn[k + 1], unit_agn[k + 2], unit_agn[k + 3]
+    t0 = unit_agn[k]
+    t1 = unit_agn[k + 1]
+    t2 = unit_agn[k + 2]
+    t3 = unit_agn[k + 3]
     # what is beyond the used bands is 0
     for j in range(0, n_used, 3):
-        g0, g1, g2 = unit_galaxy[j], unit_galaxy[j + 1], unit_galaxy[j + 2]
-        u00, u01, u02 = t0[j], t0[j + 1], t0[j + 2]
-        u10, u11, u12 = t1[j], t1[j + 1], t1[j + 2]
-        u20, u21, u22 = t2[j], t2[j + 1], t2[j + 2]
-        u30, u31, u32 = t3[j], t3[j + 1], t3[j + 2]
+        g0 = unit_galaxy[j]
+        g1 = unit_galaxy[j + 1]
+        g2 = unit_galaxy[j + 2]
+        u00 = t0[j]
+        u01 = t0[j + 1]
+        u02 = t0[j + 2]
+        u10 = t1[j]
+        u11 = t1[j + 1]
+        u12 = t1[j + 2]
+        u20 = t2[j]
+        u21 = t2[j + 1]
+        u22 = t2[j + 2]
+        u30 = t3[j]
+        u31 = t3[j + 1]
+        u32 = t3[j + 2]
         for i in range(BLOCK):
-            h0, h1, h2 = g0[i], g1[i], g2[i]
+            h0 = g0[i]
+            h1 = g1[i]
+            h2 = g2[i]
             rows[i] += h0 * u00 + h1 * u01 + h2 * u02
             rows[BLOCK + i] += h0 * u10 + h1 * u11 + h2 * u12
             rows[2 * BLOCK + i] += h0 * u20 + h1 * u21 + h2 * u22
@@ -213,33 +235,35 @@ def _list_block(pairs, norm, n_used, key, n):
     R + 2 ln(prior), `DONE` for pairs that are not kept. ``key`` is that of the first AGN model, ``n``
     runs are in the list, which must have space for one of every AGN model; returned is how many are now.
     """
-    one = np.float32(1)
+    unity = np.float32(1)
     zero = np.float32(0)
-    rows, of_torus = pairs.rows, pairs.agn32
+    rows = pairs.rows
+    of_torus = pairs.agn32
     for i in range(BLOCK):
         p2 = max(rows[_P + i], zero) + _ETA
         p2 = p2 * p2
         rows[_ALONE + i] = p2
         rows[_REST + i] = rows[_LEAST + i] - p2
         # a galaxy that passes alone passes with every AGN model
-        rows[_PASS + i] = -one if p2 >= rows[_LEAST + i] else rows[_LEAST + i]
+        rows[_PASS + i] = -unity if p2 >= rows[_LEAST + i] else rows[_LEAST + i]
         rows[_TOP + i] = DONE
     for k in range(of_torus.shape[1]):
         if k % GROUP == 0:
             _products(pairs.unit_galaxy, pairs.unit_agn, k, n_used, rows)
-        a, a2 = of_torus[0, k], of_torus[1, k]
+        a = of_torus[0, k]
+        a2 = of_torus[1, k]
         x = (k % GROUP) * BLOCK
         for i in range(BLOCK):
             cross = rows[x + i]
             n1 = a - rows[_P + i] * cross + _ETA
             n2 = rows[_P + i] - a * cross + _ETA
-            r = n1 * n1 - rows[_REST + i] * (one - cross * cross - _EPS)
+            r = n1 * n1 - rows[_REST + i] * (unity - cross * cross - _EPS)
             rows[_SCORE + i] = max(min(r, min(n1, n2)), a2 - rows[_PASS + i])
         # counted, for the largest of them would not be found side by side
-        some = zero
+        n_kept = zero
         for i in range(BLOCK):
-            some += one if rows[_SCORE + i] >= zero else zero
-        if some == zero:
+            n_kept += unity if rows[_SCORE + i] >= zero else zero
+        if n_kept == zero:
             continue
         pairs.run_key[n] = key + k
         bound = pairs.bound[n]
@@ -247,10 +271,10 @@ def _list_block(pairs, norm, n_used, key, n):
             cross = rows[x + i]
             n1 = a - rows[_P + i] * cross + _ETA
             n2 = rows[_P + i] - a * cross + _ETA
-            both = rows[_ALONE + i] + n1 * n1 / max(one - cross * cross - _EPS, _EPS)
+            joint_bound = rows[_ALONE + i] + n1 * n1 / max(unity - cross * cross - _EPS, _EPS)
             r = max(rows[_ALONE + i], a2)
-            r = max(r, both) if min(n1, n2) >= zero else r
-            r = min(r, one) * norm
+            r = max(r, joint_bound) if min(n1, n2) >= zero else r
+            r = min(r, unity) * norm
             # rounding of single precision is added
             value = r + rows[_BASE + i] + _SLACK * (r + abs(rows[_BASE + i]))
             value = value if rows[_SCORE + i] >= zero else DONE
@@ -276,9 +300,11 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     Returned are the number of runs in the list, where to resume, and the reference, raised when a better
     model is met.
     """
-    n_z, n_blocks = tables.tiles.shape[0], tables.tiles.shape[1]
+    n_z = tables.tiles.shape[0]
+    n_blocks = tables.tiles.shape[1]
     n_agn = tables.agn.shape[1]
-    rows, bands = pairs.rows, target.bands
+    rows = pairs.rows
+    bands = target.bands
     # `_products` takes three bands at a time
     pairs.unit_galaxy[bands.size : bands.size + 2] = 0.0
     margin = 2.0
@@ -296,16 +322,17 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
             z_now = z
             agn_known = False
             _project_tori(tables.agn32[z], target, z, pairs.unit_agn, pairs.agn32)
-        start, norm = block * BLOCK, target.norm[z]
+        start = block * BLOCK
+        norm = target.norm[z]
         lowest = reference - delta - target.log_prior[z] - tables.log_top_pair
         top_prior = target.log_prior[z] + tables.log_top_pair
         log_usable = tables.log_usable[z, start : start + BLOCK]
         p32 = pairs.p32[z, start : start + BLOCK]
         inverse = pairs.inverse_norm[z, start : start + BLOCK]
-        some = -1e300
+        top_usable = -1e300
         for i in range(BLOCK):
-            some = max(some, log_usable[i])
-        if some < -1e200:
+            top_usable = max(top_usable, log_usable[i])
+        if top_usable < -1e200:
             continue
         for i in range(BLOCK):
             # what may not be used is parallel to nothing and reaches nothing

@@ -55,8 +55,11 @@ def _prepare(buffer, light, low, high, reference, scale_error):
     buffer[WR], which are not needed before the sums.
     """
     for i in range(BLOCK):
-        p, a = buffer[at.P + i], buffer[at.A + i]
-        q, x2, b = buffer[at.Q + i], buffer[at.X2 + i], buffer[at.B + i]
+        p = buffer[at.P + i]
+        a = buffer[at.A + i]
+        q = buffer[at.Q + i]
+        x2 = buffer[at.X2 + i]
+        b = buffer[at.B + i]
         t = 0.5 * x2
         rise = a * q - p * t
         fall = p * b - a * t
@@ -65,27 +68,27 @@ def _prepare(buffer, light, low, high, reference, scale_error):
         num = max(p + best * a, 0.0)
         norm = q + best * (x2 + best * b)
         dark = norm <= NO_LIGHT
-        one = 1.0 / norm if not dark else NO_LIGHT
-        each = num * one
-        r = num * each
-        k = -0.5 * one * (r * b - a * a)
-        m = -one * ((r * b - a * a) * best + r * t - p * a)
-        unit = max(each, np.sqrt(one))
-        each = one / unit
+        inverse_norm = 1.0 / norm if not dark else NO_LIGHT
+        factor = num * inverse_norm
+        r = num * factor
+        k = -0.5 * inverse_norm * (r * b - a * a)
+        m = -inverse_norm * ((r * b - a * a) * best + r * t - p * a)
+        unit = max(factor, np.sqrt(inverse_norm))
+        factor = inverse_norm / unit
         e = 0.5 * (r + buffer[at.PRIOR + i] - reference)
         e = exponential(min(max(e, -700.0), 700.0))
         buffer[at.W0 + i] = e if buffer[at.PRIOR + i] > -1e200 else 0.0
         buffer[at.W1 + i] = unit
         buffer[at.W2 + i] = r
         buffer[at.WR + i] = best
-        light[_P + i] = max(p * each, -1e30)
-        light[_A + i] = a * each
-        light[_Q + i] = q * one if not dark else 1.0
-        light[_X + i] = x2 * one
-        light[_B + i] = b * one
+        light[_P + i] = max(p * factor, -1e30)
+        light[_A + i] = a * factor
+        light[_Q + i] = q * inverse_norm if not dark else 1.0
+        light[_X + i] = x2 * inverse_norm
+        light[_B + i] = b * inverse_norm
         light[_K + i] = k if num > 0.0 else 0.0
         light[_M + i] = m if num > 0.0 and best != inner else 0.0
-        light[_VAR + i] = scale_error * each / unit
+        light[_VAR + i] = scale_error * factor / unit
         light[_SHARE + i] = min(buffer[at.SHARE + i], _MOST)
         light[_BEST + i] = best
         y = best * buffer[at.SHARE + i]
@@ -100,22 +103,25 @@ def single_likelihoods(of_frac, lanes, reference, scale_error, record):
     Weights at every fraction are those of `pair_weight`. What is counted is pairs whose R*, which no
     R exceeds, reaches ``record``.
     """
-    buffer, light = lanes.buffer, lanes.single
+    buffer = lanes.buffer
+    light = lanes.single
     zero = np.float32(0)
-    one = np.float32(1)
-    c_0, c_1 = of_frac[at.RATIO, 0], of_frac[at.RATIO, -1]
+    unity = np.float32(1)
+    c_0 = of_frac[at.RATIO, 0]
+    c_1 = of_frac[at.RATIO, -1]
     _prepare(buffer, light, c_0, c_1, reference, scale_error)
     light[_S0 : _SZ + BLOCK] = 0.0
     reached = 0.0
     n_dark = 0.0
     for i in range(BLOCK):
         reached += 1.0 if buffer[at.W2 + i] >= record else 0.0
-        p, a = buffer[at.P + i], buffer[at.A + i]
+        p = buffer[at.P + i]
+        a = buffer[at.A + i]
         n_dark += 1.0 if p > -1e29 and min(p + c_0 * a, p + c_1 * a) <= 0.0 else 0.0
     # where a fraction has R = 0 the difference to R* is not that of the formula
     some_dark = n_dark > 0.0
     for j in range(of_frac.shape[1]):
-        now = _T + j * BLOCK
+        row = _T + j * BLOCK
         c_64 = of_frac[at.RATIO, j]
         c = np.float32(c_64)
         f = np.float32(of_frac[at.PRIOR_FRAC, j])
@@ -124,9 +130,9 @@ def single_likelihoods(of_frac, lanes, reference, scale_error, record):
             y = c * light[_SHARE + i]
             den = light[_Q + i] + c * (light[_X + i] + c * light[_B + i])
             # one division for both 1 / D and y / (1 + y)
-            both = one / (den * (one + y))
-            inverse = both * (one + y)
-            light[_PHI + i] = y * both * den
+            inverse_both = unity / (den * (unity + y))
+            inverse = inverse_both * (unity + y)
+            light[_PHI + i] = y * inverse_both * den
             light[_I + i] = inverse
             light[_D + i] = d * (light[_K + i] * d + light[_M + i]) * inverse
         if some_dark:
@@ -136,10 +142,10 @@ def single_likelihoods(of_frac, lanes, reference, scale_error, record):
                 light[_D + i] = light[_D + i] if num > 0.0 else -0.5 * buffer[at.W2 + i]
         for i in range(BLOCK):
             t = exponential(max(light[_D + i], _LOWEST)) * f
-            light[now + i] = t
+            light[row + i] = t
             s = max(light[_P + i] + c * light[_A + i], zero) * light[_I + i]
             # about the values at x*, so that means and squares keep their digits
-            ds = s - one
+            ds = s - unity
             dy = c * s - light[_BEST + i]
             phi = light[_PHI + i] - light[_OTHER + i]
             # what the scale's own variance adds
@@ -158,7 +164,7 @@ def single_likelihoods(of_frac, lanes, reference, scale_error, record):
         if some_dark:
             for i in range(BLOCK):
                 dark = light[_P + i] + c * light[_A + i] <= zero
-                light[_SZ + i] += light[now + i] if dark else zero
+                light[_SZ + i] += light[row + i] if dark else zero
     for j in range(of_frac.shape[1]):
         total = 0.0
         for i in range(BLOCK):
@@ -174,7 +180,7 @@ def single_likelihoods(of_frac, lanes, reference, scale_error, record):
         y1 = np.float64(light[_Y1 + i])
         f1 = np.float64(light[_F1 + i])
         best = np.float64(light[_BEST + i])
-        other = np.float64(light[_OTHER + i])
+        best_share = np.float64(light[_OTHER + i])
         w1 = first * (s0 + s1)
         v1 = first * (best * s0 + y1)
         buffer[at.W0 + i] = w0 * s0
@@ -184,8 +190,8 @@ def single_likelihoods(of_frac, lanes, reference, scale_error, record):
         buffer[at.V1 + i] = v1
         buffer[at.U2 + i] = second * (best * (s0 + s1) + y1 + light[_SY + i])
         buffer[at.V2 + i] = second * (best * (best * s0 + 2.0 * y1) + light[_Y2 + i])
-        buffer[at.F1 + i] = w0 * (other * s0 + f1)
-        buffer[at.F2 + i] = w0 * (other * (other * s0 + 2.0 * f1) + light[_F2 + i])
+        buffer[at.F1 + i] = w0 * (best_share * s0 + f1)
+        buffer[at.F2 + i] = w0 * (best_share * (best_share * s0 + 2.0 * f1) + light[_F2 + i])
         buffer[at.WZ + i] = w0 * light[_SZ + i]
         # sum of l R, with R = (p + c a) s; lanes without weight have no p either
         p = buffer[at.P + i]

@@ -137,7 +137,7 @@ class Histograms(NamedTuple):
     table: np.ndarray  # (nG + nA + 1, N_BINS): l in bins of log s of every galaxy, of
     #     log(s c L_dust) of every AGN model, of the log of the mixed quantity
     share: np.ndarray  # (N_SHARE + 2,): changes of slope of the other fraction's distribution
-    used: np.ndarray  # int64 (nG + nA + 1, 2): first and last bin in use
+    span: np.ndarray  # int64 (nG + nA + 1, 2): first and last bin in use
     origin: np.ndarray  # (3,): log10 of s, power and mixed quantity in the middle bins
     work: np.ndarray  # (5, N_BINS + KERNEL_SIZE), scratch, the last row zeros
 
@@ -210,11 +210,13 @@ class Lanes(NamedTuple):
     weight: np.ndarray  # float64 (nf * BLOCK,): prior * likelihood
     frac_sum: np.ndarray  # float64 (nf > 0,)
     pq: np.ndarray  # float64 (2, n_padded): <G, wF> and <G, wG> of one redshift
-    known: np.ndarray  # int64 (n_blocks,): redshift + 1 for which they hold
+    products_at: np.ndarray  # int64 (n_blocks,): redshift + 1 of the products in ``pq``
     galaxy_z: np.ndarray  # float64 (3, n_padded): sums over one redshift
     agn_z: np.ndarray  # float64 (3, nA)
     limited: np.ndarray  # float64 (LIMITED_SIZE,): vectors of scales with limits
     limited32: np.ndarray  # float32 (LIMITED_SIZE,): the same in single precision
-    left: np.ndarray  # float64 (nf * BLOCK,): what limits left of the scales of earlier pairs
+    limit_share: (
+        np.ndarray
+    )  # float64 (nf * BLOCK,): scale with limits over that without, of earlier pairs
     limit: np.ndarray  # float64 (2 nb, BLOCK): fluxes in bands with limits
     limit32: np.ndarray  # float32 (2 nb, BLOCK): the same over the unit of the scale

@@ -20,29 +20,38 @@ _HEAVY = 8.0
 @njit(**PART)
 def _model(tables, limits, lanes, z, i, j, floor):
     """Do what `best_scale` does for the pair in lane i at fraction j."""
-    buffer, c = lanes.buffer, tables.of_frac[at.RATIO, j]
+    buffer = lanes.buffer
+    c = tables.of_frac[at.RATIO, j]
     p = buffer[at.P + i] + c * buffer[at.A + i]
     q = buffer[at.Q + i] + c * (buffer[at.X2 + i] + c * buffer[at.B + i])
-    galaxy, agn = tables.galaxy[z, lanes.index[0, i]], tables.agn[z, lanes.index[1, i]]
+    galaxy = tables.galaxy[z, lanes.index[0, i]]
+    agn = tables.agn[z, lanes.index[1, i]]
     return best_scale(limits, p, q, galaxy, agn, c * buffer[at.POWER + i], floor)
 
 
 @njit(**PART)
 def keep_best(sums, r, s, z, g, k, f):
     """Keep the best model; of equals the one with the lowest indices."""
-    best, index = sums.best, sums.index
+    best = sums.best
+    index = sums.index
     # the order is that of (z, g, f, k), so that f = 0 comes before its copies
     last = (index[0], index[1], index[3], index[2])
     if r < best[0] or (r == best[0] and index[0] >= 0 and (z, g, f, k) >= last):
         return
-    best[0], best[1] = r, s
-    index[0], index[1], index[2], index[3] = z, g, k, f
+    best[0] = r
+    best[1] = s
+    index[0] = z
+    index[1] = g
+    index[2] = k
+    index[3] = f
 
 
 @njit(**PART)
 def find_best(tables, limits, lanes, sums, z, level):
     """Look for the best model among the lanes; ``level`` is what R lacks to those of other redshifts."""
-    buffer, of_frac, best = lanes.buffer, tables.of_frac, sums.best
+    buffer = lanes.buffer
+    of_frac = tables.of_frac
+    best = sums.best
     for i in range(BLOCK):
         if buffer[at.PRIOR + i] < -1e200:
             continue
@@ -94,8 +103,12 @@ def add_pairs(tables, lanes, sums, z, thin):
     Those of a weight below ``thin`` times that of all pairs so far are left out of the correlation of
     galaxy and AGN in model fluxes, and of nothing else.
     """
-    buffer, frac_sum, total = lanes.buffer, lanes.frac_sum, sums.total
-    galaxy_z, agn_z, band = lanes.galaxy_z, lanes.agn_z, sums.band
+    buffer = lanes.buffer
+    frac_sum = lanes.frac_sum
+    total = sums.total
+    galaxy_z = lanes.galaxy_z
+    agn_z = lanes.agn_z
+    band = sums.band
     for j in range(frac_sum.size):
         sums.zf[z, j + tables.zero_frac] += frac_sum[j]
     weight = 0.0
@@ -114,13 +127,14 @@ def add_pairs(tables, lanes, sums, z, thin):
     total[2] += total_zero
     total[4] += share_1
     total[5] += share_2
-    least = thin * total[0]
+    min_weight = thin * total[0]
     total_cross = 0.0
     for i in range(BLOCK):
         w = buffer[at.W0 + i]
         if not w > 0.0 or buffer[at.PRIOR + i] < -1e200:
             continue
-        g, k = lanes.index[0, i], lanes.index[1, i]
+        g = lanes.index[0, i]
+        k = lanes.index[1, i]
         power = buffer[at.POWER + i]
         cross = buffer[at.U2 + i] * power
         total_cross += cross * tables.of_galaxy[at.MIXED_GALAXY, g] * tables.of_agn[at.MIXED_AGN, k]
@@ -130,7 +144,7 @@ def add_pairs(tables, lanes, sums, z, thin):
         agn_z[0, k] += w
         agn_z[1, k] += buffer[at.V1 + i] * power
         agn_z[2, k] += buffer[at.V2 + i] * power * power
-        if w > least:
+        if w > min_weight:
             cross *= 2.0
             for m in range(band.shape[1]):
                 band[1, m] += cross * tables.galaxy[z, g, m] * tables.agn[z, k, m]
@@ -141,12 +155,15 @@ def add_pairs(tables, lanes, sums, z, thin):
 @njit(**PART)
 def add_joint(joint, lanes, single, first, n_ratio):
     """Add to the joint sums that were asked for."""
-    gk, fg, fk = joint.gk, joint.fg, joint.fk
+    gk = joint.gk
+    fg = joint.fg
+    fk = joint.fk
     for i in range(BLOCK):
         w = lanes.buffer[at.W0 + i]
         if not w > 0.0 or lanes.buffer[at.PRIOR + i] < -1e200:
             continue
-        g, k = lanes.index[0, i], lanes.index[1, i]
+        g = lanes.index[0, i]
+        k = lanes.index[1, i]
         if gk.size > 0:
             gk[g, k] += w
         for j in range(n_ratio):
@@ -165,7 +182,9 @@ def deposit(tables, limits, lanes, sums, single, z, added):
     to model, every ``PARTS``-th part of the weight so far goes to the model that it is full with
     (systematic sampling, proportional to weight). ``added`` is the weight of all lanes.
     """
-    buffer, index, of_frac = lanes.buffer, lanes.index, tables.of_frac
+    buffer = lanes.buffer
+    index = lanes.index
+    of_frac = tables.of_frac
     part = sums.total[0] / PARTS
     carry = sums.total[6]
     if carry + added < part:
@@ -175,13 +194,13 @@ def deposit(tables, limits, lanes, sums, single, z, added):
         w = buffer[at.W0 + i]
         if not w > 0.0 or buffer[at.PRIOR + i] < -1e200:
             continue
-        whole = w >= _HEAVY * part
-        if not whole and carry + w < part:
+        is_heavy = w >= _HEAVY * part
+        if not is_heavy and carry + w < part:
             carry += w
             continue
         for j in range(of_frac.shape[1]):
             t = pair_weight(lanes, single, j, i)
-            if not whole:
+            if not is_heavy:
                 carry += t
                 if carry < part:
                     continue
@@ -214,15 +233,22 @@ def take_draw(draws, d, total, z, g, k, f, s, variance):
     far is a draw from all of them; it stays until the sum has grown by 1 / u, u uniform.
     """
     index = draws.index[d]
-    index[0], index[1], index[2], index[3] = z, g, k, f
-    draws.scale[d, 0], draws.scale[d, 1] = s, variance
+    index[0] = z
+    index[1] = g
+    index[2] = k
+    index[3] = f
+    draws.scale[d, 0] = s
+    draws.scale[d, 1] = variance
     draws.next[d] = total / _uniform(draws.state)
 
 
 @njit(**PART)
 def draw(tables, limits, lanes, sums, single, z, before):
     """Let the models in the lanes replace draws; the sum of weight was ``before``."""
-    buffer, of_frac, draws, after = lanes.buffer, tables.of_frac, sums.draws, sums.total[0]
+    buffer = lanes.buffer
+    of_frac = tables.of_frac
+    draws = sums.draws
+    after = sums.total[0]
     for d in range(draws.next.size):
         while draws.next[d] <= after:
             total = before
@@ -249,7 +275,8 @@ def draw(tables, limits, lanes, sums, single, z, before):
                     break
             if f < 0:
                 break
-            g, k = lanes.index[0, lane], lanes.index[1, lane]
+            g = lanes.index[0, lane]
+            k = lanes.index[1, lane]
             s, _, variance = _model(tables, limits, lanes, z, lane, f, 0.0)
-            now = max(total, draws.next[d])
-            take_draw(draws, d, now, z, g, k, f + tables.zero_frac, s, variance)
+            reached = max(total, draws.next[d])
+            take_draw(draws, d, reached, z, g, k, f + tables.zero_frac, s, variance)

@@ -52,7 +52,7 @@ def make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands, n_draws=0, joint=()):
         index=np.full(4, -1),
         hist=Histograms(
             **hist,
-            used=np.tile(np.array([[N_BINS, -1]]), (rows, 1)),
+            span=np.tile(np.array([[N_BINS, -1]]), (rows, 1)),
             origin=np.zeros(3),
         ),
         draws=Draws(
@@ -114,12 +114,12 @@ def make_workspace(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
         weight=aligned(n_frac * BLOCK),
         frac_sum=aligned(n_frac - zero_frac),
         pq=aligned(2, n_padded),
-        known=np.zeros(n_blocks, np.int64),
+        products_at=np.zeros(n_blocks, np.int64),
         galaxy_z=aligned(3, n_padded),
         agn_z=aligned(3, n_agn),
         limited=aligned(LIMITED_SIZE),
         limited32=aligned(LIMITED_SIZE, dtype=single),
-        left=aligned(n_frac * BLOCK),
+        limit_share=aligned(n_frac * BLOCK),
         limit=aligned(2 * n_bands, BLOCK),
         limit32=aligned(2 * n_bands, BLOCK, dtype=single),
     )
@@ -127,29 +127,34 @@ def make_workspace(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
 
 def clear(sums):
     """Empty the accumulators."""
-    hist, draws = sums.hist, sums.draws
+    hist = sums.hist
+    draws = sums.draws
     for array in (sums.flat, sums.best, hist.share, draws.next):
         array.fill(0.0)
     sums.index.fill(-1)
     draws.index[:, 0] = -1
-    clear_rows(hist.table, hist.used)
+    clear_rows(hist.table, hist.span)
 
 
 def make_target(flux, sigma, log_prior, template_error):
     """Bundle the data of one object; ``template_error`` is a part of the flux, shape (nz, nb)."""
-    square, more = np.square(sigma), np.square(template_error * flux)
-    level = -np.log1p(more / square).sum(axis=1)
+    square = np.square(sigma)
+    model_square = np.square(template_error * flux)
+    level = -np.log1p(model_square / square).sum(axis=1)
     bands = np.flatnonzero(np.isfinite(sigma))
-    return weighed(flux, 1.0 / (square + more), level, log_prior, bands)
+    return weighed(flux, 1.0 / (square + model_square), level, log_prior, bands)
 
 
 def weighed(flux, weight, level, log_prior, bands):
     """Bundle data with weights of their own, shape (nz, nb); ``level`` is added to -chi2 at each redshift."""
     # C order, also of several redshifts: kernels are compiled once
-    used, norm = np.take(weight, bands, axis=1), np.sum(weight * flux * flux, axis=1)
+    used_weight = np.take(weight, bands, axis=1)
+    norm = np.sum(weight * flux * flux, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        root32 = np.sqrt(used / used.max(axis=1, keepdims=True, initial=0.0)).astype(np.float32)
-        data32 = (flux[bands] * np.sqrt(used / norm[:, None])).astype(np.float32)
+        root32 = np.sqrt(used_weight / used_weight.max(axis=1, keepdims=True, initial=0.0)).astype(
+            np.float32
+        )
+        data32 = (flux[bands] * np.sqrt(used_weight / norm[:, None])).astype(np.float32)
     level = level - norm
     top = level.max()
     # at most 0: errors that are the same at all redshifts change nothing
@@ -174,7 +179,8 @@ def make_limits(limit, inverse, wrong=None):
 
 def make_few(index, flux, ratio):
     """Bundle galaxies with work space for `find_models`."""
-    (n_bands, n), n_agn = flux.shape[1:], ratio.shape[1]
+    (n_bands, n) = flux.shape[1:]
+    n_agn = ratio.shape[1]
     shapes = (n_bands, n), (n_agn, n_bands), (n_agn + 2, n), (4, n)
     work = [aligned(*shape, dtype=np.float32) for shape in shapes]
     return Few(index, flux, ratio, *work, aligned(n_bands), aligned(n_bands))
