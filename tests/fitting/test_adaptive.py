@@ -183,8 +183,8 @@ def test_names_and_places_in_a_catalog_are_no_matter(fitter, table, results):
 
 
 def test_what_is_not_converged_is_flagged(grid, table, monkeypatch):
-    monkeypatch.setattr("miricigale.fitting.grid.adaptive._MOST_EACH", 1)
-    monkeypatch.setattr("miricigale.fitting.grid.adaptive._LEAST_MOST", 512)
+    monkeypatch.setattr("miricigale.fitting.grid.adaptive._MAX_PLACES_EACH", 1)
+    monkeypatch.setattr("miricigale.fitting.grid.adaptive._MIN_MAX_PLACES", 512)
     fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=1000))
     flags = fitter.fit(table).flags
     assert np.all(flags & int(FitFlags.NOT_CONVERGED))

@@ -18,58 +18,70 @@ from scipy.stats import qmc
 from miricigale.fitting import _core
 from miricigale.fitting.grid.labels import labels_of_ranges
 from miricigale.fitting.grid.moves import move_places, systematic
-from miricigale.fitting.grid.proposals import LEAST_WEIGHT, Places, fit_mixture
+from miricigale.fitting.grid.proposals import MIN_WEIGHT, Places, fit_mixture
 from miricigale.utils.caching import cached
 
-#: Places in a round, and most places for each of the effective number that is wanted, and at least.
+#: Number of places in a round.
 ROUND_SIZE = 512
-_LARGEST_ROUND = 1024
-_MOST_EACH = 80
-_LEAST_MOST = 1 << 14
-#: Places fitted to at first: rounds, or effective number of them over that wanted in all; places after which it is
-#: seen whether a mixture will do, which double each time; and how near it must be by then.
+#: Largest number of places in a round of those that results rest on.
+_MAX_ROUND_SIZE = 1024
+#: Largest number of places for each of the effective number that is wanted.
+_MAX_PLACES_EACH = 80
+#: Smallest value of the largest number of places of an object.
+_MIN_MAX_PLACES = 1 << 14
+#: Largest number of rounds whose places mixtures are fitted to before results are collected.
 _ADAPTING_ROUNDS = 6
+#: The same where labels are pursued.
 _PURSUING_ROUNDS = 16
+#: Effective number, over that wanted in all, at which these rounds end.
 _FIRST_GOAL = 0.3
-_TRIED = 2048
-_ALMOST = 1.5
-_TRY_AGAIN = 2
-#: Weight of peaks of redshift and of labels that are to have this part of the effective number themselves.
-_COUNTS = 0.02
-_PART_EACH = 0.05
-_PART_LEAST = 30
-#: Least number of places with weights that results rest on, and part of them in each label that has weight.
-_LEAST_KEPT = 2048
-_LEAST_PLACES = 0.03
-#: Part of the draws to begin with from which a label in a peak is pursued, its share of the places until its shape
-#: is found.
-_PURSUED = 0.01
+#: Number of places after which a mixture is judged; it doubles each time.
+_N_TRIAL = 2048
+#: Effective number wanted over that reached, up to which a judged mixture is kept.
+_MAX_SHORTAGE = 1.5
+#: A mixture is given up only if this many times the places of its trial may follow.
+_TRIAL_GROWTH = 2
+#: Weight above which a peak of redshift or a label has to have an effective number of its own.
+_MIN_COUNTED_WEIGHT = 0.02
+#: That number as a part of the effective number wanted in all.
+_EFFECTIVE_PART = 0.05
+#: Smallest such number.
+_MIN_EFFECTIVE = 30
+#: Smallest number of places with weights that results rest on.
+_MIN_RESULT_PLACES = 2048
+#: Smallest part of them in each label that has weight.
+_MIN_LABEL_SHARE = 0.03
+#: Part of the draws to begin with above which a label in a peak is pursued.
+_MIN_PURSUED = 0.01
+#: Share of the places that it has until its shape is found.
 _PURSUED_SHARE = 0.06
-#: Least number of places that parts are fitted to.
-_FEWEST_PLACES = 20
-#: Share of a mixture that all labels have, whatever their weight, and each peak and what has weight in it.
+#: Smallest number of places that parts are fitted to.
+_MIN_FITTED_PLACES = 20
+#: Share of a mixture that is divided evenly among the labels, whatever their weight.
 _GUARD = 0.05
-#: Least efficiency, effective over number of places, of what has few of them.
-_LEAST_RATE = 0.05
-_LEAST_SHARE = 0.05
-#: Weight of a node's redshift, over the largest, below which there is none between peaks; and of a peak that
-#: counts.
+#: Smallest efficiency, effective over number of places, that is believed of few places.
+_MIN_RATE = 0.05
+#: Smallest share of each peak of the nodes.
+_MIN_PEAK_SHARE = 0.05
+#: Weight of a node's redshift, over the largest, below which there is a gap between peaks.
 _GAP = 2e-3
+#: Weight of a peak that counts.
 _PEAK = 0.005
-#: Effective number of points that the weights of a peak are flattened to for a fit: in each round, and at most at
-#: first, which doubles each time.
+#: Effective number of points that the weights of a peak are flattened to for a fit, for each round so far.
 _FLAT_EACH = 50
-_FLAT_MOST = 150
-#: Narrow parts that are added to each label and peak where weights are large.
+#: Largest such number at first; it doubles each time.
+_MAX_FLAT = 150
+#: Number of narrow parts that are added to each label and peak where weights are large.
 _N_LOCAL = 16
-#: Number of places that are moved where weights stay too unequal, least number in each label and peak, and the
-#: least weight of these.
+#: Number of places that are moved where weights stay too unequal.
 _N_MOVED = 768
-_FEWEST_MOVED = 48
-_LEAST_MOVED = 1e-3
+#: Smallest number of them in each label and peak.
+_MIN_MOVED = 48
+#: Weight of labels and peaks below which none are.
+_MIN_MOVED_WEIGHT = 1e-3
 #: Weight of the models that are left out of results.
 _LEFT_OUT = 1e-4
-#: Uniform numbers keep this from 0 and 1.
+#: Distance that uniform numbers keep from 0 and 1.
 _END = 1e-9
 
 
@@ -110,7 +122,7 @@ class PlacedModels:
 @cached(maxsize=8)
 def quasi_random(n_axes, log2_n, scramble):
     """
-    Sobol points for all objects.
+    Make the Sobol points of all objects.
 
     Parameters
     ----------
@@ -137,7 +149,7 @@ def quasi_random(n_axes, log2_n, scramble):
 
 def redshift_peaks(redshift, posterior):
     """
-    Peaks of a posterior on nodes of redshift that others separate which have next to no weight.
+    Find the peaks of a posterior on nodes of redshift, which nodes of hardly any weight separate.
 
     Parameters
     ----------
@@ -201,7 +213,7 @@ class AdaptiveSampler:
         What places are in.
     work : `~miricigale.fitting._core.interpolation.Work`
         Scratch of the models.
-    one : `~miricigale.fitting._core.Object`
+    target : `~miricigale.fitting._core.Object`
         The object.
     borders, peaks : `~numpy.ndarray`
         Redshifts between peaks, and weights of the peaks on the nodes; see `redshift_peaks`.
@@ -216,12 +228,12 @@ class AdaptiveSampler:
     """
 
     def __init__(
-        self, space, labels, work, one, borders, peaks, *, wanted, scramble=1, pursue=False
+        self, space, labels, work, target, borders, peaks, *, wanted, scramble=1, pursue=False
     ):
         self.space = space
         self.labels = labels
         self.work = work
-        self.one = one
+        self.target = target
         self.borders = borders
         self.peaks = peaks
         self.wanted = wanted
@@ -229,22 +241,22 @@ class AdaptiveSampler:
         self.pursue = pursue
         self.scramble = scramble
         n_axes = len(space.size)
-        most = max(_MOST_EACH * wanted, _LEAST_MOST)
+        max_places = max(_MAX_PLACES_EACH * wanted, _MIN_MAX_PLACES)
         self.n_rounds = _ADAPTING_ROUNDS
         if pursue:
             self.n_rounds = _PURSUING_ROUNDS
         # at least those that parts are fitted to, and a first try
-        most = max(most, self.n_rounds * ROUND_SIZE + _TRIED)
-        self.most = most
-        self.points = quasi_random(n_axes, int(np.ceil(np.log2(most))), scramble)
-        self.label = np.empty(most, np.int64)
-        self.score = np.empty((most, n_axes))
-        self.place = np.empty((most, n_axes))
-        self.known = np.empty((most, 5))
-        self.peak = np.zeros(most, np.int64)
-        self.density = np.zeros(most)
-        self.scratch = np.empty((n_axes + 2, _LARGEST_ROUND))
-        self.n_fitted = _FLAT_MOST
+        max_places = max(max_places, self.n_rounds * ROUND_SIZE + _N_TRIAL)
+        self.max_places = max_places
+        self.points = quasi_random(n_axes, int(np.ceil(np.log2(max_places))), scramble)
+        self.label = np.empty(max_places, np.int64)
+        self.score = np.empty((max_places, n_axes))
+        self.place = np.empty((max_places, n_axes))
+        self.evaluated = np.empty((max_places, 5))
+        self.peak = np.zeros(max_places, np.int64)
+        self.density = np.zeros(max_places)
+        self.scratch = np.empty((n_axes + 2, _MAX_ROUND_SIZE))
+        self.n_fitted = _MAX_FLAT
         self.n = 0
 
     def run(self, label, score, peak):
@@ -264,15 +276,15 @@ class AdaptiveSampler:
             None if no place has a probability above 0.
         """
         share = np.bincount(self._groups(label, peak), minlength=self.n_groups)
-        self.pursued = (share > _PURSUED * share.sum()) & self.pursue
+        self.pursued = (share > _MIN_PURSUED * share.sum()) & self.pursue
         parts = self._fit(Places(label, score, peak, np.ones(len(label))))
         adapted = self._adapt(parts, share)
         if adapted is None:
             return None
         parts, share = adapted
         best = None
-        size = _TRIED
-        while self.most - self.n >= ROUND_SIZE:
+        size = _N_TRIAL
+        while self.max_places - self.n >= ROUND_SIZE:
             sample = self._collect(parts, share, size)
             if sample is None:
                 return None
@@ -280,12 +292,14 @@ class AdaptiveSampler:
                 best = sample
             if sample.enough:
                 break
-            # what is seen of the posterior by now is fitted by more parts
-            size = 2 * size
-            self.n_fitted = 2 * self.n_fitted
+            # the shape of the posterior that is known by now is fitted by more parts
+            size *= 2
+            self.n_fitted *= 2
             parts = self._fit(self._places(self.n_fitted), n_local=_N_LOCAL)
             share = sample.wanted
-        return self._models(best) if best.enough else self._moved(best)
+        if best.enough:
+            return self._models(best)
+        return self._moved(best)
 
     def _adapt(self, parts, share):
         """
@@ -300,8 +314,8 @@ class AdaptiveSampler:
             mixture = parts.shared(self._guarded(share))
             mixtures.append(mixture)
             new = self._add_round(mixture, ROUND_SIZE)
-            for each in mixtures:
-                self._add_density(each, new, total)
+            for earlier in mixtures:
+                self._add_density(earlier, new, total)
             if ends:
                 self._add_density(mixture, np.concatenate(ends), total)
             ends.append(new)
@@ -310,8 +324,8 @@ class AdaptiveSampler:
             sample = self._weigh(rows)
             if sample is None:
                 return None
-            few = min(_FLAT_MOST, _FLAT_EACH * len(mixtures))
-            places = self._places(few)
+            n_flat = min(_MAX_FLAT, _FLAT_EACH * len(mixtures))
+            places = self._places(n_flat)
             share = self._pursuing(sample.wanted)
             good = sample.effective >= _FIRST_GOAL * self.wanted or turn + 1 >= _ADAPTING_ROUNDS
             if good and not self.pursued.any():
@@ -319,35 +333,35 @@ class AdaptiveSampler:
             parts = self._fit(places)
         return self._fit(places, n_local=_N_LOCAL), share
 
-    def _collect(self, parts, share, tried):
+    def _collect(self, parts, share, n_trial):
         """
         Add places that the parts do not depend on: `WeightedPlaces`, or None if none is possible.
 
-        They are added until there are enough. If ``tried`` of them show that it would take many more, this ends as
-        long as twice their number may follow.
+        They are added until there are enough. If ``n_trial`` of them show that it would take many more, this ends
+        as long as twice their number may follow.
         """
         first = self.n
         total = np.zeros(self.n_groups)
-        density = np.zeros((len(self.peaks), self.most))
+        density = np.zeros((len(self.peaks), self.max_places))
         missing = share
-        while self.most - self.n >= ROUND_SIZE:
-            size = int(np.clip(missing.sum(), ROUND_SIZE, _LARGEST_ROUND)) & ~127
-            size = min(size, self.most - self.n)
+        while self.max_places - self.n >= ROUND_SIZE:
+            size = int(np.clip(missing.sum(), ROUND_SIZE, _MAX_ROUND_SIZE)) & ~127
+            size = min(size, self.max_places - self.n)
             guarded = parts.possible(self._guarded(missing))
             ends = self._add_round(parts.shared(guarded), size)
             self._add_density(parts.kernel, ends, density, parts.group % len(self.peaks))
             total += size * guarded
             rows = slice(first, self.n)
-            each = total.reshape(-1, len(self.peaks))[self.label[rows]]
-            self.density[rows] = np.sum(each.T * density[:, rows], axis=0) / total.sum()
+            share_of_peak = total.reshape(-1, len(self.peaks))[self.label[rows]]
+            self.density[rows] = np.sum(share_of_peak.T * density[:, rows], axis=0) / total.sum()
             sample = self._weigh(rows)
             if sample is None:
                 return None
             n = self.n - first
-            sample = replace(sample, enough=sample.enough and n >= _LEAST_KEPT)
-            many_more = self.wanted > _ALMOST * sample.effective
-            may_follow = self.most - self.n > _TRY_AGAIN * n
-            if sample.enough or (many_more and n >= tried and may_follow):
+            sample = replace(sample, enough=sample.enough and n >= _MIN_RESULT_PLACES)
+            many_more = self.wanted > _MAX_SHORTAGE * sample.effective
+            may_follow = self.max_places - self.n > _TRIAL_GROWTH * n
+            if sample.enough or (many_more and n >= n_trial and may_follow):
                 break
             group = self._groups(self.label[rows], self.peak[rows])
             n_each = np.bincount(group, minlength=self.n_groups)
@@ -360,46 +374,46 @@ class AdaptiveSampler:
         return len(self.labels.n_active) * len(self.peaks)
 
     def _groups(self, label, peak):
-        """Index of labels and peaks."""
+        """Number the labels in peaks."""
         return label * len(self.peaks) + peak
 
-    def _places(self, few):
+    def _places(self, n_flat):
         """
-        `Places` for a fit of parts.
+        Select `Places` for a fit of parts.
 
         Weights of each peak are made flat enough to say what its shape is, or those of each label that has weight:
-        to an effective number of ``few``.
+        to an effective number of ``n_flat``.
         """
         rows = slice(0, self.n)
-        log = self.known[rows, 0] - np.log(self.density[rows])
+        log = self.evaluated[rows, 0] - np.log(self.density[rows])
         weight = np.exp(np.maximum(log - log.max(), -700.0))
         group = self.peak[rows]
         chosen = range(len(self.peaks))
         if self.pursue:
             group = self._groups(self.label[rows], self.peak[rows])
             share = np.bincount(group, weight, minlength=self.n_groups)
-            chosen = np.flatnonzero(self.pursued | (share > LEAST_WEIGHT * share.sum()))
+            chosen = np.flatnonzero(self.pursued | (share > MIN_WEIGHT * share.sum()))
         return Places(
             label=self.label[rows],
             score=self.score[rows],
             peak=self.peak[rows],
-            flat=self._flatten(log, group, chosen, few),
+            flat=self._flatten(log, group, chosen, n_flat),
             weight=weight,
-            log_target=self.known[rows, 0],
+            log_target=self.evaluated[rows, 0],
         )
 
     def _fit(self, places, n_local=0):
-        """`FittedParts` of places."""
+        """Fit parts to places: `FittedParts`."""
         return fit_mixture(self.labels, len(self.peaks), places, n_local)
 
     def _pursuing(self, share):
-        """Shares of places, of which labels whose shape is still to be found have a part whatever their weight."""
-        least = _PURSUED_SHARE * share.sum()
-        return np.where(self.pursued, np.maximum(share, least), share)
+        """Raise the shares of labels whose shape is still to be found, whatever their weight."""
+        min_share = _PURSUED_SHARE * share.sum()
+        return np.where(self.pursued, np.maximum(share, min_share), share)
 
     def _weigh(self, rows):
-        """`WeightedPlaces` of some places; None if none is possible."""
-        log = self.known[rows, 0] - np.log(self.density[rows])
+        """Weigh places by the posterior over the density of the proposal; None if none is possible."""
+        log = self.evaluated[rows, 0] - np.log(self.density[rows])
         top = log.max()
         if not top > 0.5 * _core.NEVER:
             return None
@@ -420,8 +434,8 @@ class AdaptiveSampler:
         score = score[order]
         self.label[new] = label
         self.score[new] = score
-        of_new = (label, score, self.place[new], self.known[new], self.work)
-        _core.evaluate_places(self.space, self.labels, self.one, *of_new)
+        of_new = (label, score, self.place[new], self.evaluated[new], self.work)
+        _core.evaluate_places(self.space, self.labels, self.target, *of_new)
         if self.borders.size:
             self.peak[new] = np.searchsorted(self.borders, self._redshift(self.place[new, 0]))
         ends = self.n + np.searchsorted(label, np.arange(len(self.labels.n_active) + 1))[None]
@@ -436,96 +450,98 @@ class AdaptiveSampler:
         _core.add_density(self.labels, parts, column, *places)
 
     def _redshift(self, place):
-        """Redshifts of places in the unit interval."""
-        return places_to_values(self.space, 0, place)[1]
+        """Compute the redshifts of places in the unit interval."""
+        _, redshift = places_to_values(self.space, 0, place)
+        return redshift
 
     def _wanted(self, weight, rows):
         """
-        Effective number of weights, whether it is enough, and places wanted in each label and peak.
+        Compute the effective number of weights, whether it is enough, and places wanted in each label and peak.
 
         Most is had of a number of places if that of each label and peak is as its weight over the root of its
         efficiency (Neyman allocation). Labels, peaks, and components that count have enough of their own.
         """
         group = self._groups(self.label[rows], self.peak[rows])
-        whole = weight.sum()
+        total_weight = weight.sum()
 
         def of_groups(values=None):
             return np.bincount(group, values, minlength=self.n_groups)
 
-        own = of_groups(weight)
+        group_weight = of_groups(weight)
         square = of_groups(weight * weight)
         n = of_groups()
-        effective = whole**2 / square.sum()
+        # effective number of Kish 1965: the sum squared over the sum of squares
+        effective = total_weight**2 / square.sum()
         enough = bool(effective >= self.wanted)
-        each = np.square(own) / np.maximum(square, 1e-300)
-        rate = np.clip(each / np.maximum(n, 1), _LEAST_RATE, 1.0)
-        part = own / whole
+        group_effective = np.square(group_weight) / np.maximum(square, 1e-300)
+        rate = np.clip(group_effective / np.maximum(n, 1), _MIN_RATE, 1.0)
+        part = group_weight / total_weight
         wanted = self.wanted * part / np.sqrt(rate) * np.sum(part / np.sqrt(rate))
         table = np.arange(n.size).reshape(-1, len(self.peaks))
         parts = [table[members].ravel() for members in self.members]
-        least_each = max(_PART_EACH * self.wanted, _PART_LEAST)
+        least_each = max(_EFFECTIVE_PART * self.wanted, _MIN_EFFECTIVE)
         for members in (*table, *table.T, *parts):
             total = part[members].sum()
-            if total <= _COUNTS:
+            if total <= _MIN_COUNTED_WEIGHT:
                 continue
-            has = (total * whole) ** 2 / square[members].sum()
-            enough = enough and bool(has >= least_each)
-            least = least_each * part[members] / total / rate[members]
-            wanted[members] = np.maximum(wanted[members], least)
-        # what has little weight so far may have more
-        some = part > LEAST_WEIGHT
-        wanted[some] = np.maximum(wanted[some], _LEAST_PLACES * wanted.sum())
+            joint_effective = (total * total_weight) ** 2 / square[members].sum()
+            enough = enough and bool(joint_effective >= least_each)
+            min_places = least_each * part[members] / total / rate[members]
+            wanted[members] = np.maximum(wanted[members], min_places)
+        # labels and peaks of little weight so far may have more
+        has_weight = part > MIN_WEIGHT
+        wanted[has_weight] = np.maximum(wanted[has_weight], _MIN_LABEL_SHARE * wanted.sum())
         return effective, enough, wanted
 
     def _guarded(self, share):
-        """Shares of labels and peaks: each label has some, and each peak of the nodes, whatever its weight."""
+        """Raise shares of labels and peaks, so that each label, and each peak of the nodes, has some."""
         n_peaks = len(self.peaks)
         share = share.reshape(-1, n_peaks) / share.sum()
         of_peak = share.sum(axis=0)
-        least = np.where(self.peaks > _PEAK, _LEAST_SHARE, 0.0)
-        few = (of_peak > 0) & (of_peak < least)
-        share = share * np.where(few, least / np.maximum(of_peak, 1e-300), 1.0)
+        min_share = np.where(self.peaks > _PEAK, _MIN_PEAK_SHARE, 0.0)
+        is_short = (of_peak > 0) & (of_peak < min_share)
+        share = share * np.where(is_short, min_share / np.maximum(of_peak, 1e-300), 1.0)
         share = share / share.sum()
-        even = share.sum(axis=0) / len(share)
-        return ((1.0 - _GUARD) * share + _GUARD * even).ravel()
+        even_share = share.sum(axis=0) / len(share)
+        return ((1.0 - _GUARD) * share + _GUARD * even_share).ravel()
 
-    def _flatten(self, log, group, chosen, few):
+    def _flatten(self, log, group, chosen, n_flat):
         """
-        Weights for a fit, flat enough in each of some groups to say what its shape is.
+        Flatten weights for a fit, in each of some groups enough to show its shape.
 
         A label whose own weights need not be made flat is no longer pursued: its weight can be believed.
         """
         flat = np.zeros(self.n)
         for j in chosen:
             rows = np.flatnonzero(group == j)
-            if rows.size < _FEWEST_PLACES:
+            if rows.size < _MIN_FITTED_PLACES:
                 continue
-            own = np.empty(rows.size)
-            power, _ = _core.flatten(log[rows], min(float(few), 0.5 * rows.size), own)
-            flat[rows] = own / own.sum()
-            if self.pursue and power == 1.0 and min(few, 0.5 * rows.size) >= _FLAT_MOST:
+            flat_weight = np.empty(rows.size)
+            power, _ = _core.flatten(log[rows], min(float(n_flat), 0.5 * rows.size), flat_weight)
+            flat[rows] = flat_weight / flat_weight.sum()
+            if self.pursue and power == 1.0 and min(n_flat, 0.5 * rows.size) >= _MAX_FLAT:
                 self.pursued[j] = False
         return flat
 
     def _models(self, sample):
-        """`PlacedModels` of weighted places but those of least weight."""
+        """Make `PlacedModels` of weighted places, without those of least weight."""
         weight = sample.weight
         order = np.argsort(weight, kind="stable")
         upto = np.cumsum(weight[order])
-        kept = np.sort(order[upto > _LEFT_OUT * upto[-1]])
-        rows = sample.rows.start + kept
+        indices = np.sort(order[upto > _LEFT_OUT * upto[-1]])
+        rows = sample.rows.start + indices
         return self._placed(
             self.place[rows],
-            self.known[rows],
-            weight[kept] / weight[kept].sum(),
+            self.evaluated[rows],
+            weight[indices] / weight[indices].sum(),
             self.points[1][rows],
             sample,
             converged=sample.enough,
         )
 
-    def _placed(self, place, known, weight, uniform, sample, *, converged):
-        """`PlacedModels` of places, what is known of them and their weights; ``sample`` has the evidence."""
-        _, scale, variance, power, log_likelihood = known.T
+    def _placed(self, place, evaluated, weight, uniform, sample, *, converged):
+        """Make `PlacedModels` of evaluated places and their weights; ``sample`` has the evidence."""
+        _, scale, variance, power, log_likelihood = evaluated.T
         return PlacedModels(
             place=place,
             weight=weight,
@@ -540,7 +556,7 @@ class AdaptiveSampler:
 
     def _moved(self, sample):
         """
-        `PlacedModels` of places that are moved to the posterior, where weights are too unequal for results.
+        Move places to the posterior where weights are too unequal for results: `PlacedModels`.
 
         Labels and peaks keep the weights that the sample gives them; places begin from all that there are.
         """
@@ -548,23 +564,23 @@ class AdaptiveSampler:
         index = self._groups(self.label[rows], self.peak[rows])
         share = np.bincount(index, sample.weight, minlength=self.n_groups)
         share = share / share.sum()
-        share[share < _LEAST_MOVED] = 0.0
+        share[share < _MIN_MOVED_WEIGHT] = 0.0
         share = share / share.sum()
-        every = self._groups(self.label[: self.n], self.peak[: self.n])
-        log = self.known[: self.n, 0] - np.log(self.density[: self.n])
+        group = self._groups(self.label[: self.n], self.peak[: self.n])
+        log = self.evaluated[: self.n, 0] - np.log(self.density[: self.n])
         picked = []
         weight = []
         for j in np.flatnonzero(share):
-            own = np.flatnonzero(every == j)
-            n = max(int(np.rint(share[j] * _N_MOVED)), _FEWEST_MOVED)
-            flat = np.empty(own.size)
-            _core.flatten(log[own], float(min(_FLAT_MOST, 0.5 * own.size)), flat)
-            picked.append(own[systematic(flat, n)])
+            members = np.flatnonzero(group == j)
+            n = max(int(np.rint(share[j] * _N_MOVED)), _MIN_MOVED)
+            flat = np.empty(members.size)
+            _core.flatten(log[members], float(min(_MAX_FLAT, 0.5 * members.size)), flat)
+            picked.append(members[systematic(flat, n)])
             weight.append(np.full(n, share[j] / n))
         picked = np.concatenate(picked)
         label = self.label[picked]
         score = self.score[picked]
-        known = self.known[picked]
+        evaluated = self.evaluated[picked]
         place = self.place[picked]
         active = np.zeros(self.labels.first.shape, bool)
         for i, n in enumerate(self.labels.n_active):
@@ -573,24 +589,27 @@ class AdaptiveSampler:
 
         def evaluate(rows, new):
             place_new = np.empty(new.shape)
-            known_new = np.empty((len(new), 5))
-            of_new = (label[rows], new, place_new, known_new, self.work)
-            _core.evaluate_places(self.space, self.labels, self.one, *of_new)
+            evaluated_new = np.empty((len(new), 5))
+            of_new = (label[rows], new, place_new, evaluated_new, self.work)
+            _core.evaluate_places(self.space, self.labels, self.target, *of_new)
             if self.borders.size:
-                # the weights are those of the peaks
-                left = np.searchsorted(self.borders, self._redshift(place_new[:, 0]))
-                known_new[left != peaks[rows], 0] = _core.NEVER
-            return known_new, place_new
+                # weights are those of the peaks, which places must not leave
+                peak_new = np.searchsorted(self.borders, self._redshift(place_new[:, 0]))
+                evaluated_new[peak_new != peaks[rows], 0] = _core.NEVER
+            return evaluated_new, place_new
 
-        move_places(evaluate, every[picked], active[label], score, known, place, self.scramble)
+        move_places(evaluate, group[picked], active[label], score, evaluated, place, self.scramble)
         uniform = self.points[1][: len(picked)]
-        return self._placed(place, known, np.concatenate(weight), uniform, sample, converged=False)
+        return self._placed(
+            place, evaluated, np.concatenate(weight), uniform, sample, converged=False
+        )
 
 
 def places_to_values(space, axis, place):
-    """Cells, and values of an axis, of places in its unit interval: two arrays, shape (n,)."""
+    """Convert places in the unit interval of an axis to cells and values: two arrays, shape (n,)."""
     n = space.size[axis]
     y = place * n
     cell = np.minimum(y.astype(np.int64), n - 1)
-    low, high = space.low[axis, cell], space.high[axis, cell]
+    low = space.low[axis, cell]
+    high = space.high[axis, cell]
     return cell, low + (y - cell) * (high - low)

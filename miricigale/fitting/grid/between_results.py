@@ -11,7 +11,7 @@ from miricigale.fitting.results.results import FitResults
 
 def between_results(fit, data, posteriors, pairs):
     """
-    Results of objects that all have a posterior between the nodes.
+    Make the results of objects that all have a posterior between the nodes.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def between_results(fit, data, posteriors, pairs):
     """
     axes = fit.priors.axes
     n = len(posteriors)
-    # of a grid without AGN it has one fraction
+    # a grid without AGN has one fraction
     fractions = fit.grid.frac_agn.size
     size = {name: axis.values.size for name, axis in axes.items()} | {"frac_agn": fractions}
     arrays = {
@@ -53,8 +53,8 @@ def between_results(fit, data, posteriors, pairs):
     outlier = None
     if fit.engine.mixture is not None:
         wrong = np.array([posterior.wrong for posterior in posteriors])
-        used = np.isfinite(data.sigma) | data.limit
-        outlier = np.where(used, wrong, np.nan)
+        in_fit = np.isfinite(data.sigma) | data.limit
+        outlier = np.where(in_fit, wrong, np.nan)
     bins = fit.given.agn_bins
     agn_weights = None
     if bins is not None:
@@ -80,7 +80,7 @@ def between_results(fit, data, posteriors, pairs):
 
 
 def with_axis_summaries(results):
-    """Results on nodes, not converged, with the moments and quantiles of parameters that others have."""
+    """Add moments and quantiles of parameters to results on nodes, which are flagged as not converged."""
     names = list(results.axes)
     n = len(results)
     moments = np.full((n, len(names), 2), np.nan)
@@ -91,7 +91,7 @@ def with_axis_summaries(results):
     for i in np.flatnonzero(fitted):
         single = results[i]
         for j, name in enumerate(names):
-            moments[i, j] = single.mean(name).value, single.std(name).value
+            moments[i, j] = (single.mean(name).value, single.std(name).value)
             quantiles[i, j] = single.percentile(name, DERIVED_LEVELS).value
     return replace(results, flags=flags, axis_moments=moments, axis_quantiles=quantiles)
 
@@ -111,7 +111,7 @@ def _put_parameters(arrays, i, posterior):
 
 
 def _derived_summaries(quantities, posteriors):
-    """Moments, (n, n_quantities, 3), and quantiles, (n, n_quantities, n_levels), of derived quantities."""
+    """Summarize derived quantities: moments (n, n_quantities, 3), quantiles (n, n_quantities, n_levels)."""
     n = len(posteriors)
     moments = np.full((n, len(quantities.names), 3), np.nan)
     quantiles = np.full((n, len(quantities.names), DERIVED_LEVELS.size), np.nan)
@@ -122,12 +122,13 @@ def _derived_summaries(quantities, posteriors):
                 summary = draws_summary(
                     posterior.derived[name], with_log=with_log, weight=posterior.weight
                 )
-                moments[i, j], quantiles[i, j] = summary
+                moments[i, j] = summary[0]
+                quantiles[i, j] = summary[1]
     return moments, quantiles
 
 
 def _best(fit, posteriors):
-    """Parameters and derived quantities of the best models: dict of str to array."""
+    """Collect parameters and derived quantities of the best models: dict of str to array."""
     out = {}
     for name in (*fit.priors.axes, *fit.engine.quantities.names):
         values = [posterior.best.get(name, np.nan) for posterior in posteriors]
@@ -136,5 +137,5 @@ def _best(fit, posteriors):
 
 
 def _column(posteriors, name):
-    """An attribute of all posteriors as an array."""
+    """Collect an attribute of all posteriors as an array."""
     return np.array([getattr(posterior, name) for posterior in posteriors])

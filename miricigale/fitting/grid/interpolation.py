@@ -59,11 +59,17 @@ class _Names:
         factors = []
         for column in grid.galaxy_properties.itercols():
             unit = (getattr(column, "unit", None) or u.one) * u.Msun
-            factors.append(unit.to(u.W) if unit.is_equivalent(u.W) else 1.0)
+            factor = 1.0
+            if unit.is_equivalent(u.W):
+                factor = unit.to(u.W)
+            factors.append(factor)
+        agn = ()
+        if grid.n_agn:
+            agn = tuple(grid.agn_properties.colnames)
         return cls(
             tuple(grid.galaxy_properties.colnames),
             tuple(factors),
-            tuple(grid.agn_properties.colnames) if grid.n_agn else (),
+            agn,
             tuple(grid.galaxy_shape.colnames),
         )
 
@@ -105,8 +111,9 @@ class InterpolatedModels:
 
     @classmethod
     def of_grid(cls, grid, axes=None):
-        """Between the nodes of a `~miricigale.sed.ModelGrid`, whose `GridAxis` by name may be known."""
-        axes = grid_priors(grid).axes if axes is None else axes
+        """Interpolate between the nodes of a `~miricigale.sed.ModelGrid`, with its `GridAxis` by name if known."""
+        if axes is None:
+            axes = grid_priors(grid).axes
         quantities = Quantities.of_grid(grid)
         parameters = parameter_names(axes)
         place = {name: i for i, name in enumerate(parameters)}
@@ -114,6 +121,9 @@ class InterpolatedModels:
         reference = np.asarray(grid.dust_luminosity, float)
         model, values = _models_and_values(axes, "galaxy", grid.n_galaxies)
         amount, reference = _saturating_reference(reference, model, values)
+        place_of_amount = -1
+        if amount is not None:
+            place_of_amount = place[amount]
         columns = np.column_stack([reference, reference])
         flux = np.moveaxis(np.asarray(grid.galaxy), 0, 1)
         table = logarithms(flux, columns, grid.redshift)
@@ -140,7 +150,7 @@ class InterpolatedModels:
             dust=empty_part(n_bands + 1),
             agn=agn,
             mixing=-1,
-            amount=-1 if amount is None else place[amount],
+            amount=place_of_amount,
             excess=-1,
             age=-1,
             youth=np.zeros(len(grid.redshift)),
@@ -158,7 +168,7 @@ class InterpolatedModels:
     @classmethod
     def of_model(cls, model, grid, filters, constants, axes=None):
         """
-        Between the nodes of finer tables of the model that made a grid.
+        Interpolate between the nodes of finer tables of the model that made a grid.
 
         Parameters
         ----------
@@ -175,14 +185,15 @@ class InterpolatedModels:
         ValueError
             If the model has other fluxes at the nodes of the grid.
         """
-        axes = grid_priors(grid).axes if axes is None else axes
+        if axes is None:
+            axes = grid_priors(grid).axes
         if not isinstance(filters, FilterSet):
             filters = FilterSet.from_names(filters)
         parameters = parameter_names(axes)
         place = {name: i for i, name in enumerate(parameters)}
-        made = ModelTables(model, filters, constants, axes, place, grid.redshift)
-        made.check(grid)
-        light, galaxies, agn_columns = made.tables()
+        tables = ModelTables(model, filters, constants, axes, place, grid.redshift)
+        tables.check(grid)
+        light, galaxies, agn_columns = tables.tables()
         first = [_first_value(axes, grid, name) for name in parameters]
         return cls(
             parameters,
@@ -213,7 +224,7 @@ class InterpolatedModels:
         return _core.make_work(len(self.parameters), self.n_columns)
 
     def vector(self, values, redshift):
-        """Values by name, of shape (n,), in the order of ``parameters``: (n, n_parameters)."""
+        """Arrange values by name, of shape (n,), in the order of ``parameters``: (n, n_parameters)."""
         vector = np.tile(self.constants, (len(redshift), 1))
         for i, name in enumerate(self.parameters):
             if name in values:
@@ -222,7 +233,7 @@ class InterpolatedModels:
         return vector
 
     def fluxes(self, values, redshift, frac):
-        """Fluxes of one solar mass formed, (n, nb), with AGN of fractions (n,), and the AGN's power, (n,)."""
+        """Interpolate fluxes in uJy of one solar mass formed with AGN, (n, nb), and the AGN's power in W, (n,)."""
         redshift = np.asarray(redshift, float)
         flux = np.empty((len(redshift), self.n_bands))
         power = np.empty((2, len(redshift)))
@@ -233,11 +244,12 @@ class InterpolatedModels:
         return flux, power[1]
 
     def galaxy_fluxes(self, values, redshift):
-        """Fluxes of galaxies of one solar mass formed, shape (n, nb)."""
-        return self.fluxes(values, redshift, 0.0)[0]
+        """Interpolate the fluxes of galaxies of one solar mass formed in uJy, shape (n, nb)."""
+        flux, _ = self.fluxes(values, redshift, 0.0)
+        return flux
 
     def agn_fluxes(self, values, redshift):
-        """Fluxes of AGN of one watt, shape (n, nb)."""
+        """Interpolate the fluxes of AGN of one watt in uJy, shape (n, nb)."""
         redshift = np.asarray(redshift, float)
         vector = self.vector(values, redshift)
         flux = np.empty((len(redshift), self.n_bands))
@@ -245,24 +257,30 @@ class InterpolatedModels:
         return np.exp(flux) * np.maximum(redshift, 1e-6)[:, None] ** -2.0
 
     def describe(self, values, redshift, power, scale):
-        """Derived quantities of models of AGN power (n,), for one solar mass, and scale (n,): dict by name."""
+        """Derive quantities of models of AGN power (n,), for one solar mass, and scale (n,): dict by name."""
         vector = self.vector(values, np.asarray(redshift, float))
         galaxy = self.galaxies.quantities(self.light, vector)
         names = self.names
         described = {"mass": scale}
         for name, factor in zip(names.galaxy, names.galaxy_factors, strict=True):
-            label = f"{name}_galaxy" if name in names.agn else name
+            if name in names.agn:
+                label = f"{name}_galaxy"
+            else:
+                label = name
             described[label] = scale * galaxy[name] * factor
         agn = {}
         if names.agn:
             columns = part_columns(self.agn_columns, vector).T
             agn = dict(zip(names.agn, columns, strict=True))
         for name in names.agn:
-            label = f"{name}_agn" if name in names.galaxy else name
+            if name in names.galaxy:
+                label = f"{name}_agn"
+            else:
+                label = name
             described[label] = scale * power * agn[name]
-        both = [name for name in names.galaxy if name in names.agn]
-        if both:
-            described[both[0]] = described[f"{both[0]}_galaxy"] + described[f"{both[0]}_agn"]
+        shared = [name for name in names.galaxy if name in names.agn]
+        if shared:
+            described[shared[0]] = described[f"{shared[0]}_galaxy"] + described[f"{shared[0]}_agn"]
         else:
             described["total_luminosity"] = scale * (galaxy["reference"] + power)
         for name in names.shape:
@@ -272,7 +290,7 @@ class InterpolatedModels:
         return described
 
     def _other_fraction(self, galaxy, agn, power):
-        """AGN fraction in the definition that the grid does not use."""
+        """Compute the AGN fraction in the definition that the grid does not use."""
         if self.quantities.fraction.name == "frac_agn_ir":
             of_galaxy = galaxy["ir_luminosity"]
             of_agn = power * agn["ir_luminosity"]
@@ -284,7 +302,7 @@ class InterpolatedModels:
 
 
 def parameter_names(axes):
-    """Order of the parameters of models: redshift, AGN fraction, axes of galaxies, axes of AGN."""
+    """Order the parameters of models: redshift, AGN fraction, axes of galaxies, axes of AGN."""
     galaxy = [name for name, axis in axes.items() if axis.kind == "galaxy"]
     agn = [name for name, axis in axes.items() if axis.kind == "agn"]
     return ("redshift", "frac_agn", *galaxy, *agn)
@@ -298,7 +316,7 @@ def _first_value(axes, grid, name):
 
 def grid_models(axes, kind, n_models):
     """
-    Models of all combinations of the values of a grid's axes.
+    Find the models of all combinations of the values of a grid's axes.
 
     Parameters
     ----------
@@ -311,13 +329,13 @@ def grid_models(axes, kind, n_models):
     model : `~numpy.ndarray` of int, one axis for each parameter
         -1 where there is none.
     """
-    own = [axis for axis in axes.values() if axis.kind == kind]
-    model = np.full([axis.values.size for axis in own], -1 if own else 0)
-    if not own:
-        return model
+    kind_axes = [axis for axis in axes.values() if axis.kind == kind]
+    if not kind_axes:
+        return np.array(0)
+    model = np.full([axis.values.size for axis in kind_axes], -1)
     for i in range(n_models):
         # a model without effect of a parameter stands for all its values
-        places = [np.flatnonzero(axis.share[:, i] > 0) for axis in own]
+        places = [np.flatnonzero(axis.share[:, i] > 0) for axis in kind_axes]
         model[np.ix_(*places)] = i
     return model
 
@@ -328,7 +346,7 @@ def _models_and_values(axes, kind, n_models):
 
 
 def _part_of_grid(table, model, values, redshift, place):
-    """`_core.Part` of the models of a grid."""
+    """Make the `_core.Part` of the models of a grid."""
     full = table[model.ravel()].reshape(*model.shape, *table.shape[1:])
     full = np.where((model >= 0)[..., None, None], full, np.nan)
     # shapes matter, not brightness; one redshift is enough
@@ -363,7 +381,7 @@ def _saturating_reference(reference, model, values):
             if j:
                 ratio[rows] = reference[rows] / -np.expm1(-_core.SATURATION * nodes[j])
             else:
-                both = (models[0] >= 0) & (models[1] >= 0)
-                ratio[models[0][both]] = ratio[models[1][both]]
+                has_neighbor = (models[0] >= 0) & (models[1] >= 0)
+                ratio[models[0][has_neighbor]] = ratio[models[1][has_neighbor]]
         return name, ratio
     return None, reference

@@ -1,4 +1,4 @@
-"""What posteriors between the nodes of a grid tell apart."""
+"""Labels of posteriors between the nodes of a grid: which components are present, and values of libraries."""
 
 from dataclasses import dataclass
 
@@ -30,57 +30,80 @@ class LabelTable:
 
     @classmethod
     def of_axes(cls, axes, without_effect):
-        """Of `GridAxis`, and which have no effect where others are absent; see `Continuation`."""
+        """Make the table of `GridAxis`, and which have no effect where others are absent; see `Continuation`."""
         n_axes = len(axes)
         largest = max(axis.values.size for axis in axes)
         ranges = [axis.ranges for axis in axes]
-        below, log_share = np.zeros((n_axes, largest + 1)), np.zeros((n_axes, largest))
+        share_below = np.zeros((n_axes, largest + 1))
+        log_share = np.zeros((n_axes, largest))
         for i, axis in enumerate(axes):
             n = axis.values.size
-            # what is known of redshift comes with each object
-            weight = np.full(n, 1.0 / n) if axis.kind == "redshift" else axis.weights
-            below[i, 1 : n + 1] = np.cumsum(weight)
-            below[i, n + 1 :] = below[i, n]
+            # the prior of redshift comes with each object
+            if axis.kind == "redshift":
+                weight = np.full(n, 1.0 / n)
+            else:
+                weight = axis.weights
+            share_below[i, 1 : n + 1] = np.cumsum(weight)
+            share_below[i, n + 1 :] = share_below[i, n]
             log_share[i, :n] = log_weights(weight)
-        of_range = np.full([len(r) for r in ranges], -1)
-        known, rows = {}, []
+        of_range = np.full([len(axis_ranges) for axis_ranges in ranges], -1)
+        label_of_key = {}
+        rows = []
         for index in np.ndindex(of_range.shape):
             absent = [axes[i].absent_at_zero and index[i] == 0 for i in range(n_axes)]
             inert = without_effect[np.array(absent, bool)].any(axis=0)
             cells = []
             for i in range(n_axes):
-                cells.append((0, axes[i].values.size) if inert[i] else ranges[i][index[i]])
+                if inert[i]:
+                    cells.append((0, axes[i].values.size))
+                else:
+                    cells.append(ranges[i][index[i]])
             key = tuple(cells)
-            if key not in known:
+            if key not in label_of_key:
                 first, count = np.array(cells).T
-                share = below[np.arange(n_axes), first + count] - below[np.arange(n_axes), first]
-                known[key] = len(rows) if np.all(share > 0) else -1
-                if known[key] >= 0:
+                share = (
+                    share_below[np.arange(n_axes), first + count]
+                    - share_below[np.arange(n_axes), first]
+                )
+                if np.all(share > 0):
+                    label_of_key[key] = len(rows)
+                else:
+                    label_of_key[key] = -1
+                if label_of_key[key] >= 0:
                     rows.append((first, count, inert | (count == 1)))
-            of_range[index] = known[key]
-        first, count, still = (np.array(column) for column in zip(*rows, strict=True))
-        kernel = _labels(first, count, still, below, log_share)
-        range_of = [np.repeat(np.arange(len(r)), [n for _, n in r]) for r in ranges]
+            of_range[index] = label_of_key[key]
+        first = np.array([row[0] for row in rows])
+        count = np.array([row[1] for row in rows])
+        still = np.array([row[2] for row in rows])
+        kernel = _labels(first, count, still, share_below, log_share)
+        range_of = [
+            np.repeat(np.arange(len(axis_ranges)), [n for _, n in axis_ranges])
+            for axis_ranges in ranges
+        ]
         return cls(kernel, of_range, range_of)
 
     def without_first_axis(self):
-        """The same, but for the first axis, which has one cell."""
-        own = self.kernel
-        first, count = own.first.copy(), own.count.copy()
-        below, log_share = own.below.copy(), own.log_share.copy()
-        first[:, 0], count[:, 0] = 0, 1
-        below[0], log_share[0] = 1.0, 0.0
-        below[0, 0] = 0.0
+        """Return a table whose first axis has one cell."""
+        labels = self.kernel
+        first = labels.first.copy()
+        count = labels.count.copy()
+        share_below = labels.below.copy()
+        log_share = labels.log_share.copy()
+        first[:, 0] = 0
+        count[:, 0] = 1
+        share_below[0] = 1.0
+        log_share[0] = 0.0
+        share_below[0, 0] = 0.0
         still = np.ones(first.shape, bool)
-        for i, n in enumerate(own.n_active):
-            still[i, own.axes[i, :n]] = False
+        for i, n in enumerate(labels.n_active):
+            still[i, labels.axes[i, :n]] = False
         still[:, 0] = True
-        kernel = _labels(first, count, still, below, log_share)
+        kernel = _labels(first, count, still, share_below, log_share)
         return LabelTable(kernel, self.of_range, self.range_of)
 
     def of_nodes(self, node):
         """
-        Labels and scores of places anywhere in the cells of nodes.
+        Draw places anywhere in the cells of nodes: their labels and scores.
 
         Parameters
         ----------
@@ -96,25 +119,30 @@ class LabelTable:
         """
         n, n_axes = node.shape
         index = tuple(self.range_of[i][node[:, i]] for i in range(n_axes))
-        label, every = self.of_range[index], np.arange(n_axes)
+        label = self.of_range[index]
+        all_axes = np.arange(n_axes)
         uniform = qmc.Sobol(n_axes, seed=2).random(n)
-        own, below = self.kernel, self.kernel.below
-        first, count = own.first[label], own.count[label]
+        labels = self.kernel
+        share_below = self.kernel.below
+        first = labels.first[label]
+        count = labels.count[label]
         inside = (node >= first) & (node < first + count)
         cell = np.where(inside, node, first)
-        start = below[every, first]
-        whole = below[every, first + count] - start
-        place = below[every, cell] + uniform * (below[every, cell + 1] - below[every, cell])
-        score = ndtri(np.clip((place - start) / whole, 1e-6, 1.0 - 1e-6))
-        active = np.zeros(own.first.shape, bool)
-        for i, k in enumerate(own.n_active):
-            active[i, own.axes[i, :k]] = True
+        start = share_below[all_axes, first]
+        range_share = share_below[all_axes, first + count] - start
+        place = share_below[all_axes, cell] + uniform * (
+            share_below[all_axes, cell + 1] - share_below[all_axes, cell]
+        )
+        score = ndtri(np.clip((place - start) / range_share, 1e-6, 1.0 - 1e-6))
+        active = np.zeros(labels.first.shape, bool)
+        for i, k in enumerate(labels.n_active):
+            active[i, labels.axes[i, :k]] = True
         return label, np.where(active[label], score, ndtri(np.clip(uniform, 1e-6, 1.0 - 1e-6)))
 
 
 def labels_of_ranges(labels):
     """
-    Labels in which a component is absent or present, or a parameter has a value.
+    List the labels in which a component is absent or present, or a parameter has a value.
 
     Parameters
     ----------
@@ -136,15 +164,17 @@ def labels_of_ranges(labels):
     return members
 
 
-def _labels(first, count, still, below, log_share):
-    """`_core.Labels` of ranges, of which some axes have no effect."""
-    axes, n_active = np.zeros(first.shape, np.int64), (~still).sum(axis=1)
+def _labels(first, count, still, share_below, log_share):
+    """Make `_core.Labels` of ranges, of which some axes have no effect."""
+    axes = np.zeros(first.shape, np.int64)
+    n_active = (~still).sum(axis=1)
     for i, row in enumerate(~still):
         axes[i, : n_active[i]] = np.flatnonzero(row)
-    first, count = first.astype(np.int64), count.astype(np.int64)
-    return _core.Labels(first, count, axes, n_active.astype(np.int64), below, log_share)
+    first = first.astype(np.int64)
+    count = count.astype(np.int64)
+    return _core.Labels(first, count, axes, n_active.astype(np.int64), share_below, log_share)
 
 
 def log_weights(weights):
-    """Logarithms of weights; of 0 a number that is none."""
+    """Compute logarithms of weights, `_core.NEVER` of 0."""
     return np.log(weights, where=weights > 0, out=np.full(np.shape(weights), _core.NEVER))

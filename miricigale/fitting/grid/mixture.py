@@ -19,10 +19,12 @@ from miricigale.fitting import _core
 from miricigale.fitting.data.likelihood import per_band
 from miricigale.utils.options import check_that
 
-#: Least width of the broad part, in units of the stated error.
-_WIDE = 10.0
-#: Galaxies looked at for the model at which the tangents touch: at each redshift, and at those that matter.
-_FEW, _MORE = 64, 512
+#: Smallest width of the broad part, in units of the stated error.
+_MIN_BROAD_SIGMA = 10.0
+#: Number of galaxies at each redshift among which the model at which the tangents touch is sought.
+_N_GALAXIES = 64
+#: Number of galaxies at the redshifts that matter.
+_N_MORE_GALAXIES = 512
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
@@ -46,32 +48,37 @@ class BandMixture:
     def of_bands(cls, outliers, filters):
         """Make it of ``outliers`` of a fitter and its filters; None where there are none."""
         names = tuple(getattr(filters, "names", filters))
-        part = {} if outliers is None else per_band(outliers, names, "outliers")
+        part = {}
+        if outliers is not None:
+            part = per_band(outliers, names, "outliers")
         part = np.array(list(part.values()))
         check_that(np.all(part < 1), "outliers", "at least 0 and below 1", outliers)
         if not part.any():
             return None
-        known = filters if isinstance(filters, FilterSet) else FilterSet.from_names(names)
-        return cls(part, np.argsort(known.pivot.to_value("um"), kind="stable"))
+        if isinstance(filters, FilterSet):
+            filter_set = filters
+        else:
+            filter_set = FilterSet.from_names(names)
+        return cls(part, np.argsort(filter_set.pivot.to_value("um"), kind="stable"))
 
     def broad(self, flux, sigma):
         """
-        Widths of the broad parts in uJy, infinite in bands without a flux: shape (n, nb).
+        Compute the widths of the broad parts in uJy, infinite in bands without a flux: shape (n, nb).
 
         The larger, in quadrature, of 10 sigma and of the largest flux of the band and the measured ones next
         to it: data alone say it, and a flux of 0 between bright ones is wrong too.
         """
         out = np.full(np.shape(flux), np.inf)
         for i in range(len(flux)):
-            used = self.order[np.isfinite(sigma[i, self.order])]
-            size = np.pad(np.abs(flux[i, used]), 1)
+            measured = self.order[np.isfinite(sigma[i, self.order])]
+            size = np.pad(np.abs(flux[i, measured]), 1)
             top = np.maximum(size[1:-1], np.maximum(size[:-2], size[2:]))
-            out[i, used] = np.hypot(_WIDE * sigma[i, used], top)
+            out[i, measured] = np.hypot(_MIN_BROAD_SIGMA * sigma[i, measured], top)
         return out
 
     def log_likelihood(self, model, flux, sigma, broad, limit=None, limit_sigma=None):
         """
-        Ln of the likelihood of models, and how likely each band is wrong for each.
+        Compute ln of the likelihood of models, and how likely each band is wrong for each.
 
         Parameters
         ----------
@@ -89,35 +96,39 @@ class BandMixture:
         wrong : `~numpy.ndarray`, shape (..., nb)
             0 in bands without data.
         """
-        used = np.isfinite(sigma)
-        part = np.broadcast_to(self.part, used.shape)
-        own, wide = np.where(used, sigma, 1.0), np.where(used, broad, 1.0)
-        square = np.where(used, np.square(flux - model), 0.0)
+        measured = np.isfinite(sigma)
+        part = np.broadcast_to(self.part, measured.shape)
+        narrow = np.where(measured, sigma, 1.0)
+        wide = np.where(measured, broad, 1.0)
+        square = np.where(measured, np.square(flux - model), 0.0)
         with np.errstate(divide="ignore"):
-            good = np.log1p(-part) - 0.5 * square / np.square(own)
-            bad = np.log(part) - 0.5 * square / np.square(wide) + np.log(own / wide)
-            log = np.where(used, np.logaddexp(good, bad), 0.0)
-            wrong = np.where(used, expit(bad - good), 0.0)
+            good = np.log1p(-part) - 0.5 * square / np.square(narrow)
+            bad = np.log(part) - 0.5 * square / np.square(wide) + np.log(narrow / wide)
+            log = np.where(measured, np.logaddexp(good, bad), 0.0)
+            wrong = np.where(measured, expit(bad - good), 0.0)
             if limit is not None:
-                some = np.isfinite(limit_sigma)
-                below = log_ndtr(np.where(some, (limit - model) / limit_sigma, 0.0))
-                good, bad = np.log1p(-self.part) + below, np.log(self.part)
-                log = np.where(some, np.logaddexp(good, bad), log)
-                wrong = np.where(some, expit(bad - good), wrong)
+                has_limit = np.isfinite(limit_sigma)
+                log_below = log_ndtr(np.where(has_limit, (limit - model) / limit_sigma, 0.0))
+                good = np.log1p(-self.part) + log_below
+                bad = np.log(self.part)
+                log = np.where(has_limit, np.logaddexp(good, bad), log)
+                wrong = np.where(has_limit, expit(bad - good), wrong)
         return log.sum(axis=-1), wrong
 
     def shares(self, model, target, broad, limits, z, weight):
         """
-        How likely each band is wrong, shape (nb,), over models, (n, nb), at nodes ``z`` of redshift.
+        Compute how likely each band is wrong, shape (nb,), over models, (n, nb), at nodes ``z`` of redshift.
 
         ``weight``, shape (n,), are the weights of the models, which sum to 1.
         """
         with np.errstate(divide="ignore"):
-            own = 1.0 / np.sqrt(target.weight[z])
-        more = np.array([np.zeros(len(broad)), np.full(len(broad), np.inf)])
+            narrow = 1.0 / np.sqrt(target.weight[z])
+        limit = np.zeros(len(broad))
+        limit_sigma = np.full(len(broad), np.inf)
         if limits is not None:
-            more[:, limits.bands] = limits.level / limits.inverse, 1.0 / limits.inverse
-        wrong = self.log_likelihood(model, target.flux, own, broad, *more)[1]
+            limit[limits.bands] = limits.level / limits.inverse
+            limit_sigma[limits.bands] = 1.0 / limits.inverse
+        _, wrong = self.log_likelihood(model, target.flux, narrow, broad, limit, limit_sigma)
         return np.sum(weight[:, None] * wrong, axis=0)
 
 
@@ -132,13 +143,13 @@ class Tangents:
         The bands.
     tables : `~miricigale.fitting._core.Tables`
         The grid.
-    few : tuple of `~numpy.ndarray`
+    galaxies : tuple of `~numpy.ndarray`
         Galaxies that are looked at: the first fields of ``Few``.
     """
 
     bands: BandMixture
     tables: tuple
-    few: tuple
+    galaxies: tuple
 
     @classmethod
     def of_tables(cls, bands, tables):
@@ -150,16 +161,16 @@ class Tangents:
         flux = _core.aligned(n_z, n_bands, n_wide, dtype=np.float32)
         ratio = _core.aligned(n_z, tables.agn.shape[1], n_wide, dtype=np.float32)
         for z in range(n_z):
-            some = order[tables.log_usable[z, order] > -1e200]
-            index[z, : some.size] = some
-            flux[z, :, : some.size] = tables.galaxy32[z][:, some]
-            size = tables.of_galaxy[0, some] / tables.galaxy_unit[z, some]
-            ratio[z, :, : some.size] = np.clip(size * tables.agn_unit[z, :, None], 0.0, 1e15)
+            usable = order[tables.log_usable[z, order] > -1e200]
+            index[z, : usable.size] = usable
+            flux[z, :, : usable.size] = tables.galaxy32[z][:, usable]
+            size = tables.of_galaxy[0, usable] / tables.galaxy_unit[z, usable]
+            ratio[z, :, : usable.size] = np.clip(size * tables.agn_unit[z, :, None], 0.0, 1e15)
         return cls(bands, tables, (index, flux, ratio))
 
     def touch(self, target, log_prior, sigma, broad, limit=None, limit_sigma=None):
         """
-        Weights of the tangents of one object.
+        Compute the weights of the tangents of one object.
 
         Parameters
         ----------
@@ -179,31 +190,42 @@ class Tangents:
         wrong : `~numpy.ndarray`, shape (nz, nb)
             How likely each band is wrong for the models at which they touch.
         """
-        tables, bands, part = self.tables, target.bands, self.bands.part
-        own = 1.0 / np.sqrt(np.take(target.weight, bands, axis=1))
-        narrow = own / broad[bands]
+        tables = self.tables
+        bands = target.bands
+        part = self.bands.part
+        stated = 1.0 / np.sqrt(np.take(target.weight, bands, axis=1))
+        narrow = stated / broad[bands]
         odds = part[bands] / (1.0 - part[bands]) * narrow
-        n_z, ratio = len(log_prior), tables.of_frac[0]
-        ends = 0.0 if tables.zero_frac else ratio.min(initial=1e9), min(ratio.max(initial=0.0), 1e9)
-        index, scale = np.full((n_z, 2), -1), np.zeros((n_z, 2))
+        n_z = len(log_prior)
+        ratio = tables.of_frac[0]
+        lowest = ratio.min(initial=1e9)
+        if tables.zero_frac:
+            lowest = 0.0
+        ends = np.array([lowest, min(ratio.max(initial=0.0), 1e9)])
+        index = np.full((n_z, 2), -1)
+        scale = np.zeros((n_z, 2))
         # likelihoods are of fluxes in units of the errors without that of the templates
-        rise = 2.0 * np.log(own / sigma[bands]).sum(axis=1)
-        found = np.ones(odds.shape), np.zeros(n_z), index, scale
-        n = self.few[0].shape[1]
-        sizes, few = np.array([min(_FEW, n), min(_MORE, n), n]), _core.make_few(*self.few)
+        rise = 2.0 * np.log(stated / sigma[bands]).sum(axis=1)
+        best_models = np.ones(odds.shape), np.zeros(n_z), index, scale
+        n = self.galaxies[0].shape[1]
+        sizes = np.array([min(_N_GALAXIES, n), min(_N_MORE_GALAXIES, n), n])
+        galaxies = _core.make_few(*self.galaxies)
         _core.find_models(
-            tables, target, few, odds, narrow**2, rise - log_prior, np.array(ends), sizes, *found
+            tables, target, galaxies, odds, narrow**2, rise - log_prior, ends, sizes, *best_models
         )
         model = scale[:, :1] * tables.galaxy[np.arange(n_z), np.maximum(index[:, 0], 0)]
-        some = np.flatnonzero(index[:, 1] >= 0)
-        model[some] += scale[some, 1:] * tables.agn[some, index[some, 1]]
+        with_agn = np.flatnonzero(index[:, 1] >= 0)
+        model[with_agn] += scale[with_agn, 1:] * tables.agn[with_agn, index[with_agn, 1]]
         square = np.square(target.flux - model)[:, bands]
         full = np.full((n_z, len(sigma)), np.inf)
-        full[:, bands] = own
+        full[:, bands] = stated
         log, wrong = self.bands.log_likelihood(model, target.flux, full, broad)
         if limit_sigma is not None:
-            more = np.full(sigma.shape, np.inf), broad, limit, limit_sigma
-            wrong = wrong + self.bands.log_likelihood(model, target.flux, *more)[1]
+            no_flux = np.full(sigma.shape, np.inf)
+            _, wrong_limits = self.bands.log_likelihood(
+                model, target.flux, no_flux, broad, limit, limit_sigma
+            )
+            wrong = wrong + wrong_limits
         weight = target.weight.copy()
         weight[:, bands] *= 1.0 - wrong[:, bands] * (1.0 - narrow**2)
         level = 2.0 * log - rise

@@ -30,19 +30,20 @@ from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.options import check_that
 
 #: Part of a parameter's first step at which dust that may be absent is evaluated in place of 0.
-_HARDLY_ANY_DUST = 1e-3
-#: Error of masses formed in the last 10 and 100 Myr; and parts of the stars, for each Gyr, that do not matter.
-_TOLERANCE_OF_COLUMNS = 0.01
-_HARDLY_FORMED = 0.01
+_TRACE_OF_DUST = 1e-3
+#: Relative error of masses formed in the last 10 and 100 Myr.
+_COLUMN_TOLERANCE = 0.01
+#: Part of the stars formed, for each Gyr, that is negligible.
+_NEGLIGIBLE_FORMED = 0.01
 #: Redshifts at which axes are refined.
 _N_LINE_REDSHIFTS = 5
 #: Largest step of the tables in ln(1 + z): lines, breaks and features of dust cross the edges of bands.
 _REDSHIFT_STEP = 0.01
 #: Bursts differ by less than this along an axis that has no effect on them.
 _NO_EFFECT = 1e-6
-#: Tables that are kept for further fitters of a process (some 50 MB each), the last used at the end.
-_MOST_KEPT = 2
-_kept = OrderedDict()
+#: Largest number of tables kept for further fitters of a process (some 50 MB each), the last used at the end.
+_MAX_STORED_TABLES = 2
+_stored_tables = OrderedDict()
 _lock = threading.Lock()
 
 
@@ -58,10 +59,16 @@ class ModelGalaxies:
     reference_row: int
 
     def quantities(self, light, values):
-        """Quantities for one solar mass formed: dict of name to array, of values (n, n_parameters)."""
+        """Derive quantities for one solar mass formed from values (n, n_parameters): dict of name to array."""
         n = len(values)
-        share = np.zeros(n) if light.mixing < 0 else values[:, light.mixing]
-        age = np.full(n, self.constant_age) if light.age < 0 else values[:, light.age]
+        if light.mixing < 0:
+            share = np.zeros(n)
+        else:
+            share = values[:, light.mixing]
+        if light.age < 0:
+            age = np.full(n, self.constant_age)
+        else:
+            age = values[:, light.age]
         starlight = part_columns(self.stars, values)
         starlight *= (1.0 - share)[:, None]
         if self.burst.table.shape[1]:
@@ -89,28 +96,30 @@ class ModelTables:
         self.axes = axes
         self.place = place
         self.redshift = np.asarray(redshift, float)
-        free = {name: axis.values for name, axis in axes.items()}
-        self.constants = {name: value for name, value in constants.items() if name not in free}
+        free_values = {name: axis.values for name, axis in axes.items()}
+        self.constants = {
+            name: value for name, value in constants.items() if name not in free_values
+        }
         self.names = {}
         for part, names in part_parameters(model).items():
-            self.names[part] = {name: free[name] for name in names if name in free}
+            self.names[part] = {name: free_values[name] for name in names if name in free_values}
         self.mixing = model.component("sfh").linear
         if self.mixing not in self.names["starlight"]:
             self.mixing = ""
         self.amount = self._amount_of_dust()
 
     def light_at(self, redshift):
-        """`LightParts` at some redshifts."""
+        """Make `LightParts` at redshifts."""
         return LightParts(self.model, self.filters, redshift, self.constants)
 
     def _amount_of_dust(self):
-        """Axis of starlight whose value 0 is no dust; "" if there is none."""
+        """Find the axis of starlight whose value 0 is no dust; "" if there is none."""
         axes = self.names["starlight"]
         light = self.light_at(self.redshift[:1])
         for name, values in axes.items():
             if values[0] != 0.0 or len(values) < 2:
                 continue
-            row = {other: float(nodes[-1]) for other, nodes in axes.items()}
+            row = {parameter: float(nodes[-1]) for parameter, nodes in axes.items()}
             absorbed = light.starlight([row | {name: 0.0}, row]).columns[:, -1]
             if absorbed[0] == 0.0 and absorbed[1] > 0.0:
                 return name
@@ -119,9 +128,9 @@ class ModelTables:
     def check(self, grid):
         """Refuse a model that did not make the grid."""
         rng = np.random.default_rng(1)
-        some = rng.choice(grid.n_galaxies, min(grid.n_galaxies, 20), replace=False)
+        galaxies = rng.choice(grid.n_galaxies, min(grid.n_galaxies, 20), replace=False)
         z = self.redshift[:: max(len(self.redshift) // 2, 1)]
-        table = grid.galaxy_parameters[some]
+        table = grid.galaxy_parameters[galaxies]
         rows = [dict(zip(table.colnames, map(_number, row), strict=True)) for row in table]
         light = self.light_at(z)
         index = np.searchsorted(self.redshift, z)
@@ -129,20 +138,22 @@ class ModelTables:
         dust = light.dust(rows)
         power = starlight.columns[:, -1] * [row.get("dust_excess", 1.0) for row in rows]
         flux = starlight.flux + power[:, None, None] * dust.flux
-        same = _nearly_equal(flux, np.moveaxis(grid.galaxy[index][:, some], 0, 1))
+        is_same = _nearly_equal(flux, np.moveaxis(grid.galaxy[index][:, galaxies], 0, 1))
         reference = power
         if self.model.frac_agn_definition != "dust":
             dust_reference = dust.columns[:, self.model.chain.reference_row]
             reference = starlight.columns[:, self._reference_column] + power * dust_reference
-        same = same and _nearly_equal(reference, grid.dust_luminosity[some])
+        is_same = is_same and _nearly_equal(reference, grid.dust_luminosity[galaxies])
         if grid.n_agn:
-            some = rng.choice(grid.n_agn, min(grid.n_agn, 5), replace=False)
-            table = grid.agn_parameters[some]
+            templates = rng.choice(grid.n_agn, min(grid.n_agn, 5), replace=False)
+            table = grid.agn_parameters[templates]
             rows = [dict(zip(table.colnames, map(_number, row), strict=True)) for row in table]
-            expected = np.moveaxis(grid.agn[index][:, some], 0, 1)
-            same = same and self.model.has_agn and _nearly_equal(light.agn(rows).flux, expected)
+            expected = np.moveaxis(grid.agn[index][:, templates], 0, 1)
+            is_same = (
+                is_same and self.model.has_agn and _nearly_equal(light.agn(rows).flux, expected)
+            )
         check_that(
-            same, "finer", "the model that made the grid", "one with other fluxes at its nodes"
+            is_same, "finer", "the model that made the grid", "one with other fluxes at its nodes"
         )
 
     def _refuses(self, name, row):
@@ -161,7 +172,7 @@ class ModelTables:
         return self._starlight_tables(*self._starlight(light, rows), light.redshift)[0]
 
     def _starlight_tables(self, flux, columns, ratio, redshift):
-        """Logarithms that fluxes follow from, and of the columns, the last being the dust's power."""
+        """Compute the logarithms that fluxes follow from, and those of columns, the last the dust's power."""
         reference = columns[:, self._reference_column]
         logs = logarithms(flux, np.column_stack([reference, ratio]), redshift)
         columns = np.column_stack([columns[:, :-1], ratio])
@@ -173,7 +184,7 @@ class ModelTables:
         return -1 - n + self.model.chain.reference_row % n
 
     def _starlight(self, light, rows, share=0.0):
-        """Fluxes, columns, and the dust's power over its saturation, at a mass fraction of the burst."""
+        """Evaluate fluxes, columns, and the dust's power over its saturation, at a mass fraction of the burst."""
         if self.mixing:
             rows = [row | {self.mixing: share} for row in rows]
         table = light.starlight(rows)
@@ -185,10 +196,10 @@ class ModelTables:
         without = np.flatnonzero(amounts == 0.0)
         if without.size:
             # the limit of the ratio
-            little = _HARDLY_ANY_DUST * float(self.names["starlight"][self.amount][1])
+            little = _TRACE_OF_DUST * float(self.names["starlight"][self.amount][1])
             amounts[without] = little
-            some = [rows[i] | {self.amount: little} for i in without]
-            power[without] = excess * light.absorbed(some)
+            dusty_rows = [rows[i] | {self.amount: little} for i in without]
+            power[without] = excess * light.absorbed(dusty_rows)
         return table.flux, table.columns, power / -np.expm1(-_core.SATURATION * amounts)
 
     def _dust_logs(self, light, rows):
@@ -211,7 +222,7 @@ class ModelTables:
 
     def tables(self):
         """
-        `_core.Light`, derived quantities of galaxies, and properties of AGN.
+        Return `_core.Light`, derived quantities of galaxies, and properties of AGN.
 
         A process keeps the last two: fits of the same models and bands, such as a calibration and the fit after
         it, share them. No caller may change the arrays. They are not marked read-only, because numba would compile
@@ -221,17 +232,17 @@ class ModelTables:
             return self._evaluated()
         key = self._key()
         with _lock:
-            tables = _kept.pop(key, None)
+            tables = _stored_tables.pop(key, None)
         if tables is None:
             tables = self._evaluated()
         with _lock:
-            _kept[key] = tables
-            while len(_kept) > _MOST_KEPT:
-                _kept.popitem(last=False)
+            _stored_tables[key] = tables
+            while len(_stored_tables) > _MAX_STORED_TABLES:
+                _stored_tables.popitem(last=False)
         return tables
 
     def _key(self):
-        """Checksum of all that tables depend on."""
+        """Compute a checksum of all that tables depend on."""
         axes = {
             name: [axis.kind, np.asarray(axis.values, float)] for name, axis in self.axes.items()
         }
@@ -294,7 +305,7 @@ class ModelTables:
 
     def _star_columns(self, axes, powers, lines):
         """
-        Table of the columns of starlight.
+        Make the table of the columns of starlight.
 
         Star-formation rates have a kink where galaxies are as old as the span of their mean: axes are refined once
         more for them, which costs little without redshifts and bands.
@@ -303,18 +314,20 @@ class ModelTables:
 
         def formed(light, rows):
             columns = self._starlight(light, rows)[1]
-            some = [np.log(columns[:, [j]] + _HARDLY_FORMED * s) for j, s in FORMED_COLUMNS.items()]
+            logs_formed = [
+                np.log(columns[:, [j]] + _NEGLIGIBLE_FORMED * s) for j, s in FORMED_COLUMNS.items()
+            ]
             # in place of fluxes
-            return np.concatenate(some, axis=1)[:, None]
+            return np.concatenate(logs_formed, axis=1)[:, None]
 
-        part = PartAxes(axes, formed, self._refuses, 2 * MAX_MODELS, _TOLERANCE_OF_COLUMNS, powers)
+        part = PartAxes(axes, formed, self._refuses, 2 * MAX_MODELS, _COLUMN_TOLERANCE, powers)
         axes, powers = part.refined(light)
         rows = part.rows(axes)
         _, columns = self._starlight_tables(*self._starlight(light, rows), light.redshift)
         return make_part(tuple(axes), axes, powers, columns[:, None], [0.0], self.place)
 
     def _burst(self, light, axes, powers):
-        """The burst alone, from two of its mass fractions."""
+        """Make tables of the burst alone, from two of its mass fractions."""
         top = self.model.parameters[self.mixing].bounds[1]
         effective = self._axes_of_burst(axes, top)
         fixed = {name: float(values[-1]) for name, values in axes.items() if name not in effective}
@@ -322,24 +335,25 @@ class ModelTables:
         if not effective:
             rows = [fixed]
 
-        def alone(numbers, others):
-            return np.maximum((numbers - (1.0 - top) * others) / top, 0.0)
+        # light mixes linearly: with_share = (1 - top) without_burst + top burst
+        def burst_alone(with_share, without_burst):
+            return np.maximum((with_share - (1.0 - top) * without_burst) / top, 0.0)
 
         with_burst = self._starlight(light, rows, top)
         without = self._starlight(light, rows)
-        numbers = [alone(*pair) for pair in zip(with_burst, without, strict=True)]
-        logs, columns = self._starlight_tables(*numbers, light.redshift)
+        flux, columns, ratio = map(burst_alone, with_burst, without)
+        logs, columns = self._starlight_tables(flux, columns, ratio, light.redshift)
         names = tuple(effective)
         burst = make_part(names, effective, powers, logs, light.redshift, self.place)
         return burst, with_columns(burst, columns)
 
     def _axes_of_burst(self, axes, top):
-        """Axes that have an effect on a burst alone."""
+        """Find the axes that have an effect on a burst alone."""
         rng = np.random.default_rng(2)
         light = self.light_at(self.redshift[:1])
         effective = {}
         for name, values in axes.items():
-            row = {other: float(rng.choice(nodes)) for other, nodes in axes.items()}
+            row = {parameter: float(rng.choice(nodes)) for parameter, nodes in axes.items()}
             rows = [row | {name: float(value)} for value in values]
             flux = self._starlight(light, rows, top)[0]
             flux = flux - (1.0 - top) * self._starlight(light, rows)[0]

@@ -4,16 +4,17 @@ import numpy as np
 
 #: Sweeps over all places, in each of which half of them are moved, then the other half.
 N_SWEEPS = 100
-#: Most parts of the difference of two places that a third is moved by, over the best for normal distributions; how
-#: often it is moved by the whole difference, from one peak to another; and by how much more.
-_SHORTEST = 0.4
-_WHOLE = 0.1
+#: Smallest step, a part of the difference of two places, over the one that is best for normal distributions.
+_MIN_PART = 0.4
+#: Share of steps by the whole difference, from one peak to another.
+_WHOLE_SHARE = 0.1
+#: Standard deviation of what is added to each step.
 _JITTER = 1e-4
 #: Number of places, over that of their axes, below which a group is not moved.
-_LEAST_OF_AXES = 4
+_MIN_PLACES_PER_AXIS = 4
 
 
-def move_places(evaluate, group, active, score, known, place, seed):
+def move_places(evaluate, group, active, score, evaluated, place, seed):
     """
     Move places to the posterior in their labels by differential evolution.
 
@@ -30,46 +31,47 @@ def move_places(evaluate, group, active, score, known, place, seed):
         Groups of the places, of one label each.
     active : `~numpy.ndarray` of bool, shape (n, n_axes)
         Axes that have an effect.
-    score, known, place : `~numpy.ndarray`, shapes (n, n_axes), (n, 5) and (n, n_axes)
-        Scores, what is known of them, and places in unit intervals; they change.
+    score, evaluated, place : `~numpy.ndarray`, shapes (n, n_axes), (n, 5) and (n, n_axes)
+        Scores, what `_core.evaluate_places` says of them, and places in unit intervals; they change.
     seed : int
         Seed of the moves.
     """
     rng = np.random.default_rng(seed)
     n = len(group)
     n_active = active.sum(axis=1)
+    # step of the highest efficiency for normal distributions (ter Braak 2006)
     best = 2.38 / np.sqrt(2.0 * np.maximum(n_active, 1))
     size = np.bincount(group)
-    movable = size[group] >= _LEAST_OF_AXES * (n_active + 1)
+    movable = size[group] >= _MIN_PLACES_PER_AXIS * (n_active + 1)
     for _ in range(N_SWEEPS):
         order = np.lexsort([rng.random(n), group])
         order = order[movable[order]]
         for parity in (0, 1):
             rows = order[parity::2]
-            others = order[1 - parity :: 2]
-            first = _others_of_group(group, rows, others, rng)
-            second = _others_of_group(group, rows, others, rng)
-            factor = best[rows] * (_SHORTEST + (1.0 - _SHORTEST) * rng.random(rows.size))
-            factor[rng.random(rows.size) < _WHOLE] = 1.0
+            partners = order[1 - parity :: 2]
+            first = _partners_of_group(group, rows, partners, rng)
+            second = _partners_of_group(group, rows, partners, rng)
+            factor = best[rows] * (_MIN_PART + (1.0 - _MIN_PART) * rng.random(rows.size))
+            factor[rng.random(rows.size) < _WHOLE_SHARE] = 1.0
             change = factor[:, None] * (score[first] - score[second])
             change += _JITTER * rng.standard_normal(change.shape)
             new = score[rows] + np.where(active[rows], change, 0.0)
-            known_new, place_new = evaluate(rows, new)
-            accepted = np.log(rng.random(rows.size)) < known_new[:, 0] - known[rows, 0]
+            evaluated_new, place_new = evaluate(rows, new)
+            accepted = np.log(rng.random(rows.size)) < evaluated_new[:, 0] - evaluated[rows, 0]
             rows = rows[accepted]
             score[rows] = new[accepted]
-            known[rows] = known_new[accepted]
+            evaluated[rows] = evaluated_new[accepted]
             place[rows] = place_new[accepted]
 
 
-def _others_of_group(group, rows, others, rng):
-    """One of ``others``, which are sorted by group, of the same group for each of the rows."""
-    start = np.searchsorted(group[others], group[rows], "left")
-    end = np.searchsorted(group[others], group[rows], "right")
-    return others[start + (rng.random(rows.size) * (end - start)).astype(int)]
+def _partners_of_group(group, rows, partners, rng):
+    """Choose one of ``partners``, which are sorted by group, of the same group for each of the rows."""
+    start = np.searchsorted(group[partners], group[rows], "left")
+    end = np.searchsorted(group[partners], group[rows], "right")
+    return partners[start + (rng.random(rows.size) * (end - start)).astype(int)]
 
 
 def systematic(weight, n):
-    """Indices of n places in proportion to weights, as equally as can be."""
+    """Choose n places in proportion to weights (systematic resampling): their indices."""
     upto = np.cumsum(weight)
     return np.searchsorted(upto, (np.arange(n) + 0.5) * upto[-1] / n)

@@ -13,14 +13,15 @@ _POWERS = (1.0, 0.5, 0.125, -0.5, -1.0)
 _DARK = 1e-12
 #: Fluxes below this part of it do not count when a table is refined.
 _FAINT = 1e-3
-#: Least number whose logarithm is interpolated.
+#: Smallest number whose logarithm is interpolated.
 LEAST = 1e-290
 #: Largest relative error of the interpolation along one axis for 95 % of fluxes.
 TOLERANCE = 0.005
-#: Most models of one table.
+#: Largest number of models of one table.
 MAX_MODELS = 6144
-#: Lines along which an axis is refined, and most times that a cell is halved.
+#: Number of lines along which an axis is refined.
 _N_LINES = 24
+#: Largest number of times that a cell is halved.
 _MAX_HALVINGS = 6
 
 
@@ -35,21 +36,21 @@ def logarithms(flux, columns, redshift):
 
 
 def to_scale(value, power):
-    """Values on the scale of their axis."""
+    """Transform values to the scale of their axis: sign(p) v^p."""
     if power == 1.0:
         return np.asarray(value, float)
     return np.sign(power) * np.power(value, power)
 
 
 def from_scale(value, power):
-    """Values from those on the scale of their axis."""
+    """Transform values back from the scale of their axis."""
     if power == 1.0:
         return value
     return np.power(np.sign(power) * value, 1.0 / power)
 
 
 def _possible_powers(values):
-    """Scales that an axis of these values may have."""
+    """List the scales that an axis of these values may have."""
     if len(values) < 3 or values[0] < 0:
         return (1.0,)
     if values[0] == 0:
@@ -58,7 +59,7 @@ def _possible_powers(values):
 
 
 def _bend(table, x):
-    """How far, on average, middle nodes along the first axis of a table are off lines between their neighbors."""
+    """Measure how far middle nodes along the first axis are off lines between their neighbors, on average."""
     bend = 0.0
     for i in range(1, len(x) - 1):
         t = (x[i] - x[i - 1]) / (x[i + 1] - x[i - 1])
@@ -71,7 +72,7 @@ def _bend(table, x):
 
 
 def straightest_power(values, table):
-    """Power whose scale makes a table, first axis along the values, straightest."""
+    """Find the power whose scale makes a table, first axis along the values, straightest."""
     powers = _possible_powers(values)
     bends = [_bend(table, to_scale(values, power)) for power in powers]
     return powers[int(np.argmin(bends))]
@@ -79,7 +80,7 @@ def straightest_power(values, table):
 
 def make_part(names, axes, powers, table, redshift, place, model=None):
     """
-    `_core.Part` of a table of logarithms (n_models, nz, n_columns).
+    Make the `_core.Part` of a table of logarithms (n_models, nz, n_columns).
 
     ``axes`` and ``powers`` are values and scales by name; ``place`` says where each name stands among the
     parameters; ``model`` are the models of all combinations, all in order if it is None.
@@ -105,7 +106,7 @@ def make_part(names, axes, powers, table, redshift, place, model=None):
 
 def _single(table):
     """
-    A table in single precision, (nz, n_models, n_columns), and the offset of each column that is taken from it.
+    Convert a table to single precision, (nz, n_models, n_columns), with an offset of each column taken from it.
 
     Places of an object lie at few redshifts: models of one redshift next to each other fit in a cache.
     """
@@ -117,24 +118,24 @@ def _single(table):
 
 
 def empty_part(n_columns, n_z=1):
-    """`_core.Part` of a part that there is not."""
+    """Make a `_core.Part` without models."""
     table = np.zeros((0, n_z, n_columns))
     return make_part((), {}, {}, table, np.arange(n_z, dtype=float), {})
 
 
 def with_columns(part, table):
-    """A `_core.Part` of the same models with other columns (n_models, k), which do not depend on redshift."""
+    """Return a `_core.Part` of the same models with columns (n_models, k) that do not depend on redshift."""
     table, offset = _single(np.asarray(table, float)[:, None])
     return part._replace(table=table, offset=offset, log_z=np.zeros(1))
 
 
 def part_columns(part, values):
-    """Columns of a part that do not depend on redshift, (n, n_columns)."""
+    """Interpolate columns of a part that do not depend on redshift, (n, n_columns)."""
     return np.exp(log_part_columns(part, values))
 
 
 def log_part_columns(part, values):
-    """Columns of a part, as they are in its table, (n, n_columns)."""
+    """Interpolate columns of a part as they are in its table: logarithms, (n, n_columns)."""
     n = len(values)
     out = np.empty((n, part.table.shape[2]))
     work = _core.make_work(values.shape[1], part.table.shape[2])
@@ -175,7 +176,7 @@ class PartAxes:
     powers: dict | None = None
 
     def rows(self, axes):
-        """All combinations of values of axes, the last one fastest: list of dicts."""
+        """List all combinations of values of axes, the last one fastest: list of dicts."""
         return [
             dict(zip(axes, map(float, row), strict=True))
             for row in itertools.product(*axes.values())
@@ -183,19 +184,20 @@ class PartAxes:
 
     def refined(self, light):
         """
-        Axes whose cells are halved where that helps most for its size, and the powers of their scales.
+        Halve cells of axes where that helps most for its size; return values of axes and powers of their scales.
 
-        Until the interpolation is good along each of them, or there are as many combinations as a table may have.
+        This ends when the interpolation is good along each of them, or there are as many combinations as a table
+        may have.
         """
         axes = {name: _RefinedAxis(self, name, light) for name in self.axes}
-        most = max(self.max_models, _n_combinations(self.axes))
+        max_models = max(self.max_models, _n_combinations(self.axes))
         open_axes = set(axes)
         while open_axes:
             name = max(sorted(open_axes), key=lambda name: axes[name].urgency)
             axis = axes[name]
-            sizes = {other: len(axes[other].values) for other in axes}
+            sizes = {parameter: len(axes[parameter].values) for parameter in axes}
             sizes[name] += axis.n_splits
-            too_many = np.prod(list(sizes.values())) > most
+            too_many = np.prod(list(sizes.values())) > max_models
             if axis.error <= self.tolerance or too_many:
                 open_axes.remove(name)
             else:
@@ -241,9 +243,9 @@ class _RefinedAxis:
         lines = set()
         for _ in range(_N_LINES):
             line = [
-                (other, float(rng.choice(nodes)))
-                for other, nodes in part.axes.items()
-                if other != name
+                (parameter, float(rng.choice(nodes)))
+                for parameter, nodes in part.axes.items()
+                if parameter != name
             ]
             lines.add(tuple(line))
         self._lines = [dict(line) for line in sorted(lines)]
@@ -260,13 +262,13 @@ class _RefinedAxis:
         return self._mean_error / np.log1p(self.n_splits / len(self.values))
 
     def _evaluate(self, nodes):
-        """Logarithms at nodes of all lines: (n_nodes, n_lines, nz, n_columns)."""
+        """Evaluate logarithms at nodes of all lines: (n_nodes, n_lines, nz, n_columns)."""
         rows = [line | {self.name: float(node)} for node in nodes for line in self._lines]
         logs = self.part.evaluate(self.light, rows)
         return logs.reshape(len(nodes), len(self._lines), *logs.shape[1:])
 
     def _measure(self):
-        """Errors in the middles of the cells that can be halved."""
+        """Measure errors in the middles of the cells that can be halved."""
         if self.part.powers is None:
             self.power = straightest_power(self.values, self._table)
         else:
@@ -308,7 +310,7 @@ class _RefinedAxis:
         self._measure()
 
     def _errors(self):
-        """95th percentile of the relative errors in each of the middles."""
+        """Compute the 95th percentile of the relative errors in each of the middles."""
         n_lines, n_z, n_columns = self._table.shape[1:]
         n_bands = min(self.light.n_bands, n_columns)
         redshift = self.light.redshift
@@ -334,7 +336,7 @@ class _RefinedAxis:
 
 
 def finer_redshifts(redshift, step):
-    """Redshifts with cells divided until no step in ln(1 + z) is larger."""
+    """Divide cells of redshifts until no step in ln(1 + z) is larger."""
     log_z = np.log1p(np.asarray(redshift, float))
     nodes = [log_z[:1]]
     for low, high in itertools.pairwise(log_z):

@@ -7,20 +7,25 @@ import numpy as np
 from miricigale.fitting import _core
 
 #: Weight, over that of its peak, below which no part is fitted.
-LEAST_WEIGHT = 1e-3
-#: Effective number of points for each part that is fitted, most parts, and rounds of the fit.
+MIN_WEIGHT = 1e-3
+#: Effective number of points for each part that is fitted.
 _POINTS_EACH = 50
-_MOST_PARTS = 3
+#: Largest number of parts of a group.
+_MAX_PARTS = 3
+#: Rounds of the fit.
 _FIT_ROUNDS = 4
-#: Share of wide parts, of the mean and this times the covariance of all places of a peak, in all labels.
+#: Share of wide parts in all labels.
 _WIDE_SHARE = 0.2
+#: Their covariance over that of all places of a peak.
 _WIDE_SQUARE = 1.4
-#: What widths are multiplied by.
+#: Factor by which widths of fitted parts are enlarged.
 _WIDER = 1.1
-#: Share of narrow parts where weights are large, in groups of at least this weight; places that one is fitted to.
+#: Share of narrow parts where weights are large.
 _LOCAL_SHARE = 0.5
-_LOCAL_LEAST = 0.03
-_NEAR = 120
+#: Smallest weight of the groups that have narrow parts.
+_MIN_LOCAL_WEIGHT = 0.03
+#: Number of places that a narrow part is fitted to.
+_N_NEAR = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +70,15 @@ class FittedParts:
     group: np.ndarray
 
     def possible(self, share):
-        """Shares, which sum to 1, of the labels and peaks that have parts."""
-        some = np.bincount(self.group, minlength=len(share)) > 0
-        share = np.where(some, share, 0.0)
+        """Normalize the shares of the labels and peaks that have parts."""
+        has_parts = np.bincount(self.group, minlength=len(share)) > 0
+        share = np.where(has_parts, share, 0.0)
         return share / share.sum()
 
     def shared(self, share):
-        """Mixture in which labels and peaks have shares, of any sum: `~miricigale.fitting._core.Parts`."""
-        own = self.kernel.share * share[self.group]
-        return self.kernel._replace(share=own / own.sum())
+        """Make the mixture in which labels and peaks have shares: `~miricigale.fitting._core.Parts`."""
+        part_share = self.kernel.share * share[self.group]
+        return self.kernel._replace(share=part_share / part_share.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +156,7 @@ def fit_mixture(labels, n_peaks, places, n_local=0):
 
 
 def _groups(labels, n_peaks, places, n_local):
-    """Labels in peaks that places have weight in: list of `_Group`, by label."""
+    """List the labels in peaks that places have weight in: `_Group`, by label."""
     n_labels = len(labels.n_active)
     index = places.label * n_peaks + places.peak
     n_groups = n_labels * n_peaks
@@ -171,11 +176,11 @@ def _groups(labels, n_peaks, places, n_local):
             k = label * n_peaks + peak
             rows = order[ends[k] : ends[k + 1]]
             n_fitted = 0
-            if flat[label, peak] > LEAST_WEIGHT * of_peak[peak]:
+            if flat[label, peak] > MIN_WEIGHT * of_peak[peak]:
                 effective = _effective_number(places.flat[rows])
-                n_fitted = int(np.clip(effective / _POINTS_EACH, 1, _MOST_PARTS))
+                n_fitted = int(np.clip(effective / _POINTS_EACH, 1, _MAX_PARTS))
             n_narrow = n_local
-            if share[label, peak] < _LOCAL_LEAST or rows.size < _NEAR:
+            if share[label, peak] < _MIN_LOCAL_WEIGHT or rows.size < _N_NEAR:
                 n_narrow = 0
             group = _Group(label, peak, rows, first, n_fitted, n_narrow)
             groups.append(group)
@@ -184,16 +189,17 @@ def _groups(labels, n_peaks, places, n_local):
 
 
 def _moments_of_peaks(places):
-    """Mean and covariance of the places of each peak: dict; of axes without effect too, for labels with them."""
+    """Compute mean and covariance of the places of each peak, by peak; of axes without effect too."""
     n_axes = places.score.shape[1]
-    _, every = _mean_and_cov(places.score, places.flat)
+    _, global_cov = _mean_and_cov(places.score, places.flat)
     moments = {}
     for peak in np.unique(places.peak[places.flat > 0]):
         rows = np.flatnonzero((places.peak == peak) & (places.flat > 0))
         flat = places.flat[rows]
         mean, cov = _mean_and_cov(places.score[rows], flat)
-        few = n_axes / (n_axes + _effective_number(flat))
-        moments[peak] = (mean, (1.0 - few) * cov + few * every)
+        # few places say little of a covariance: it is drawn to that of all peaks
+        shrinkage = n_axes / (n_axes + _effective_number(flat))
+        moments[peak] = (mean, (1.0 - shrinkage) * cov + shrinkage * global_cov)
     return moments
 
 
@@ -230,18 +236,18 @@ def _add_local_parts(labels, parts, group, places):
     )
     points = (places.score[rows], weight / weight.sum(), target)
     counts = (group.first, group.n_fitted + 1, group.n_local)
-    _core.add_local_parts(labels, parts, *counts, _LOCAL_SHARE, _NEAR, _WIDER, points, scratch)
+    _core.add_local_parts(labels, parts, *counts, _LOCAL_SHARE, _N_NEAR, _WIDER, points, scratch)
 
 
 def _mean_and_cov(score, weight):
-    """Mean and covariance of places with weights."""
+    """Compute mean and covariance of places with weights."""
     weight = weight / weight.sum()
     mean = weight @ score
-    apart = score - mean
-    cov = (apart * weight[:, None]).T @ apart + 1e-6 * np.eye(score.shape[1])
+    deviation = score - mean
+    cov = (deviation * weight[:, None]).T @ deviation + 1e-6 * np.eye(score.shape[1])
     return mean, cov
 
 
 def _effective_number(weight):
-    """Effective number of weights."""
+    """Compute the effective number of weights (Kish 1965)."""
     return weight.sum() ** 2 / np.sum(weight * weight)
