@@ -45,14 +45,15 @@ class Continuation(Frozen):
     @cached_property
     def axes(self):
         """`GridAxis` of redshift, AGN fraction, galaxies and AGN, in this order: dict by name."""
-        known, grid = self.engine.priors.axes, self.engine.grid
-        out = {}
+        prior_axes = self.engine.priors.axes
+        grid = self.engine.grid
+        axes = {}
         for name, values in (("redshift", grid.redshift), ("frac_agn", grid.frac_agn)):
             equal = np.full(values.size, 1.0 / values.size)
-            out[name] = known.get(name) or GridAxis(name, values, 1, name, equal)
+            axes[name] = prior_axes.get(name) or GridAxis(name, values, 1, name, equal)
         for kind in ("galaxy", "agn"):
-            out |= {name: axis for name, axis in known.items() if axis.kind == kind}
-        return out
+            axes |= {name: axis for name, axis in prior_axes.items() if axis.kind == kind}
+        return axes
 
     @cached_property
     def _models(self):
@@ -71,9 +72,11 @@ class Continuation(Frozen):
         size = np.array([axis.values.size for axis in axes], np.int64)
         low, high, log_prior = np.zeros((3, len(size), max(size)))
         for i, axis in enumerate(axes):
-            n, values = size[i], axis.values
-            # none beyond the outermost
-            low[i, :n], high[i, :n] = np.clip(axis.cells(), values[0], values[-1])
+            n = size[i]
+            # no cell reaches beyond the outermost nodes
+            cells = np.clip(axis.cells(), axis.values[0], axis.values[-1])
+            low[i, :n] = cells[0]
+            high[i, :n] = cells[1]
             if axis.kind in ("frac_agn", "agn"):
                 log_prior[i, :n] = log_weights(axis.weights)
         galaxy = self._models["galaxy"]
@@ -87,32 +90,33 @@ class Continuation(Frozen):
 
     @cached_property
     def labels_at_redshift(self):
-        """The same where it is known: redshift is then no axis."""
+        """`LabelTable` of objects whose redshift is known: redshift is then no axis."""
         return self.labels.without_first_axis()
 
     @cached_property
     def _without_effect(self):
-        """Which axes (columns) have no effect where what others (rows) measure is absent: (n_axes, n_axes)."""
+        """Find axes (columns) without effect where the component of others (rows) is absent: (n_axes, n_axes)."""
         axes = list(self.axes.values())
         out = np.zeros((len(axes), len(axes)), bool)
         for kind in ("galaxy", "agn"):
-            own = [i for i, axis in enumerate(axes) if axis.kind == kind]
+            of_kind = [i for i, axis in enumerate(axes) if axis.kind == kind]
             model = self._models[kind]
-            for k, i in enumerate(own):
+            for k, i in enumerate(of_kind):
                 if not axes[i].absent_at_zero:
                     continue
                 absent = model.take([0], axis=k)
-                for m, j in enumerate(own):
+                for m, j in enumerate(of_kind):
                     first = absent.take([0], axis=m)
-                    out[i, j] = j != i and self._same(kind, absent, first)
+                    out[i, j] = j != i and self._have_same_flux(kind, absent, first)
         out[1, [axis.kind == "agn" for axis in axes]] = True
         return out
 
-    def _same(self, kind, models, first):
-        """Whether models have the fluxes of others, which broadcast; where both are there."""
-        both = (models >= 0) & (first >= 0)
+    def _have_same_flux(self, kind, models, first):
+        """Whether models have the fluxes of others, which broadcast, where both exist."""
+        exist = (models >= 0) & (first >= 0)
         a, b = np.broadcast_arrays(models, first)
-        a, b = a[both], b[both]
+        a = a[exist]
+        b = b[exist]
         if kind == "galaxy":
             dust = self.engine.grid.dust_luminosity
             if not np.allclose(dust[a], dust[b], rtol=_SAME_FLUX, atol=0):
@@ -130,17 +134,15 @@ class Continuation(Frozen):
     @cached_property
     def _values(self):
         """Values of the models of the grid by kind: dicts by name; of those with several values the first."""
-        out = {}
-        axes = self.engine.priors.axes
-        for kind in ("galaxy", "agn"):
-            names = [name for name, axis in axes.items() if axis.kind == kind]
-            # of models that stand for several values the first
-            first = [axes[name].share.argmax(axis=0) for name in names]
-            out[kind] = {name: axes[name].values[i] for name, i in zip(names, first, strict=True)}
-        return out
+        values = {"galaxy": {}, "agn": {}}
+        for name, axis in self.engine.priors.axes.items():
+            if axis.kind in values:
+                # of models that stand for several values the first
+                values[axis.kind][name] = axis.values[axis.share.argmax(axis=0)]
+        return values
 
     def at_redshift(self, redshift, node):
-        """`GridEngine` of all models of the grid at one redshift; what else depends on it is that of a node."""
+        """Return a `GridEngine` of all models at one redshift; priors and template errors are those of a node."""
         engine = self.engine
         new = {"usable": engine.usable[node : node + 1]}
         for kind, values in self._values.items():
@@ -155,7 +157,8 @@ class Continuation(Frozen):
                 new[kind] = np.where(exists[:, None], flux, 0.0)[None]
             else:
                 new[kind] = self.models.agn_fluxes(values, z)[None]
-        density, prior = engine.density, engine.mass_prior
+        density = engine.density
+        prior = engine.mass_prior
         new["template_error"] = engine.template_error[node : node + 1]
         if density is not None:
             new["density"] = replace(density, table=density.table[node : node + 1])
@@ -237,15 +240,19 @@ class Continuation(Frozen):
         posteriors[known.row] = models and self._describe(models, one, known, nuclei)
 
     def _cells_of(self, drawn):
-        """Nodes of the axes of draws from the posterior on nodes: (n, n_axes)."""
+        """Find the nodes of the axes of draws from the posterior on nodes: (n, n_axes)."""
         z, g, k, f = drawn.T
         columns = []
         for axis in self.axes.values():
-            if axis.share is None:
-                columns.append(z if axis.kind == "redshift" else f)
+            if axis.kind == "redshift":
+                columns.append(z)
+            elif axis.kind == "frac_agn":
+                columns.append(f)
+            elif axis.kind == "galaxy":
+                columns.append(axis.share.argmax(axis=0)[g])
             else:
-                node = axis.share.argmax(axis=0)
-                columns.append(node[g if axis.kind == "galaxy" else np.maximum(k, 0)])
+                # without AGN light the draw has no AGN model
+                columns.append(axis.share.argmax(axis=0)[np.maximum(k, 0)])
         return np.stack(columns, axis=1)
 
     def _mixture(self, bands, stated, sigma, broad):
@@ -258,16 +265,16 @@ class Continuation(Frozen):
         return _core.Mixture(narrow, wide**-2.0, odds, level, np.zeros(len(broad)))
 
     def index_of_nodes(self, node):
-        """Redshift, galaxy, AGN model and fraction of nodes of the axes, (n, n_axes): (n, 4), -1 for none."""
+        """Find redshift, galaxy, AGN model and fraction of nodes of the axes, (n, n_axes): (n, 4), -1 for none."""
         index = np.full((len(node), 4), -1)
         index[:, 0] = node[:, 0]
         index[:, 3] = node[:, 1]
         kinds = np.array([axis.kind for axis in self.axes.values()])
         for column, kind in ((1, "galaxy"), (2, "agn")):
             models = self._models[kind]
-            own = node[:, kinds == kind]
-            if own.shape[1]:
-                index[:, column] = models[tuple(own.T)]
+            kind_node = node[:, kinds == kind]
+            if kind_node.shape[1]:
+                index[:, column] = models[tuple(kind_node.T)]
             else:
                 index[:, column] = models.ravel()[0]
         without_agn = self.engine.grid.frac_agn[node[:, 1]] == 0.0
@@ -333,15 +340,16 @@ class Continuation(Frozen):
         return nuclei.extended(flux, agn)
 
     def _derived(self, values, models, scale):
-        """Derived quantities by name, shape (n,), of models with scales (n,)."""
+        """Derive quantities by name, shape (n,), of models with scales (n,)."""
         return self.models.describe(values, values["redshift"], models.power, scale)
 
     def _best(self, values, models, best):
-        """Parameters and derived quantities of the best model: dict of str to float."""
+        """Collect parameters and derived quantities of the best model: dict of str to float."""
         row = slice(best, best + 1)
-        own = {name: value[row] for name, value in values.items()}
-        derived = self.models.describe(own, own["redshift"], models.power[row], models.scale[row])
-        out = {name: float(value[0]) for name, value in (own | derived).items()}
+        parameters = {name: value[row] for name, value in values.items()}
+        z = parameters["redshift"]
+        derived = self.models.describe(parameters, z, models.power[row], models.scale[row])
+        out = {name: float(value[0]) for name, value in (parameters | derived).items()}
         if not out["frac_agn"] > 0:
             # without AGN light there is no template
             for name, axis in self.axes.items():
@@ -397,7 +405,7 @@ class BetweenPosterior:
 
 
 def _chi2(target, limits, z, flux):
-    """Chi2 of the fluxes of a model, with errors at a node of redshift."""
+    """Compute chi2 of the fluxes of a model, with errors at a node of redshift."""
     chi2 = np.sum(target.weight[z] * np.square(target.flux - flux))
     if limits is not None:
         faint = limits.level - flux[limits.bands] * limits.inverse

@@ -24,14 +24,14 @@ _SAFETY = 0.1
 _TAIL = 10.0
 #: Part of ``rtol`` times its share below which a pair adds nothing to the scatter of fluxes.
 _THIN = 1e-4
-#: Least ``rtol``, unless it is 0, of fits with wrong bands.
-_LOOSE = 1e-3
+#: Smallest ``rtol``, unless it is 0, of fits with wrong bands.
+_MIN_MIXTURE_RTOL = 1e-3
 #: Best chi2 over the number of bands above which nodes are too coarse for the errors of the data.
-_EXCESS = 2.0
-#: Least ``rtol`` with which pairs of little weight are evaluated in single precision.
+_MAX_EXCESS = 2.0
+#: Smallest ``rtol`` with which pairs of little weight are evaluated in single precision.
 _SINGLE = 5e-7
-#: Least variance of a scale.
-_TINY = 1e-290
+#: Smallest variance of a scale.
+_MIN_VARIANCE = 1e-290
 
 
 #: What a fit of n objects returns, by the axes of each array after that of the objects.
@@ -125,8 +125,10 @@ class GridEngine(Frozen):
 
     @property
     def _rtol(self):
+        if self.mixture is None or self.rtol == 0:
+            return self.rtol
         # with wrong bands more redshifts matter, and tangents are not as good as that
-        return self.rtol if self.mixture is None or self.rtol == 0 else max(self.rtol, _LOOSE)
+        return max(self.rtol, _MIN_MIXTURE_RTOL)
 
     @cached_property
     def _tables(self):
@@ -142,25 +144,38 @@ class GridEngine(Frozen):
         padded[:, :n_galaxy] = self.galaxy
         tiles = _core.aligned(n_z, n_padded // block, n_bands, block)
         tiles[:] = padded.reshape(n_z, -1, block, n_bands).transpose(0, 1, 3, 2)
-        unit, agn_unit = _unit(self.galaxy), _unit(self.agn)
+        unit = _unit(self.galaxy)
+        agn_unit = _unit(self.agn)
         padded[:, :n_galaxy] /= unit
         galaxy32 = _core.aligned(n_z, n_bands, n_padded, dtype=np.float32)
         galaxy32[:] = padded.transpose(0, 2, 1)
-        priors, known = self.priors, self.quantities
-        dust, frac = self.grid.dust_luminosity, self.grid.frac_agn
+        priors = self.priors
+        quantities = self.quantities
+        dust = self.grid.dust_luminosity
+        frac = self.grid.frac_agn
         log_galaxy = _two_log(priors.galaxy / priors.galaxy.sum())
         log_usable = np.full((n_z, n_padded), -1e300)
         log_usable[:, :n_galaxy] = np.where(self.usable, log_galaxy, -1e300)
-        of, n_agn = known.fraction, self.agn.shape[1]
-        shares = (np.zeros(n_galaxy), np.zeros(n_agn)) if of is None else (of.galaxy, of.agn)
+        n_agn = self.agn.shape[1]
+        galaxy_share = np.zeros(n_galaxy)
+        agn_share = np.zeros(n_agn)
+        if quantities.fraction is not None:
+            galaxy_share = quantities.fraction.galaxy
+            agn_share = quantities.fraction.agn
         log_dust = np.log10(dust, where=dust > 0, out=np.full(n_galaxy, -400.0))
         of_galaxy = np.zeros((4, n_padded))
-        of_galaxy[:, :n_galaxy] = (dust, log_dust, shares[0], known.mixed_galaxy)
+        of_galaxy[:, :n_galaxy] = (dust, log_dust, galaxy_share, quantities.mixed_galaxy)
         of_agn = np.zeros((3, max(n_agn, 1)))
-        of_agn[:, :n_agn] = (_two_log(self._agn_prior), shares[1], known.mixed_agn)
+        of_agn[:, :n_agn] = (_two_log(self._agn_prior), agn_share, quantities.mixed_agn)
         prior_frac = priors.frac / priors.frac.sum()
         log_frac = _two_log(prior_frac)
-        ratio, edge = _ratio(frac), _ratio(cell_edges(frac, (0.0, 1.0)))
+        ratio = _ratio(frac)
+        edge = _ratio(cell_edges(frac, (0.0, 1.0)))
+        prior_zero = 0.0
+        log_zero = -1e300
+        if self._zero_frac:
+            prior_zero = float(prior_frac[0])
+            log_zero = float(log_frac[0])
         above = frac > 0
         log_ratio = np.log10(ratio, where=above, out=np.zeros(ratio.size)) * _core.PER_DEX
         of_frac = np.array([ratio, log_ratio, prior_frac, log_frac, edge[:-1], edge[1:]])
@@ -177,11 +192,11 @@ class GridEngine(Frozen):
             of_agn=of_agn,
             of_frac=np.array(of_frac[:, above], order="C"),
             zero_frac=int(self._zero_frac),
-            prior_zero=float(prior_frac[0]) if self._zero_frac else 0.0,
-            log_zero=float(log_frac[0]) if self._zero_frac else -1e300,
+            prior_zero=prior_zero,
+            log_zero=log_zero,
             edge_zero=float(edge[1]),
             log_top_pair=float(of_agn[0].max() + log_frac[above].max(initial=-1e300)),
-            share_mean=float(self._agn_prior @ shares[1]),
+            share_mean=float(self._agn_prior @ agn_share),
         )
 
     @property
@@ -194,10 +209,13 @@ class GridEngine(Frozen):
 
     @cached_property
     def _scales(self):
-        known, n_agn = self.quantities, self.agn.shape[1]
-        agn = np.zeros((len(known.agn_scale) + 1, max(n_agn, 1)))
-        agn[:, :n_agn] = np.vstack([known.agn_scale, known.mixed_agn])
-        return _core.make_scales(np.vstack([known.galaxy_scale, known.mixed_galaxy]), agn)
+        quantities = self.quantities
+        n_agn = self.agn.shape[1]
+        galaxy = np.vstack([quantities.galaxy_scale, quantities.mixed_galaxy])
+        # the kernels take one AGN model at least
+        agn = np.zeros((len(quantities.agn_scale) + 1, max(n_agn, 1)))
+        agn[:, :n_agn] = np.vstack([quantities.agn_scale, quantities.mixed_agn])
+        return _core.make_scales(galaxy, agn)
 
     @cached_property
     def _tangents(self):
@@ -254,15 +272,24 @@ class GridEngine(Frozen):
         """
         n, n_bands = flux.shape
         data = np.where(np.isfinite(sigma), flux, 0.0)
-        inverse = np.zeros((n, n_bands)) if limit is None else 1.0 / limit_sigma
-        limit = np.where(inverse > 0, 0.0 if limit is None else limit, 0.0)
+        if limit is None:
+            inverse = np.zeros((n, n_bands))
+            limit = np.zeros((n, n_bands))
+        else:
+            inverse = 1.0 / limit_sigma
+            limit = np.where(inverse > 0, limit, 0.0)
         log_prior = np.where(np.isfinite(log_prior), 2.0 * log_prior, -1e300)
-        seeds = np.zeros(n, np.uint64) if seeds is None else np.array(seeds, np.uint64)
+        if seeds is None:
+            seeds = np.zeros(n)
+        seeds = np.array(seeds, np.uint64)
         out = self.empty_output(n, n_draws, joint)
-        workspace = self.workspace(n_draws, joint) if workspace is None else workspace
+        if workspace is None:
+            workspace = self.workspace(n_draws, joint)
         sums = workspace[0]
         single = self._rtol >= _SINGLE
-        broad = None if self.mixture is None else self.mixture.broad(data, sigma)
+        broad = None
+        if self.mixture is not None:
+            broad = self.mixture.broad(data, sigma)
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
             given = data[i], sigma[i], log_prior[i]
             target = stated = _core.make_target(*given, self.template_error)
@@ -278,30 +305,34 @@ class GridEngine(Frozen):
             if target.norm[0] > 0.0 and _core.sum_up(*given, *workspace, single=single):
                 self._summarize(stated, target, limits, sums, out, i)
                 if broad is not None:
-                    used = np.isfinite(sigma[i]) | (inverse[i] > 0)
-                    out.outlier[i] = np.where(used, out.zf[i].sum(axis=1) @ wrong, np.nan)
+                    in_fit = np.isfinite(sigma[i]) | (inverse[i] > 0)
+                    out.outlier[i] = np.where(in_fit, out.zf[i].sum(axis=1) @ wrong, np.nan)
                 if each is not None:
-                    wrong = None if broad is None else (stated, sigma[i], broad[i])
+                    wrong = None
+                    if broad is not None:
+                        wrong = (stated, sigma[i], broad[i])
                     start = Start(out.draw_index[i], out.zf[i], False)
                     excess = out.chi2[i] / np.isfinite(sigma[i]).sum()
-                    if excess > _EXCESS:
+                    if excess > _MAX_EXCESS:
                         larger = np.sqrt(excess)
                         loose = _core.make_target(
                             data[i], larger * sigma[i], log_prior[i], larger * self.template_error
                         )
                         start = self._spread(loose, limits, workspace, single, seeds[i]) or start
                     # likelihoods of mixtures have no constant
-                    zero = 0.0 if broad is not None else -0.5 * target.top
-                    if limits is not None and broad is None:
-                        zero -= 0.5 * limits.dark
-                    known = ObjectOnNodes(i, of_all, limits, None, wrong, start, log_norm, zero)
+                    zero = 0.0
+                    if broad is None:
+                        zero = -0.5 * target.top
+                        if limits is not None:
+                            zero -= 0.5 * limits.dark
+                    on_nodes = ObjectOnNodes(i, of_all, limits, None, wrong, start, log_norm, zero)
                     if self.mass_prior is not None:
-                        known = known._replace(target=target, log_usable=tables.log_usable)
-                    each(known)
+                        on_nodes = on_nodes._replace(target=target, log_usable=tables.log_usable)
+                    each(on_nodes)
         return out
 
     def empty_output(self, n, n_draws=0, joint=()):
-        """`GridOutput` of n objects that were not fitted; arguments as of `fit`."""
+        """Make the `GridOutput` of n objects that were not fitted; arguments as of `fit`."""
         # the galaxy's, the AGN model's and the sum of both
         n_quantities = len(self._scales.galaxy) + len(self._scales.agn) - 1
         n_bands = self.galaxy.shape[2]
@@ -311,17 +342,18 @@ class GridEngine(Frozen):
         def empty(axes, value):
             return np.full((n, *map(size.get, axes)), value)
 
-        return GridOutput(
-            *(empty(axes, -1 if "index" in name else np.nan) for name, axes in _AXES.items()),
-            joint={name: empty(name, np.nan) for name in joint},
-        )
+        arrays = {name: empty(axes, np.nan) for name, axes in _AXES.items()}
+        for name in arrays:
+            if "index" in name:
+                arrays[name] = empty(_AXES[name], -1)
+        return GridOutput(**arrays, joint={name: empty(name, np.nan) for name in joint})
 
     def _spread(self, target, limits, workspace, single, seed):
         """
-        `Start` by the posterior of data with larger errors; None if no model is possible.
+        Make a `Start` of the posterior of data with larger errors; None if no model is possible.
 
         Where errors are small against the differences of nodes, the posterior on nodes is that of a node that
-        happens to be near, and what lies in the cells of others is to be found.
+        happens to be near, and misses models in the cells of other nodes.
         """
         sums = workspace[0]
         tables, target, _ = self._of_masses(target, workspace[2])
@@ -334,15 +366,17 @@ class GridEngine(Frozen):
 
     def _of_masses(self, target, space):
         """
-        Tables and data with the priors of galaxies, and of redshifts, at the masses that an object has.
+        Put the priors of mass into tables and data: priors of galaxies and redshifts at the masses of an object.
 
         The third is ln of the factor that keeps the sum of a mass function's priors.
         """
         tables = self._tables
         log_norm = 0.0
         if self.density is not None:
-            change, out = np.empty(target.log_prior.size), np.empty(tables.log_usable.shape)
-            table, stars = self.density.table, np.zeros(out.shape[1])
+            change = np.empty(target.log_prior.size)
+            out = np.empty(tables.log_usable.shape)
+            table = self.density.table
+            stars = np.zeros(out.shape[1])
             stars[: self.size["g"]] = self.density.log_stars
             per_dex = self.density.per_dex
             _core.weigh_masses(tables, target, space.pq, stars, table, per_dex, out, change)
@@ -355,32 +389,37 @@ class GridEngine(Frozen):
             target = target._replace(log_prior=log_prior)
         if self.mass_prior is None:
             return tables, target, log_norm
-        log, n_galaxy = tables.log_usable.copy(), self.size["g"]
+        log = tables.log_usable.copy()
+        n_galaxy = self.size["g"]
         rows = np.flatnonzero(target.log_prior > -1e200)
-        galaxy, weight = self.galaxy[rows], target.weight[rows]
+        galaxy = self.galaxy[rows]
+        weight = target.weight[rows]
         data = np.einsum("zgb,zb->zg", galaxy, weight * target.flux)
         norm = np.einsum("zgb,zgb,zb->zg", galaxy, galaxy, weight)
         with np.errstate(divide="ignore", invalid="ignore"):
-            plain = np.where(self.usable[rows], 0.5 * log[rows, :n_galaxy], -np.inf)
+            log_prior = np.where(self.usable[rows], 0.5 * log[rows, :n_galaxy], -np.inf)
             # a scale that is not positive, or of a model without light here, is taken for 1 Msun
-            found = plain + self.mass_prior(np.fmax(data / norm, 1.0), rows)
-            # how much of the prior a redshift has is not for this factor to say
-            found += (logsumexp(plain, axis=1) - logsumexp(found, axis=1))[:, None]
-        log[rows, :n_galaxy] = np.where(found > -1e200, 2.0 * found, -1e300)
+            log_weighted = log_prior + self.mass_prior(np.fmax(data / norm, 1.0), rows)
+            # each redshift keeps its sum: this factor is a prior of galaxies given the redshift
+            log_ratio = logsumexp(log_prior, axis=1) - logsumexp(log_weighted, axis=1)
+            log_weighted += log_ratio[:, None]
+        log[rows, :n_galaxy] = np.where(log_weighted > -1e200, 2.0 * log_weighted, -1e300)
         return tables._replace(log_usable=log), target, log_norm
 
     def _summarize(self, stated, target, limits, sums, out, i):
         """Fill row i of the output."""
         total = sums.total[0]
-        z, g, k, f = out.index[i] = sums.index
-        scale = out.best_scale[i] = sums.best[1]
+        out.index[i] = sums.index
+        out.best_scale[i] = sums.best[1]
+        z, g, k, f = sums.index
+        scale = sums.best[1]
         model = scale * self.galaxy[z, g]
         frac = self.grid.frac_agn[f]
         if frac > 0:
             power = scale * self.grid.dust_luminosity[g] * frac / (1.0 - frac)
             model = model + power * self.agn[z, k]
         out.best_flux[i] = model
-        # from the residuals: |F|^2_w - R would lose digits
+        # chi2 from the residuals: |F|^2_w - R would lose digits
         chi2 = np.sum(stated.weight[z] * (target.flux - model) ** 2)
         norm = target.top
         if limits is not None:
@@ -398,12 +437,16 @@ class GridEngine(Frozen):
             agn = sums.agn[:, 0] + sums.alone.sum() * prior
             out.agn[i] = agn / agn.sum()
         mean, square = sums.band / total
-        out.band[i] = mean, np.sqrt(np.maximum(square - mean * mean, 0.0))
-        given = self._scales, sums, float(self.scale_error), DERIVED_LEVELS
-        _core.summarize(*given, out.moments[i], out.quantiles[i])
+        out.band[i, 0] = mean
+        out.band[i, 1] = np.sqrt(np.maximum(square - mean * mean, 0.0))
+        scale_error = float(self.scale_error)
+        moments = out.moments[i]
+        quantiles = out.quantiles[i]
+        _core.summarize(self._scales, sums, scale_error, DERIVED_LEVELS, moments, quantiles)
         if self.quantities.fraction is not None:
             mean, square = sums.total[4:6] / total
-            out.share[i] = mean, np.sqrt(max(square - mean * mean, 0.0))
+            out.share[i, 0] = mean
+            out.share[i, 1] = np.sqrt(max(square - mean * mean, 0.0))
             # the density in each bin, from changes of slope
             density = np.cumsum(sums.hist.share[: _core.N_SHARE])[None]
             _core.percentile_places(density, DERIVED_LEVELS, out.share_quantiles[i : i + 1])
@@ -434,8 +477,11 @@ class GridEngine(Frozen):
             best scale, as far as it is positive.
         """
         out = self.fit(flux, sigma, log_prior, n_draws=n_draws, seeds=seeds, **limits)
-        index, scale = out.draw_index, out.draw_scale[:, :, 0]
-        prior = self._agn_prior if self.agn.shape[1] else np.ones(1)
+        index = out.draw_index
+        scale = out.draw_scale[:, :, 0]
+        prior = np.ones(1)
+        if self.agn.shape[1]:
+            prior = self._agn_prior
         for i in np.flatnonzero(np.isfinite(out.chi2)):
             rng = np.random.default_rng(int(seeds[i]))
             drawn = rng.choice(prior.size, size=n_draws, p=prior)
@@ -446,13 +492,13 @@ class GridEngine(Frozen):
 
     def drawn_scale(self, scale, variance, uniform):
         """
-        Scales drawn from the Gaussians about best ones, as far as they are positive; or these themselves.
+        Draw scales from the Gaussians about best ones, as far as they are positive; or return these themselves.
 
         ``uniform``, shape (n,), are numbers above 0 and below, or equal to, 1.
         """
         if not self.scale_error:
             return scale
-        error = np.sqrt(np.maximum(variance, _TINY))
+        error = np.sqrt(np.maximum(variance, _MIN_VARIANCE))
         low = ndtr(-scale / error)
         return scale + error * ndtri(low + (1.0 - low) * uniform)
 
@@ -474,13 +520,13 @@ class GridEngine(Frozen):
 
 
 def _unit(table):
-    """Largest flux of every model, shape (nz, n, 1); 1 where there is none."""
+    """Return the largest flux of every model, shape (nz, n, 1); 1 where there is none."""
     top = table.max(axis=-1, keepdims=True, initial=0.0)
     return np.where(top > 0, top, 1.0)
 
 
 def _ratio(frac):
-    """Odds f / (1 - f), of 1 a large number."""
+    """Compute the odds f / (1 - f), of 1 a large number."""
     return frac / np.maximum(1.0 - frac, 1e-12)
 
 

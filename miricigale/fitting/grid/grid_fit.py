@@ -38,7 +38,7 @@ VANISHING_CHI2 = 1417.0
 #: Numbers of joint sums that a piece may have at once (32 MB).
 _JOINT_SIZE = 1 << 22
 #: Weight of one galaxy model, and of one redshift, above which an object is flagged.
-_ALONE = 0.95
+_ONE_NODE_WEIGHT = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +74,20 @@ class GridFit:
         outliers,
         calibration,
     ):
-        """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
+        """Set up the engine with a grid, which is made of a model, its priors and derived quantities."""
         check_choice(compat, "compat", (None, "cigale"))
         finer = settings.finer
-        interpolate = 0 if compat == "cigale" else settings.interpolate
+        interpolate = settings.interpolate
+        if compat == "cigale":
+            interpolate = 0
         grid = model
         if isinstance(model, SEDModel):
             if finer not in (None, model):
                 raise argument_error("finer", "left out when 'model' is an SEDModel", "another one")
-            grid, finer = model.grid(axes, filters), model if interpolate else None
+            grid = model.grid(axes, filters)
+            finer = None
+            if interpolate:
+                finer = model
         elif axes is not None:
             raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
         elif not isinstance(model, ModelGrid):
@@ -92,10 +97,12 @@ class GridFit:
             raise argument_error("agn_error", "0 with 'compat'", f"{settings.agn_error}")
         check_that(outliers is None or not compat, "outliers", "None with 'compat'", outliers)
         if calibration is not None:
-            known = {name: axis.values for name, axis in grid_priors(grid).axes.items()}
-            priors = calibration.grid_priors(known) | (priors or {})
+            axis_values = {name: axis.values for name, axis in grid_priors(grid).axes.items()}
+            priors = calibration.grid_priors(axis_values) | (priors or {})
         priors = grid_priors(grid, priors, prior_f=settings.prior_f)
-        bands = grid.filters if model is grid else filters
+        bands = filters
+        if model is grid:
+            bands = grid.filters
         if calibration is not None and outliers is None and not compat:
             outliers = calibration.of_bands("outlier", filter_names("filters", bands), 0.0)
         engine = GridEngine(
@@ -113,15 +120,17 @@ class GridFit:
             mixture=BandMixture.of_bands(outliers, bands),
         )
         out = cls(engine, replace(settings, finer=None), compat, template_error)
-        # neither a single model nor templates have anything between
-        several = {name for name, axis in priors.axes.items() if axis.values.size > 1}
-        if not interpolate or not several or "template" in several:
+        # there is nothing between a single model or templates
+        free_axes = {name for name, axis in priors.axes.items() if axis.values.size > 1}
+        if not interpolate or not free_axes or "template" in free_axes:
             return out
         if finer is None:
             models = InterpolatedModels.of_grid(grid, priors.axes)
         else:
-            same = isinstance(filters, FilterSet) and tuple(filters.names) == grid.filters
-            bands = filters if same else grid.filters
+            bands = grid.filters
+            if isinstance(filters, FilterSet) and tuple(filters.names) == grid.filters:
+                # the curves of the user
+                bands = filters
             models = InterpolatedModels.of_model(finer, grid, bands, out.constants, priors.axes)
         return replace(out, between=Continuation(engine, models, float(settings.agn_error)))
 
@@ -175,23 +184,30 @@ class GridFit:
     @property
     def constants(self):
         """Parameters of the grid that have one value, which have no posterior: name to float."""
-        tables = self.grid.galaxy_parameters, self.grid.agn_parameters
-        first = {
-            name: column_values(table[name])[:1] for table in tables for name in table.colnames
-        }
-        return {n: float(v[0]) for n, v in first.items() if n not in self.priors.axes and v.size}
+        constants = {}
+        for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
+            for name in table.colnames:
+                if name not in self.priors.axes and len(table):
+                    constants[name] = float(column_values(table[name])[0])
+        return constants
 
     def settings(self):
         """Return the settings of the fit as plain values."""
-        error, prior, between = self.template_error, self.engine.mass_prior, self.between
+        error = self.template_error
+        prior = self.engine.mass_prior
+        interpolate = 0
+        agn_error = 0.0
+        if self.between is not None:
+            interpolate = int(self.given.interpolate)
+            agn_error = self.between.agn_error
         out = {
             "prior_f": self.given.prior_f,
             "rtol": self.engine.rtol,
             "scale_error": self.engine.scale_error,
             "compat": self.compat,
             "n_models": int(self.engine.n_models),
-            "interpolate": 0 if between is None else int(self.given.interpolate),
-            "agn_error": 0.0 if between is None else between.agn_error,
+            "interpolate": interpolate,
+            "agn_error": agn_error,
             "constants": self.constants,
         }
         if self.nuclei is not None:
@@ -209,18 +225,18 @@ class GridFit:
             relation, scatter, z = prior.args[:3]
             # a function is known by its values at some masses
             mass = [1e8, 1e10, 1e12] * MASS
-            rates = [expected_sfr(relation, mass, one).tolist() for one in z[[0, -1]]]
+            rates = [expected_sfr(relation, mass, end).tolist() for end in z[[0, -1]]]
             out["sfr_prior"] = {"scatter": scatter, "sfr": rates}
-        if between is not None:
-            out["tables"] = between.models.sizes
+        if self.between is not None:
+            out["tables"] = self.between.models.sizes
         if self.given.agn_bins is not None:
             out["agn_bins"] = repr(self.given.agn_bins)
         return out
 
     def provenance(self):
         """Return what results say of the grid, and what to cite for it."""
-        known = {key: value for key, value in self.grid.meta.items() if key != "axes"}
-        return {"citations": known.pop("citations", ()), "grid": known}
+        meta = {key: value for key, value in self.grid.meta.items() if key != "axes"}
+        return {"citations": meta.pop("citations", ()), "grid": meta}
 
     def check_data(self, data):
         """Refuse limits in bands in which a model has negative flux."""
@@ -230,12 +246,13 @@ class GridFit:
 
     def redshifts(self, photometry, redshift, redshift_prior, flags):
         """
-        ln(prior) of the grid's redshifts for every object.
+        Compute ln(prior) of the grid's redshifts for every object.
 
         ``flags``, of the n objects, are added to in place. Returned are the priors, shape (n, nz), the
         number of free parameters (the mass among them) and "fixed" or "free".
         """
-        z, prior = self.grid.redshift, self.priors.redshift
+        z = self.grid.redshift
+        prior = self.priors.redshift
         allowed = self.engine.usable.any(axis=1) & (prior > 0)
         if redshift_prior is not None:
             log_prior = density_log_prior(redshift_prior, z, allowed, flags)
@@ -247,12 +264,13 @@ class GridFit:
         else:
             if not allowed.any():
                 flags |= int(FitFlags.NO_MODEL)
-            one = np.log(prior, where=allowed, out=np.full(z.size, -np.inf))
-            log_prior = np.tile(one, (len(flags), 1))
+            of_grid = np.log(prior, where=allowed, out=np.full(z.size, -np.inf))
+            log_prior = np.tile(of_grid, (len(flags), 1))
         log_prior[(flags & int(FitFlags.UNFITTED)) != 0] = -np.inf
         n_free = 1 + sum(axis.values.size > 1 for axis in self.priors.axes.values())
-        n_free -= redshift is not None and z.size > 1
-        return log_prior, n_free, "free" if redshift is None else "fixed"
+        if redshift is None:
+            return log_prior, n_free, "free"
+        return log_prior, n_free - (z.size > 1), "fixed"
 
     # ------------------------------------------------------------------------- fit
 
@@ -387,21 +405,27 @@ class GridFit:
             vanished = out.chi2 > VANISHING_CHI2
             flags[vanished] |= int(FitFlags.NO_LIKELIHOOD)
             for array in (*out[:-1], *out.joint.values()):
-                array[vanished] = -1 if array.dtype.kind == "i" else np.nan
+                missing = np.nan
+                if array.dtype.kind == "i":
+                    missing = -1
+                array[vanished] = missing
         axes = self.priors.axes
         pdf = {"redshift": out.zf.sum(axis=2)}
         if self.between is None:
-            alone = np.minimum(out.galaxy.max(axis=1), pdf["redshift"].max(axis=1)) > _ALONE
-            flags[alone & (out.galaxy.shape[1] > 1)] |= int(FitFlags.ONE_NODE)
+            largest = np.minimum(out.galaxy.max(axis=1), pdf["redshift"].max(axis=1))
+            one_node = (largest > _ONE_NODE_WEIGHT) & (out.galaxy.shape[1] > 1)
+            flags[one_node] |= int(FitFlags.ONE_NODE)
         if "frac_agn" in axes:
             pdf["frac_agn"] = out.zf.sum(axis=1)
         for name, axis in axes.items():
             if axis.share is not None:
-                models = out.galaxy if axis.kind == "galaxy" else out.agn
+                models = {"galaxy": out.galaxy, "agn": out.agn}[axis.kind]
                 # not a matrix product, whose last digits depend on how many rows there are
                 pdf[name] = np.einsum("ng,vg->nv", models, axis.share)
-        known = self.engine.quantities
-        moments, quantiles = known.summarize(out)
+        moments, quantiles = self.engine.quantities.summarize(out)
+        outlier = None
+        if self.engine.mixture is not None:
+            outlier = out.outlier
         log_sigma = self.log_errors(data)
         data = self.with_template_error(data, np.where(np.isnan(out.chi2), -1, out.index[:, 0]))
         return FitResults(
@@ -421,7 +445,7 @@ class GridFit:
             model_flux=out.band[:, 0],
             model_flux_std=out.band[:, 1],
             best_flux=out.best_flux,
-            outlier=None if self.engine.mixture is None else out.outlier,
+            outlier=outlier,
             agn_weights=self._no_agn_weights(len(data)),
         )
 
@@ -433,23 +457,26 @@ class GridFit:
         return np.full((n, *bins.shape), np.nan, np.float32)
 
     def log_errors(self, data):
-        """Ln of the product of the errors that likelihoods are divided by, shape (n,)."""
+        """Compute ln of the product of the errors that likelihoods are divided by, shape (n,)."""
         # limits are probabilities, which have no unit
         log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
         return log_sigma + 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
 
     def with_template_error(self, data, node):
-        """Photometry whose errors have that of the templates at nodes of redshift, (n,); -1 is none."""
+        """Add the errors of the templates at nodes of redshift, (n,), to those of photometry; -1 is none."""
         if self.template_error is None:
             return data
-        more = self.engine.template_error[np.maximum(node, 0)] * data.flux
-        more[~data.measured | (node < 0)[:, None]] = 0.0
-        return data._changed(sigma=np.hypot(data.sigma, more))
+        error = self.engine.template_error[np.maximum(node, 0)] * data.flux
+        error[~data.measured | (node < 0)[:, None]] = 0.0
+        return data._changed(sigma=np.hypot(data.sigma, error))
 
     def result_settings(self):
-        """Keywords of `FitResults` that are the same for all objects."""
+        """Return the keywords of `FitResults` that are the same for all objects."""
         quantities = self.engine.quantities
         axes = {name: replace(axis, share=None) for name, axis in self.priors.axes.items()}
+        least_std = 0.0
+        if self.compat == "cigale":
+            least_std = CIGALE_LEAST_STD
         return {
             "filters": self.filters,
             "axes": axes,
@@ -458,37 +485,41 @@ class GridFit:
             "descriptions": quantities.descriptions,
             "intensive": quantities.intensive,
             "constants": self.constants,
-            "least_std": CIGALE_LEAST_STD if self.compat == "cigale" else 0.0,
+            "least_std": least_std,
         }
 
     def _best(self, out):
-        """Parameters and derived quantities of the best models: name to array."""
+        """Collect parameters and derived quantities of the best models: name to array."""
         grid = self.grid
-        ok, known = np.isfinite(out.chi2), self.engine.quantities
+        quantities = self.engine.quantities
+        ok = np.isfinite(out.chi2)
         z, g, k, f = np.where(ok[:, None], out.index, 0).T
         frac = grid.frac_agn[f]
         values = {"redshift": grid.redshift[z], "frac_agn": frac}
-        values |= {
-            name: column_values(column)[g] for name, column in grid.galaxy_parameters.items()
-        }
-        for name, column in grid.agn_parameters.items() if grid.n_agn else ():
-            # without AGN light there is no template
-            values[name] = np.where(frac > 0, column_values(column)[k], np.nan)
+        for name, column in grid.galaxy_parameters.items():
+            values[name] = column_values(column)[g]
+        if grid.n_agn:
+            for name, column in grid.agn_parameters.items():
+                # without AGN light there is no template
+                values[name] = np.where(frac > 0, column_values(column)[k], np.nan)
         best = {name: np.where(ok, values[name], np.nan) for name in self.priors.axes}
         scale = np.where(ok, out.best_scale, np.nan)
-        return best | {n: known.evaluate(n, grid, g, k, frac, scale) for n in known.names}
+        for name in quantities.names:
+            best[name] = quantities.evaluate(name, grid, g, k, frac, scale)
+        return best
 
     # ----------------------------------------------------------------------- draws
 
     def sample(self, data, log_prior, n_draws, seed, **parallel):
-        """`~miricigale.fitting.Samples` of objects; ``parallel`` is for `parallel_map`."""
+        """Draw `~miricigale.fitting.Samples` of objects; ``parallel`` is for `parallel_map`."""
         keys = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
         keys = np.array(keys, dtype=np.int64)
-        rows = list(chunks(len(data), 16)) or [slice(0, 0)]
-        pieces = [(data[some], log_prior[some], keys[some]) for some in rows]
+        slices = list(chunks(len(data), 16)) or [slice(0, 0)]
+        pieces = [(data[rows], log_prior[rows], keys[rows]) for rows in slices]
         task = partial(_draw_piece, self.engine, n_draws)
         parts = parallel_map(task, pieces, desc="draws", **parallel)
-        index, scale = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        index = np.concatenate([part[0] for part in parts])
+        scale = np.concatenate([part[1] for part in parts])
         flags = np.array(data.flags)
         unfitted = ~np.isfinite(scale).all(axis=1) & ((flags & int(FitFlags.UNFITTED)) == 0)
         flags[unfitted] |= int(FitFlags.NO_SIGNAL)
