@@ -5,7 +5,7 @@ from scipy import stats
 
 from miricigale.detector._core.charge import add_poisson, cosmic_ray_deposits
 from miricigale.detector._core.random import poisson, seed_stream, standard_normals
-from miricigale.detector._core.readout import digitize
+from miricigale.detector._core.readout import digitize, interpolate_response
 
 KEY = np.array([11, 22, 33, 44], np.uint64)
 
@@ -14,6 +14,17 @@ def normals(shape, first_row=0, key=KEY):
     out = np.empty(shape)
     standard_normals(key, first_row, out)
     return out
+
+
+def test_a_response_goes_on_along_its_last_piece():
+    """Below, between, at and beyond the nodes of a table that bends, in a gain of 4 electrons a DN."""
+    gain, step = 4.0, 10.0
+    response = np.array([0.0, 9.0, 17.0, 24.0])
+    linear = np.array([-5.0, 0.0, 4.0, 10.0, 25.0, 30.0, 50.0])
+    expected = np.array([-4.5, 0.0, 3.6, 9.0, 20.5, 24.0, 38.0])
+    ramp = np.float32(gain * linear)[None, None, None]
+    interpolate_response(ramp, gain, response, step)
+    assert_allclose(ramp[0, 0, 0], expected, atol=1e-5)
 
 
 def test_normals_are_normal():

@@ -321,6 +321,28 @@ def test_light_beyond_a_template_is_part_of_the_total(r_eff):
     assert truth[bright].sum() / template[bright].sum() == pytest.approx(total, rel=0.02)
 
 
+def test_templates_and_their_errors_do_not_depend_on_the_unit_of_light():
+    """Light and errors times 50: shares of the light and relative errors are the same."""
+    sigma = 0.002
+    noise = np.random.default_rng(2).normal(0, sigma, (81, 81))
+    knots = sum(gaussian_image(81, WIDTH, *at) for at in ((-4, 1), (5, -2)))
+    image = 0.6 * galaxy((81, 81), 40, 40, r_eff=5.0, n=1.5, q=0.6) + 0.2 * knots + noise
+    labels = (scipy.ndimage.gaussian_filter(image, 1.5) > 0.6 * sigma).astype(int)
+    psf, one, place = gaussian_psf(), np.array([1]), np.array([[40.0, 40.0]])
+    parts, lights = [], []
+    for unit in (1.0, 50.0):
+        fine = unit * image, np.full(image.shape, (unit * sigma) ** 2), psf, SCALE
+        (cutout,), _, _, fitted = cutouts(*fine, labels, one, place, min_snr=5.0, select=False)
+        parts.append(cutout)
+        lights.append(fitted["light"][0])
+    for layer, other in zip(parts[0].layers, parts[1].layers, strict=True):
+        assert_allclose(other.data, layer.data, atol=1e-4 * np.abs(layer.data).max())
+    assert_allclose(lights[1], lights[0], rtol=1e-3)
+    assert_allclose(parts[1].noise, parts[0].noise, rtol=1e-3)
+    # the variances of the pixels that are taken from the image, of a light of 1
+    assert 50 < parts[0].noise / sigma**2 < np.count_nonzero(labels)
+
+
 def test_neighbors_do_not_add_to_each_others_wings():
     shape, sigma = (121, 161), 1e-4
     places, light = np.array([[62.0, 60.0], [98.0, 60.0]]), np.array([1.0, 3.0])
