@@ -60,12 +60,17 @@ def open_product(path):
     with warnings.catch_warnings():
         # they are about what was tried
         warnings.simplefilter("ignore")
+        reason = ""
         for read in _readers():
             try:
                 return read(path)
-            except other:
-                continue
-    raise data_error(path, "is no product, image or table that can be read")
+            except other as err:
+                # the last reader is that of tables
+                reason = str(err).partition("cannot be read as a table: ")[2]
+    problem = "is no product, image or table that can be read"
+    if reason:
+        problem += f" (as a table: {reason})"
+    raise data_error(path, problem)
 
 
 def show(args):

@@ -251,18 +251,18 @@ def plain_floats(column, name, argument):
     try:
         return np.where(mask, np.nan, values.astype(float))
     except (TypeError, ValueError):
-        row = _first_word(values)
+        row = first_word(values) or 0
         wanted = f"a table with numbers in {name!r}"
         raise argument_error(
             argument, wanted, f"{values[row]!s:.40} in row {row} (from 0)"
         ) from None
 
 
-def _first_word(values):
-    """Row of the first value that is no number."""
+def first_word(values):
+    """Row of the first value that is no number; None if all are."""
     for row, value in enumerate(values.tolist()):
         try:
             float(value)
         except (TypeError, ValueError):
             return row
-    return 0
+    return None

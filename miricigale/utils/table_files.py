@@ -564,6 +564,8 @@ def write_table(table, path, *, overwrite=False):
     form = TABLE_FORMATS.get(Path(path.name.lower().removesuffix(".gz")).suffix)
     wanted = f"a file ending in one of {', '.join(TABLE_FORMATS)}"
     check_that(form is not None, "path", wanted, str(path))
+    if form == "parquet":
+        require("pyarrow", extra="parquet")
     with replacing(path, overwrite=overwrite) as partial:
         if form == "fits":
             hdus = fits.HDUList([fits.PrimaryHDU(), table_hdu(table)])
@@ -571,6 +573,9 @@ def write_table(table, path, *, overwrite=False):
         else:
             if form == "votable":
                 plain_table = _for_votable(sky_as_angles(table))
+            elif form == "ascii.csv":
+                # text of both angles in one cell is no position
+                plain_table = sky_as_angles(table)
             else:
                 plain_table = table
             plain_table.write(partial, format=form, **_OPTIONS.get(form, {}))
@@ -635,6 +640,8 @@ def fits_ready(table):
     for name in table.colnames:
         _change_type(table, name, _FITS_TYPES)
         column = table[name]
+        if isinstance(column, Column) and column.dtype.kind == "U":
+            _check_ascii(column)
         if not isinstance(column, MaskedColumn) or not column.mask.any():
             continue
         if column.dtype.kind == "b":
@@ -647,6 +654,16 @@ def fits_ready(table):
         column.fill_value = _unused_number(column)
         table.replace_column(name, column)
     return table
+
+
+def _check_ascii(column):
+    """Refuse text that FITS cannot hold."""
+    texts = np.ma.filled(column, "").ravel().tolist()
+    foreign = next((text for text in texts if not text.isascii()), None)
+    wanted = (
+        f"a file of another format, such as .ecsv, for text in {column.name!r} that is not ASCII"
+    )
+    check_that(foreign is None, "path", wanted, f"FITS, for {foreign!r:.40}")
 
 
 def _unused_number(column):

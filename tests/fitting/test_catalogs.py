@@ -267,6 +267,10 @@ def test_fluxes_are_numbers(grid, catalog):
         table["band1"] = Column(values, unit="uJy")
         match = f"'photometry' must be a table with numbers in column 'band1', got {kind}"
         refuses(match, node_fitter(grid).fit, table)
+    words = flux.astype("U8")
+    words[2] = "<1.5"
+    table["band1"] = Column(words, unit="uJy")
+    refuses("got text, <1.5 in row 2 ", node_fitter(grid).fit, table)
 
 
 @pytest.mark.parametrize(

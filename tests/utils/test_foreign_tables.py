@@ -7,12 +7,14 @@ import zipfile
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.io.votable import from_table
-from astropy.table import MaskedColumn, Table
+from astropy.table import MaskedColumn, QTable, Table
 
 from helpers.errors import refuses
 from miricigale.utils.exceptions import CatalogWarning, DataError
+from miricigale.utils.positions import as_positions
 from miricigale.utils.row_files import open_rows, write_rows
 from miricigale.utils.table_files import read_table, write_table
 
@@ -151,3 +153,20 @@ def test_votables_have_no_integers_above_2_to_63(tmp_path):
             tmp_path / "c.xml")  # fmt: skip
     write_table(Table({"TARGETID": np.array([2**63 - 1], np.uint64)}), tmp_path / "c.xml")
     assert read_table(tmp_path / "c.xml", wanted="a catalog")["TARGETID"].tolist() == [2**63 - 1]
+
+
+def test_text_that_fits_cannot_hold_is_refused_by_column(tmp_path):
+    table = Table({"id": [1, 2], "name": ["a", "\u00e9"]})
+    refuses("'path' must be a file of another format, .* in 'name' .*\u00e9", write_table, table,
+            tmp_path / "c.fits")  # fmt: skip
+    assert not list(tmp_path.iterdir())
+    write_table(table, tmp_path / "c.csv")
+    assert read_table(tmp_path / "c.csv", wanted="a catalog")["name"].tolist() == ["a", "\u00e9"]
+
+
+@pytest.mark.parametrize("name", ["c.csv", "c.ecsv", "c.fits", "c.xml"])
+def test_positions_are_positions_after_writing(name, tmp_path):
+    sky = SkyCoord([53.1, 359.99999999], [-27.8, 1e-9], unit="deg")
+    write_table(QTable({"id": [1, 2], "sky": sky}), tmp_path / name)
+    back = as_positions(read_table(tmp_path / name, wanted="a catalog"), name)
+    assert np.all(back.separation(sky).arcsec < 1e-6)

@@ -8,6 +8,7 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.filters.library import SEDPY
 from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.missing_values import first_word
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
@@ -458,7 +459,11 @@ def flux_column(table, name):
     kind = getattr(column, "dtype", np.dtype(float)).kind
     if kind not in "fiuO":
         wanted = f"a table with numbers in column {name!r}"
-        raise argument_error("photometry", wanted, _KINDS.get(kind, str(column.dtype)))
+        got = _KINDS.get(kind, str(column.dtype))
+        row = first_word(np.ma.getdata(column))
+        if kind in "US" and row is not None:
+            got += f", {column[row]!s:.40} in row {row} (from 0)"
+        raise argument_error("photometry", wanted, got)
     array = to_array(column, FNU, name, ndim=1).copy()
     array[np.broadcast_to(np.asarray(getattr(table[name], "mask", False)), array.shape)] = np.nan
     return array
