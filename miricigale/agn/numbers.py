@@ -58,8 +58,8 @@ class SampleNumbers:
     pure : `~numpy.ndarray`, shape (n_z, n_lum)
         Sum of their probabilities to have an AGN fraction of at least the limit, by the measured prior.
     injected : dict of str to `~numpy.ndarray` of int, shape (n_z, n_lum)
-        Injected AGN by true redshift and luminosity: ``all``; ``above`` the floor; the ``selected`` ones; and of
-        these the ``right`` ones, above the limit.
+        Injected AGN by true redshift and luminosity: ``all``; ``above`` the floor; above the ``limit``; the
+        ``selected`` ones; and of these the ``right`` ones, above the limit.
     seed : int
         Of the errors of rates.
     """
@@ -130,12 +130,26 @@ class SampleNumbers:
         n_selected = self.selected[i, k]
         row["n_selected"] = int(n_selected)
         row["purity"] = self.pure[i, k] / n_selected if n_selected else np.nan
-        row["n_corrected"] = np.nan
-        if injected["right"]:
-            row["n_corrected"] = self.pure[i, k] * injected["all"] / injected["right"]
+        row |= _summary(self._corrected(i, k, "all"), "n_corrected")
         row["constrained"] = bool(row["above"] >= LEAST_ABOVE)
         row |= self._density(number, row["n_shipped"], injected, i, k)
         return row | self._obscured(by_class, i, k)
+
+    def _corrected(self, i, k, kind):
+        """
+        Draws of the number of AGN of a bin by the selected ones and the injected ones of a kind.
+
+        NaN where AGN are selected and no such injected one is.
+        """
+        pure = self.pure[i, k]
+        n_injected = int(self.injected[kind][i, k])
+        n_right = int(self.injected["right"][i, k])
+        n_draws = self.draws.n_draws
+        if not n_right:
+            return np.full(n_draws, np.nan if pure > 0 or kind == "all" else 0.0)
+        rng = stream(self.seed, "agn", "corrected", i, k)
+        share = rng.beta(n_right + _JEFFREYS, n_injected - n_right + _JEFFREYS, n_draws)
+        return rng.standard_gamma(pure, n_draws) / share if pure > 0 else np.zeros(n_draws)
 
     def _density(self, number, n_shipped, injected, i, k):
         """Luminosity function of all AGN of a bin, also those below the floor, which injected ones tell."""
@@ -178,8 +192,19 @@ class SampleNumbers:
             row = {"frac_agn": fraction} | _summary(number, "n")
             row["n_shipped"] = float(sum(one[part].sum() for one in self.shipped.values()))
             row["n_selected"] = int(self.selected[:n_z].sum())
+            row |= _summary(self._total_corrected(fraction), "n_corrected")
             rows.append(row)
         return described_rows(rows, _texts("totals"))
+
+    def _total_corrected(self, fraction):
+        """Draws of the number of AGN from a fraction on by the selected ones, as they are where no share is known."""
+        kind = "above" if fraction == self.floor else "limit"
+        total = np.zeros(self.draws.n_draws)
+        for i in range(len(self.bins.redshift) - 1):
+            for k in range(self.bins.shape[2]):
+                number = self._corrected(i, k, kind)
+                total += np.where(np.isfinite(number), number, self.pure[i, k])
+        return total
 
 
 def prior_table(bins, prior, draws, every):

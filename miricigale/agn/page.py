@@ -60,7 +60,15 @@ def _rows(table):
         for name in ("redshift", "log_luminosity", "frac_agn"):
             if f"{name}_low" in row:
                 row[name] = _span(row[f"{name}_low"], row[f"{name}_high"])
-        for name in ("n", "completeness", "above", "density", "obscured", "measured"):
+        for name in (
+            "n",
+            "n_corrected",
+            "completeness",
+            "above",
+            "density",
+            "obscured",
+            "measured",
+        ):
             if f"{name}_low" in row and f"{name}_high" in row:
                 row[f"{name}_err"] = 0.5 * (row[f"{name}_high"] - row[f"{name}_low"])
     return rows

@@ -343,6 +343,7 @@ class AGNSurvey:
         chosen = {
             "all": np.ones(len(injected), bool),
             "above": fraction >= FLOOR,
+            "limit": fraction >= self.limit,
             "selected": selected,
             "right": selected & (fraction >= self.limit),
         }

@@ -7,8 +7,9 @@ from astropy.table import QTable
 
 from helpers.commands import command
 from helpers.errors import refuses
-from miricigale import BayesFitter, ErrorModel, SEDModel
+from miricigale import BayesFitter, ErrorModel, FitResults, SEDModel
 from miricigale.agn import AGNSurvey, NoiseCurve, add_light, agn_light
+from miricigale.fitting import AGNBins, GridSettings
 from miricigale.utils.parallel import threads
 
 BANDS = [
@@ -145,6 +146,23 @@ def test_light_of_an_agn_is_that_of_the_model(model, truth, photometry):
     )
     assert all(np.all(none[band].value == 0) for band in BANDS)
     assert np.all(fraction == 0)
+
+
+def test_posteriors_in_bins_are_those_of_the_fit(model, photometry, tmp_path):
+    bins = AGNBins((0.5, 1.5), (40.0,))
+    settings = GridSettings(interpolate=60, agn_bins=bins)
+    fitter = BayesFitter(model, BANDS, axes=AXES, model_error=0.3, settings=settings)
+    results = fitter.fit(photometry[:3])
+    np.testing.assert_allclose(results.agn_weights.sum(axis=(1, 2, 3)), 1.0, rtol=1e-5)
+    # no AGN is a node of the grid, and all others are brighter than the edge
+    absent = results.agn_weights[:, 0, 0, 0]
+    np.testing.assert_allclose(absent, results.pdf["frac_agn"][:, 0], atol=1e-6)
+    assert np.all(results.agn_weights[:, :, 1:, 0] == 0)
+    results.write(tmp_path / "fit.fits")
+    again = FitResults.read(tmp_path / "fit.fits")
+    assert np.array_equal(again.agn_weights, results.agn_weights)
+    on_nodes = fitter.replace(settings=GridSettings(interpolate=0, agn_bins=bins))
+    assert np.all(np.isnan(on_nodes.fit(photometry[:1]).agn_weights))
 
 
 def test_all_agn_are_counted_where_there_is_no_doubt(result, truth):
