@@ -72,6 +72,14 @@ def close_figures():
         sys.modules["matplotlib.pyplot"].close("all")
 
 
+@pytest.fixture(autouse=True)
+def pictures(request, monkeypatch):
+    """Leave pictures out of pages in tests without the mark ``pictures``: drawing takes most of a page's time."""
+    is_test = isinstance(request.node, pytest.Function)
+    if is_test and request.node.get_closest_marker("pictures") is None:
+        monkeypatch.setattr("miricigale.pages.page.image_of", lambda figure, dpi: ("data:,", 1))
+
+
 @pytest.fixture(scope="session")
 def data_file():
     """Path of a file or folder of the development data, or a skip that names it."""

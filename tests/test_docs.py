@@ -43,6 +43,7 @@ def code_of(text):
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 @pytest.mark.parametrize("path", SCRIPTS, ids=name_of)
 def test_example_runs_and_draws(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -56,6 +56,7 @@ def catalog():
     return out
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
     catalog.write(tmp_path / "cat.fits")
@@ -289,6 +290,7 @@ def test_a_table_without_fluxes_is_refused_with_what_is_wanted(tmp_path, capsys,
     assert "Traceback" not in err
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_path, monkeypatch):
     """Redshifts of the models themselves come back; a band of no error is counted, flags have their meanings."""
@@ -337,6 +339,7 @@ def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, t
     assert np.all(found["chi2_best"] < 0.1)
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
     catalog, tmp_path, capsys, monkeypatch

@@ -80,7 +80,8 @@ def test_posterior_is_that_of_the_mixture(grid, table):
     count = np.where(grid.allowed[:, :, None, None], grid.agn_multiplicity[:, None], 0)
     every = 8 * 9 * 4 * grid.agn_multiplicity.sum()
     far, change, worse = [], [], []
-    for i in range(12):
+    # with and without wrong bands and limits, both in 8
+    for i in (0, 1, 2, 3, 5, 8):
         log, wrong = by_hand(grid, results, i)
         weight = count * np.exp(log - log.max())
         total = weight.sum()

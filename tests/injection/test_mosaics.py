@@ -200,6 +200,7 @@ def test_no_injected_sources_give_the_users_own_result(folder, prior_files, tmp_
             assert_array_equal(table[name], own[name])
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_sources_are_put_into_the_prior_too(folder, prior_files, tmp_path, capsys):
     """By the command, with own stars and galaxies of known colors, and a segmentation map."""

@@ -5,6 +5,7 @@ from base64 import b64decode
 from io import BytesIO
 
 import numpy as np
+import pytest
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from PIL import Image
@@ -12,6 +13,8 @@ from PIL import Image
 from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale.pages import Link, Missing, Page, SectionWriter, number
+
+pytestmark = pytest.mark.pictures
 
 HOSTILE = "</script><img src=x onerror='alert(1)'> & \"co\""
 

@@ -82,6 +82,7 @@ def arguments(files, output, **changes):
     return ["photometry", "--no-progress", *(part for pair in given for part in pair)]
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_files_become_a_catalog_that_can_be_fitted_and_a_page(files, tmp_path, capsys):
     output = tmp_path / "new" / "fluxes.ecsv"
@@ -174,6 +175,7 @@ def test_sources_that_the_prior_lacks_are_the_last_rows(files, tmp_path):
     assert_allclose(found, files.flux[lost], rtol=0.02)
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_several_bands_are_measured_in_one_call(files, tmp_path, capsys):
     """The second with a kernel by place, the prior with a sky; what one shows beyond it is measured in both."""

@@ -58,6 +58,7 @@ def test_errors_on_drizzled_white_noise_are_those_of_the_kernel(tools):
     refuses("'diameters' must be positive", image_errors, image, diameters=[0.0] * u.arcsec)
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_the_command_states_what_empty_apertures_of_a_real_image_scatter_by(
     data_file, tmp_path, capsys

@@ -337,6 +337,7 @@ def test_model_and_residual_are_written_with_their_coordinates(field, tmp_path):
         fluxes(field, model=tmp_path / "a.png")
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_poor_fits_of_the_bright_stand_on_the_page_and_warnings_are_shown_once(field, tmp_path):
     """The PSF of another band, said to be that of a smoothed image."""

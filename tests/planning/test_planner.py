@@ -245,6 +245,7 @@ def test_agn_of_other_skies_count_by_their_share():
         _ = Planner(none).sources
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_the_command_writes_a_page(tmp_path, capsys):
     path = tmp_path / "plan.toml"

@@ -57,6 +57,7 @@ def level_of(file):
     return file.image.data + file.planes["BKG"]
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
     out = tmp_path / "out"

@@ -10,7 +10,16 @@ import pytest
 from astropy.table import QTable
 
 from helpers.figures import legend_texts
-from helpers.runs import AREA, SCALE, SHAPE, make_run, noise_image, sky_image, small_config
+from helpers.runs import (
+    AREA,
+    SCALE,
+    SHAPE,
+    make_run,
+    no_pictures,
+    noise_image,
+    sky_image,
+    small_config,
+)
 from miricigale.evaluation import PUBLISHED
 from miricigale.fitting import FitResults
 from miricigale.sed import SEDModel
@@ -50,9 +59,13 @@ def reports(tmp_path_factory):
     """Reports of several kinds of run."""
     folder = tmp_path_factory.mktemp("reports")
     truths = {"frac_agn": (0.0, 0.4, FIELD), "sets": ("all", "none", "blue", "red")}
-    options = {"one": {"mass": 1e4}, "four": {"points": True}, "truths": {"points": True, **truths}}
+    # its figures are among those of the run of several truths
+    with no_pictures():
+        four = make_run(folder / "four", FILTERS["four"], points=True)
     return {
-        kind: make_run(folder / kind, filters, **options[kind]) for kind, filters in FILTERS.items()
+        "one": make_run(folder / "one", FILTERS["one"], mass=1e4),
+        "four": four,
+        "truths": make_run(folder / "truths", FILTERS["truths"], points=True, **truths),
     }
 
 
@@ -74,9 +87,8 @@ def test_many_sources_are_read_and_fitted_in_pieces_to_the_same_page(
 ):
     for place in ("engine.stage", "stages.inputs"):
         monkeypatch.setattr(f"miricigale.workflow.{place}.LONG", 10)
-    # numbers are compared: the pictures are those of the other reports
-    monkeypatch.setattr("miricigale.pages.page.image_of", lambda figure, dpi: ("data:,", 1))
-    report = make_run(tmp_path, FILTERS["four"], points=True)
+    with no_pictures():
+        report = make_run(tmp_path, FILTERS["four"], points=True)
     for name in ("input_seds", "agn00/fits_all", "agn00/fits_none"):
         folder, _, name = f"./{name}".rpartition("/")
         assert len(list((tmp_path / folder).glob(f"{name}_000[012].fits"))) == 3

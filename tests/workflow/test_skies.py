@@ -6,7 +6,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
-from helpers.runs import do_stage, make_run, small_config
+from helpers.runs import do_stage, make_run, no_pictures, small_config
 from miricigale.photometry import ErrorModel
 from miricigale.workflow.stages.skies import sky_photometry
 from miricigale.workflow.truths import FIELD
@@ -42,7 +42,8 @@ def test_fluxes_are_off_by_the_errors_of_a_measured_source():
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("skies")
-    make_run(folder, BANDS, frac_agn=(0.0, FIELD), skies=40)
+    with no_pictures():
+        make_run(folder, BANDS, frac_agn=(0.0, FIELD), skies=40)
     return folder
 
 

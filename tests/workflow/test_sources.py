@@ -13,7 +13,16 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from PIL import Image
 
-from helpers.runs import SCALE, SHAPE, do_stage, make_run, noise_image, sky_image, small_config
+from helpers.runs import (
+    SCALE,
+    SHAPE,
+    do_stage,
+    make_run,
+    no_pictures,
+    noise_image,
+    sky_image,
+    small_config,
+)
 from miricigale.fitting import FitResults
 from miricigale.pages.browser import CHUNK
 from miricigale.plotting import cutouts
@@ -87,7 +96,8 @@ def test_the_table_holds_what_the_tables_hold(run):
 
 @pytest.mark.slow
 def test_ids_that_are_text_and_fractions_of_the_catalog(tmp_path):
-    page = make_run(tmp_path, BANDS, text_ids=True, frac_agn=(0.0, "catalog"))
+    with no_pictures():
+        page = make_run(tmp_path, BANDS, text_ids=True, frac_agn=(0.0, "catalog"))
     text = (page / "index.html").read_text("utf-8")
     assert "AGN of the catalog" in text
     assert "source src-" in text
