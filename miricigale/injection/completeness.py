@@ -154,7 +154,9 @@ def _limit(values):
     if raw_plateau <= logit(0.5):
         return np.nan
     flux = 1.0 + np.exp(log_width) * ndtri(0.5 / expit(raw_plateau))
-    return middle - 2.5 * np.log10(flux) if flux > 0 else np.nan
+    if flux > 0:
+        return middle - 2.5 * np.log10(flux)
+    return np.nan
 
 
 def _limit_error(loss, best):
@@ -174,4 +176,6 @@ def _limit_error(loss, best):
             )
             curvature[i, j] = corners / (4 * _STEP**2)
     variance = gradient @ np.linalg.pinv(curvature, hermitian=True) @ gradient
-    return np.sqrt(variance) if variance > 0 else np.nan
+    if variance > 0:
+        return np.sqrt(variance)
+    return np.nan

@@ -57,8 +57,8 @@ def recovered_rows(positions, fluxes, former, former_fluxes, sky, flux, radius):
     """
     rows, _ = match_sky(positions, sky, radius=radius)
     if len(former) and len(sky):
-        nearest, apart, _ = sky.match_to_catalog_sky(former)
-        hidden = (apart < radius) & (former_fluxes[nearest] > flux)
+        nearest, separation, _ = sky.match_to_catalog_sky(former)
+        hidden = (separation < radius) & (former_fluxes[nearest] > flux)
         rows = np.where(hidden, -1, rows)
     return rows
 
@@ -78,7 +78,8 @@ class PriorField:
     has_prior = True
 
     def __init__(self, inputs, n_threads=None):
-        self.inputs, self.n_threads = inputs, n_threads
+        self.inputs = inputs
+        self.n_threads = n_threads
         (self.band,) = inputs.bands
         self.prior_band = inputs.highres.header.filter
 
@@ -150,7 +151,10 @@ class PriorField:
             Of the prior, as the user's photometry takes them.
         """
         inputs = self.inputs
-        n = 0 if sources is None else len(sources)
+        if sources is None:
+            n = 0
+        else:
+            n = len(sources)
         light = prior_light = None
         if n and image_file is None:
             light = light_on_file(
@@ -160,7 +164,10 @@ class PriorField:
             prior_light = light_on_file(
                 inputs.highres, sources, sources["prior_flux"], psfs[1], self.n_threads
             )
-        file = inputs.images[0] if image_file is None else image_file
+        if image_file is None:
+            file = inputs.images[0]
+        else:
+            file = image_file
         pixels = Pixels(inputs.highres.read(prior_light), [], {self.band: file.read(light)})
         segments, catalog = inputs.find_sources(pixels, inputs.catalog)
         detected = inputs.segmentation is None and inputs.catalog is None
@@ -236,11 +243,11 @@ def joined_segments(segments, detected, places):
     labels_found, _ = nearest_values(detected, places)
     labels = np.zeros(len(places), int)
     for k in np.flatnonzero((present == 0) & (labels_found > 0)):
-        own = (detected == labels_found[k]) & (segments == 0)
+        new_pixels = (detected == labels_found[k]) & (segments == 0)
         # of two sources in one segment the first has it
-        if own.any():
+        if new_pixels.any():
             labels[k] = first + k
-            segments[own] = labels[k]
+            segments[new_pixels] = labels[k]
     return segments, labels
 
 
@@ -264,7 +271,9 @@ class ImageField:
     prior_band = None
 
     def __init__(self, file, preset, options, n_threads=None):
-        self.file, self.preset, self.n_threads = file, preset, n_threads
+        self.file = file
+        self.preset = preset
+        self.n_threads = n_threads
         self.options = {"background_order": 0, "second_pass": None, **options}
         self.band = file.header.filter
 
@@ -294,7 +303,10 @@ class ImageField:
 
     def measure(self, sources=None, psfs=None, former=None, image_file=None):
         """As `PriorField.measure`; ``former`` are the sources of the field with their shapes."""
-        n = 0 if sources is None else len(sources)
+        if sources is None:
+            n = 0
+        else:
+            n = len(sources)
         light = None
         if n and image_file is None:
             light = light_on_file(self.file, sources, sources["flux"], psfs[0], self.n_threads)
@@ -313,9 +325,9 @@ class ImageField:
 
     def _shapes(self, image, segments, catalog):
         scale = pixel_scale(image.wcs)
-        turned = rotate_psf(self.psf, grid_angle=grid_angle(image.wcs, image.shape))
+        rotated = rotate_psf(self.psf, grid_angle=grid_angle(image.wcs, image.shape))
         n = 2 * int(self.psf.half_width / scale) + 1
-        psf = psf_image(turned, pixel_scale=scale * ANGLE, shape=n)
+        psf = psf_image(rotated, pixel_scale=scale * ANGLE, shape=n)
         return fitted_shapes(image, segments, catalog, psf, self.n_threads)
 
     def shapes(self, pixels, segments, catalog, psfs):
@@ -325,7 +337,10 @@ class ImageField:
 
 def with_shapes(former, sources):
     """A catalog of Sersic profiles and points: those of the field, and after them what is injected."""
-    tables = [former] if sources is None else [former, sources]
+    if sources is None:
+        tables = [former]
+    else:
+        tables = [former, sources]
     rows = QTable()
     ids = np.asarray(former["id"])
     if sources is not None:

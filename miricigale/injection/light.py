@@ -41,8 +41,8 @@ def psf_on_pixels(psf, wcs, shape):
     oversampling = max(2, int(np.ceil(_CELLS * scale / psf.fwhm.to_value(ANGLE))))
     cell = scale / oversampling
     n = 2 * int(psf.half_width / cell) + 1
-    turned = rotate_psf(psf, grid_angle=angle)
-    data = psf_image(turned, pixel_scale=cell * ANGLE, shape=n)
+    rotated = rotate_psf(psf, grid_angle=angle)
+    data = psf_image(rotated, pixel_scale=cell * ANGLE, shape=n)
     data *= psf.enclosed / data.sum()
     return make_psf(
         data * oversampling**2,
@@ -82,7 +82,10 @@ def light_on_image(sources, flux, wcs, shape, psf, n_threads=None):
     rows["id"] = np.arange(1, len(rows) + 1)
     rows["redshift"] = np.full(len(rows), np.nan)
     # light has no color here
-    band = "miri.f770w" if psf.filter is None else psf.filter
+    if psf.filter is None:
+        band = "miri.f770w"
+    else:
+        band = psf.filter
     rows[band] = flux
     wcs = wcs.deepcopy()
     wcs.pixel_shape = shape[::-1]

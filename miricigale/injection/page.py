@@ -49,7 +49,10 @@ def write_page(path, result, name, *, in_ramps=False):
     page = SectionWriter(report, declared("miricigale.injection"))
     is_star = np.asarray(result.sources["kind"]) == "star"
     facts = {key: meta[key] for key in ("n_trials", "preset", "threshold")}
-    positions = "the prior" if meta.get("prior_band") else "the injected sources, taken as known"
+    if meta.get("prior_band"):
+        positions = "the prior"
+    else:
+        positions = "the injected sources, taken as known"
     facts |= {"n": len(result.sources), "n_stars": int(is_star.sum()), "positions": positions}
     page.section("answer", **facts)
     page.items(_headline(result))
@@ -61,11 +64,20 @@ def write_page(path, result, name, *, in_ramps=False):
         page.table("table", _dicts(result.recovery(by)), by=_HEADS[by])
     page.section("purity")
     for by in BINNED_BY:
-        head = "size (arcsec, rms)" if by == "size" else _HEADS[by]
+        if by == "size":
+            head = "size (arcsec, rms)"
+        else:
+            head = _HEADS[by]
         page.table("table", _dicts(result.purity(by)), by=head)
     has_catalog = np.any(np.asarray(result.sources["row"]) >= 0)
-    drawn = "those of the catalog" if has_catalog else "those of the field's sources"
-    noise = "in ramps it has its photon noise" if in_ramps else "it has no photon noise of its own"
+    if has_catalog:
+        drawn = "those of the catalog"
+    else:
+        drawn = "those of the field's sources"
+    if in_ramps:
+        noise = "in ramps it has its photon noise"
+    else:
+        noise = "it has no photon noise of its own"
     page.section("method", drawn=drawn, apart=f"{APART:g}", noise=noise)
     report.write(path, overwrite=True)
 
@@ -78,11 +90,18 @@ def _headline(result):
     row = {}
     for question in QUESTIONS:
         curve = result.curve(question)
-        row[f"limit_{question}"] = np.nan if curve is None else curve.limit
-        row[f"limit_{question}_err"] = np.nan if curve is None else curve.limit_err
+        if curve is None:
+            row[f"limit_{question}"] = np.nan
+            row[f"limit_{question}_err"] = np.nan
+        else:
+            row[f"limit_{question}"] = curve.limit
+            row[f"limit_{question}_err"] = curve.limit_err
     row |= result.errors()
     pulls = result.empty_pulls[np.isfinite(result.empty_pulls)]
-    row["empty"] = float(mad_std(pulls)) if len(pulls) else np.nan
+    if len(pulls):
+        row["empty"] = float(mad_std(pulls))
+    else:
+        row["empty"] = np.nan
     row["false_rate"] = result.false_rate()
     return row
 
@@ -115,16 +134,16 @@ def _curves(result):
 
 def _fluxes(result):
     """Measured over true fluxes, and pulls."""
-    figure, [[left, right]] = new_figure(1, 2, size=(5.0, 3.4))
+    figure, [[bias_axes, right]] = new_figure(1, 2, size=(5.0, 3.4))
     sources = result.sources
     magnitude = np.asarray(sources["magnitude"])
     true, flux, error = (
         np.asarray(sources[name].to_value(FNU)) for name in ("flux_true", "flux", "flux_err")
     )
     good = np.isfinite(flux) & (error > 0)
-    left.plot(magnitude[good], (flux / true)[good], ".", ms=3, color="0.5")
-    left.axhline(1.0, color="0.7", lw=0.8, ls=":")
-    left.set(xlabel="true magnitude (AB)", ylabel="measured / true flux", ylim=(0, 2))
+    bias_axes.plot(magnitude[good], (flux / true)[good], ".", ms=3, color="0.5")
+    bias_axes.axhline(1.0, color="0.7", lw=0.8, ls=":")
+    bias_axes.set(xlabel="true magnitude (AB)", ylabel="measured / true flux", ylim=(0, 2))
     table = result.recovery("magnitude")
     middle = (table["low"] + table["high"]) / 2
     right.plot(magnitude[good], ((flux - true) / error)[good], ".", ms=3, color="0.5")
@@ -145,13 +164,17 @@ def _map(result):
     if curve is None:
         return None
     sources = result.sources
-    middle = curve.limit if np.isfinite(curve.limit) else curve.middle
-    near = np.abs(np.asarray(sources["magnitude"]) - middle) < _NEAR_LIMIT
-    detected = near & np.asarray(sources["detected"])
-    measured = near & np.asarray(sources["recovered"]) & ~detected
-    neither = near & ~detected & ~measured
+    if np.isfinite(curve.limit):
+        middle = curve.limit
+    else:
+        middle = curve.middle
+    at_limit = np.abs(np.asarray(sources["magnitude"]) - middle) < _NEAR_LIMIT
+    detected = at_limit & np.asarray(sources["detected"])
+    measured = at_limit & np.asarray(sources["recovered"]) & ~detected
+    neither = at_limit & ~detected & ~measured
     figure, [[ax]] = new_figure(1, 1, size=(5.2, 4.6))
-    x, y = np.asarray(sources["x"]), np.asarray(sources["y"])
+    x = np.asarray(sources["x"])
+    y = np.asarray(sources["y"])
     style = {"ls": "none", "ms": 4}
     ax.plot(x[detected], y[detected], "o", color="#c2410c", label="detected", **style)
     ax.plot(x[measured], y[measured], "o", mfc="none", color="#1d4ed8", label="measured", **style)

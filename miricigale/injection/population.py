@@ -151,10 +151,10 @@ def measured_population(shapes, flux, snr, good):
     """
     fine = np.asarray(shapes["flux"].value)
     # a NaN fails every comparison
-    used = good & (snr > _WELL_MEASURED) & (flux > 0) & (fine > 0)
-    rows = QTable(shapes[used], copy=True)
-    rows["magnitude"] = ab_magnitude(flux[used] * FNU)
-    rows["color"] = ab_magnitude(fine[used] * FNU) - rows["magnitude"]
+    usable = good & (snr > _WELL_MEASURED) & (flux > 0) & (fine > 0)
+    rows = QTable(shapes[usable], copy=True)
+    rows["magnitude"] = ab_magnitude(flux[usable] * FNU)
+    rows["color"] = ab_magnitude(fine[usable] * FNU) - rows["magnitude"]
     return rows["profile", "half_light_radius", "sersic_index", "axis_ratio", "magnitude", "color"]
 
 
@@ -212,14 +212,14 @@ def read_sources(catalog, band, prior_band, wcs):
         extended = profile == "sersic"
     _check_shapes(shapes, extended)
     rows["profile"] = np.where(extended, "sersic", "point")
-    plain = {
+    columns = {
         "half_light_radius": 0.0,
         "sersic_index": 1.0,
         "axis_ratio": 1.0,
         "position_angle": 0.0,
     }
     for name in SHAPE:
-        rows[name] = np.where(extended, shapes[name], plain[name]) * units.get(name, 1)
+        rows[name] = np.where(extended, shapes[name], columns[name]) * units.get(name, 1)
     rows["flux"] = flux * FNU
     prior_flux = np.full(len(table), np.nan)
     if prior_band == band:
@@ -272,10 +272,10 @@ def counts_slope(magnitude, limit):
     slope : float
         Per magnitude, from 0 to 0.6.
     """
-    below = limit - magnitude[magnitude < limit]
-    if not len(below):
+    brighter = limit - magnitude[magnitude < limit]
+    if not len(brighter):
         return 0.0
-    return float(np.clip(1.0 / (np.log(10.0) * np.mean(below)), 0.0, _STEEPEST))
+    return float(np.clip(1.0 / (np.log(10.0) * np.mean(brighter)), 0.0, _STEEPEST))
 
 
 def draw_magnitudes(n, slope, low, high, rng):
@@ -337,8 +337,8 @@ def draw_sources(population, n, star_share, slope, magnitudes, rng):
     for star, m in zip(is_star, magnitude, strict=True):
         pool = donors[bool(star)]
         n_near = max(_FEWEST_NEIGHBORS, int(_NEIGHBOR_SHARE * len(pool)))
-        near = np.argsort(np.abs(pool["magnitude"] - m), kind="stable")[:n_near]
-        rows.append(pool[int(near[rng.integers(len(near))])])
+        nearest = np.argsort(np.abs(pool["magnitude"] - m), kind="stable")[:n_near]
+        rows.append(pool[int(nearest[rng.integers(len(nearest))])])
     radius = np.array([row["half_light_radius"].value for row in rows])
     sources = QTable({"profile": np.where(is_star, "point", "sersic")})
     sources["half_light_radius"] = np.where(is_star, 0.0, radius) * ANGLE
@@ -352,7 +352,7 @@ def draw_sources(population, n, star_share, slope, magnitudes, rng):
     return sources
 
 
-def draw_places(usable, n, apart, rng):
+def draw_places(usable, n, separation, rng):
     """
     Draw places on usable pixels, apart from each other.
 
@@ -362,7 +362,7 @@ def draw_places(usable, n, apart, rng):
         Pixels on which a source may be.
     n : int
         How many.
-    apart : float
+    separation : float
         Least distance in pixels.
     rng : `~numpy.random.Generator`
         Random numbers.
@@ -380,7 +380,7 @@ def draw_places(usable, n, apart, rng):
             break
         k = rng.integers(len(x))
         place = np.array([x[k], y[k]]) + rng.uniform(-0.5, 0.5, 2)
-        if m and np.min(np.hypot(*(places[:m] - place).T)) < apart:
+        if m and np.min(np.hypot(*(places[:m] - place).T)) < separation:
             continue
         places[m] = place
         m += 1

@@ -253,7 +253,9 @@ def _with_charge(raw, added, maps, y, x, integration, rng):
 
     def at(values):
         values = np.asarray(values, float)
-        return values[y, x][:, None] if values.ndim == 2 and values.size > 1 else values
+        if values.ndim == 2 and values.size > 1:
+            return values[y, x][:, None]
+        return values
 
     level = np.asarray(at(maps.bias), float)
     if maps.reset is not None:

@@ -158,11 +158,13 @@ class InjectionResult(Interactive):
         if by != "magnitude":
             for question in QUESTIONS:
                 curve = self._curve(question, chosen)
-                limits[question] = np.nan if curve is None else curve.limit
-        rows = [
-            self._recovery_row(name, low, high, member, limits)
-            for name, low, high, member in self._bins(by, chosen)
-        ]
+                if curve is None:
+                    limits[question] = np.nan
+                else:
+                    limits[question] = curve.limit
+        rows = []
+        for name, low, high, member in self._bins(by, chosen):
+            rows.append(self._recovery_row(name, low, high, member, limits))
         return _described(rows, "recovery")
 
     def _bins(self, by, chosen):
@@ -197,9 +199,16 @@ class InjectionResult(Interactive):
             row[f"{column}_low"] = share_low
             row[f"{column}_high"] = share_high
         for question in QUESTIONS:
-            curve = self._curve(question, member) if limits else None
-            row[f"limit_{question}"] = np.nan if curve is None else curve.limit
-            row[f"limit_{question}_err"] = np.nan if curve is None else curve.limit_err
+            if limits:
+                curve = self._curve(question, member)
+            else:
+                curve = None
+            if curve is None:
+                row[f"limit_{question}"] = np.nan
+                row[f"limit_{question}_err"] = np.nan
+            else:
+                row[f"limit_{question}"] = curve.limit
+                row[f"limit_{question}_err"] = curve.limit_err
         return row | _errors(sources[member])
 
     def purity(self, by="magnitude"):
@@ -233,9 +242,10 @@ class InjectionResult(Interactive):
             bins = _classes(np.asarray(table["size"].value), everything, "arcsec")
         elif by == "place":
             place = np.asarray(table["place"])
-            bins = [
-                (name, np.nan, np.nan, place == name) for name in PLACES if np.any(place == name)
-            ]
+            bins = []
+            for name in PLACES:
+                if np.any(place == name):
+                    bins.append((name, np.nan, np.nan, place == name))
         else:
             bins = _neighbors(np.asarray(table["neighbor_light"]), everything)
         rows = [self._purity_row(*group) for group in bins]
@@ -250,7 +260,10 @@ class InjectionResult(Interactive):
         row |= {"n_positive": n_positive, "n_negative": n_negative}
         counts = {"purity": n_negative, "purity_low": most, "purity_high": fewest}
         for column, n in counts.items():
-            row[column] = 1.0 - n / n_positive if n_positive else np.nan
+            if n_positive:
+                row[column] = 1.0 - n / n_positive
+            else:
+                row[column] = np.nan
         return row
 
     def errors(self):
@@ -279,9 +292,12 @@ class InjectionResult(Interactive):
         rate : float
             NaN without empty positions.
         """
-        threshold = self.meta["threshold"] if threshold is None else threshold
+        if threshold is None:
+            threshold = self.meta["threshold"]
         pulls = self.empty_pulls[np.isfinite(self.empty_pulls)]
-        return float(np.mean(pulls > threshold)) if len(pulls) else np.nan
+        if len(pulls):
+            return float(np.mean(pulls > threshold))
+        return np.nan
 
     @functools.cached_property
     def summary(self):
@@ -306,7 +322,8 @@ def _steps(values, chosen):
         return
     number = np.floor(np.where(chosen, values, 0.0) / _STEP).astype(int)
     for k in np.unique(number[chosen]):
-        low, high = k * _STEP, (k + 1) * _STEP
+        low = k * _STEP
+        high = (k + 1) * _STEP
         yield f"{low:.1f} - {high:.1f}", low, high, chosen & (number == k)
 
 
@@ -318,8 +335,11 @@ def _classes(values, chosen, unit):
     if len(edges) == 1:
         edges = np.append(edges, edges)
     for k, (low, high) in enumerate(itertools.pairwise(edges)):
-        below = values <= high if k == len(edges) - 2 else values < high
-        member = chosen & (values >= low) & below
+        if k == len(edges) - 2:
+            inside = values <= high
+        else:
+            inside = values < high
+        member = chosen & (values >= low) & inside
         if member.any():
             yield f"{low:.2f} - {high:.2f} {unit}", low, high, member
 
@@ -336,7 +356,8 @@ def _share(values):
     """Share of values that are True, and its 68 % interval."""
     if not len(values):
         return [np.nan] * 3
-    k, n = int(np.count_nonzero(values)), len(values)
+    k = int(np.count_nonzero(values))
+    n = len(values)
     low, high = binom_conf_interval(k, n, interval="wilson")
     return [k / n, float(low), float(high)]
 
@@ -371,7 +392,12 @@ def _described(rows, kind):
     counts = ("n", "n_measured", "n_positive", "n_negative")
     table = QTable()
     for name, text in texts.items():
-        kind = str if name == "name" else int if name in counts else float
+        if name == "name":
+            kind = str
+        elif name in counts:
+            kind = int
+        else:
+            kind = float
         table[name] = np.array([row[name] for row in rows], kind)
         table[name].info.description = text
     return table

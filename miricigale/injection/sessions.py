@@ -186,8 +186,8 @@ class Injection(Interactive, InjectionSettings):
             tuple(paths), Reducer() if reducer is None else reducer, pixel_scale, align
         )
         folder = Path(folder)
-        beside = folder.with_name(f"{folder.name}-reduced")
-        mosaic = exposures.reduce(beside, n_threads=n_threads, progress_bar=progress_bar)
+        output = folder.with_name(f"{folder.name}-reduced")
+        mosaic = exposures.reduce(output, n_threads=n_threads, progress_bar=progress_bar)
         return run_injection(
             self,
             mosaic,

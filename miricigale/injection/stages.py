@@ -168,7 +168,7 @@ def _states(config, unit):
     # paths may name an extension
     paths = sorted({file_place(path)[0] for path in task.files})
     states = {path: os.stat(path) for path in paths}
-    return {path: [one.st_size, one.st_mtime_ns] for path, one in states.items()}
+    return {path: [status.st_size, status.st_mtime_ns] for path, status in states.items()}
 
 
 def _bytes(config, unit):
@@ -200,7 +200,10 @@ def field_stage(context, _):
     detections = [_detection_rows(table, base.model) for table in (base.detections, base.negatives)]
     for name, rows in zip(("detections", "negatives"), detections, strict=True):
         context.save_rows(f"field/{name}", rows)
-    pulls = np.zeros(0) if base.empty_pulls is None else np.asarray(base.empty_pulls)
+    if base.empty_pulls is None:
+        pulls = np.zeros(0)
+    else:
+        pulls = np.asarray(base.empty_pulls)
     context.save_table("field/empty.fits", QTable({"pull": pulls}))
     context.save_image("field/model.fits", base.model)
     for name, psf in zip(("psf", "prior_psf"), base.psfs, strict=True):
@@ -272,7 +275,10 @@ def trial_stage(context, unit):
 
 
 def _usable(base, field, task):
-    prior = None if task.inputs is None else task.inputs.highres.read()
+    if task.inputs is None:
+        prior = None
+    else:
+        prior = task.inputs.highres.read()
     return field.usable(base.model, prior)
 
 
@@ -343,7 +349,10 @@ def run_injection(
     """Run a `~miricigale.injection.Injection`; see its method ``run``."""
     foreign = sorted(set(options) & set(_FOREIGN))
     check_that(not foreign, "options", f"others than {list(_FOREIGN)}", foreign)
-    file = image if isinstance(image, MosaicFile) else MosaicFile(image)
+    if isinstance(image, MosaicFile):
+        file = image
+    else:
+        file = MosaicFile(image)
     inputs = None
     if highres is not None:
         inputs = Inputs.of(file, highres, **{"psf_stars": None, **options})
@@ -360,7 +369,7 @@ def run_injection(
         "options": as_text(options),
         "exposures": None if exposures is None else as_text(_plain_exposures(exposures)),
     }
-    settings = {one.name: getattr(injection, one.name) for one in dataclasses.fields(injection)}
+    settings = {item.name: getattr(injection, item.name) for item in dataclasses.fields(injection)}
     del settings["n_trials"], settings["seed"]
     settings["catalog"] = _catalog_text(injection.catalog)
     if isinstance(injection.preset, DetectionPreset):
@@ -375,7 +384,10 @@ def run_injection(
     )
     # faults of the user's are refused here rather than in a trial
     field = Task.of(config, injection.seed).field(n_threads)
-    _ = field.photometers if inputs is not None else field.photometer
+    if inputs is not None:
+        _ = field.photometers
+    else:
+        _ = field.photometer
     Task.of(config, injection.seed).sources(field, file.header.wcs)
     runner = StudyRunner(
         config, folder, injection_stages, executor=executor, redo=redo, progress_bar=progress_bar
@@ -387,7 +399,7 @@ def run_injection(
 
 def _plain_exposures(exposures):
     """Ramps and settings as `as_text` takes them."""
-    values = {one.name: getattr(exposures, one.name) for one in dataclasses.fields(exposures)}
+    values = {item.name: getattr(exposures, item.name) for item in dataclasses.fields(exposures)}
     values["paths"] = [absolute(path) for path in exposures.paths]
     values["reducer"] = exposures.reducer.replace(n_threads=None)
     return values

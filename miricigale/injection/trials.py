@@ -103,7 +103,8 @@ def measure_base(field, injection):
     base : `Base`
     """
     measured, pixels, segments, catalog = field.measure()
-    image, result = measured.image, measured.result
+    image = measured.image
+    result = measured.result
     psfs = field.psfs(result)
     n = len(catalog)
     shapes = field.shapes(pixels, segments, catalog, psfs)
@@ -113,9 +114,10 @@ def measure_base(field, injection):
     check_that(usable.any(), "image", "a field of which some source is measured", "none")
     good = result.flags[:n] & ~int(_HARMLESS) == 0
     population = measured_population(shapes, flux, result.snr[:n], good)
-    error_of_points = (
-        np.median(error[usable & good]) if (usable & good).any() else np.median(error[usable])
-    )
+    if (usable & good).any():
+        error_of_points = np.median(error[usable & good])
+    else:
+        error_of_points = np.median(error[usable])
     limit = float(ab_magnitude(5 * error_of_points * FNU))
     fwhm = result.psf_fwhm.to_value(ANGLE)
     good_pixels = field.usable(image, pixels.prior)
@@ -124,7 +126,10 @@ def measure_base(field, injection):
     former = shapes
     if field.has_prior:
         former = QTable({"sky": catalog["sky"]})
-        former["flux"] = catalog["flux"] if "flux" in catalog.colnames else shapes["flux"]
+        if "flux" in catalog.colnames:
+            former["flux"] = catalog["flux"]
+        else:
+            former["flux"] = shapes["flux"]
     return Base(
         table=measured.table,
         former=former,
@@ -204,7 +209,10 @@ def injected_sources(injection, catalog, base, usable, wcs, number):
         ``row`` (that of an own catalog, -1 otherwise), ``sky``, ``profile``, shapes, ``flux``, ``prior_flux``.
     """
     rng = stream(injection.seed, "injection", number)
-    n = base.facts["n_injected"] if injection.n_sources is None else injection.n_sources
+    if injection.n_sources is None:
+        n = base.facts["n_injected"]
+    else:
+        n = injection.n_sources
     if n == 0:
         return QTable({"row": np.zeros(0, int)})
     rows = np.full(n, -1)
@@ -224,8 +232,8 @@ def injected_sources(injection, catalog, base, usable, wcs, number):
         )
     sources["row"] = rows
     if "sky" not in sources.colnames:
-        apart = APART * base.facts["fwhm"] / pixel_scale(wcs)
-        xy = draw_places(usable, len(sources), apart, rng)
+        separation = APART * base.facts["fwhm"] / pixel_scale(wcs)
+        xy = draw_places(usable, len(sources), separation, rng)
         check_that(len(xy), "image", "large enough for sources", "no free place")
         if injection.n_sources is not None and len(xy) < len(sources):
             wanted = f"at most {len(xy)}, which have room {APART:g} widths of the PSF apart"
@@ -286,7 +294,8 @@ def run_trial(field, injection, base, sources, image_file=None):
         )
         return QTable(), measured.table
     measured, *_ = field.measure(sources, base.psfs, base.former, image_file)
-    image, result = measured.image, measured.result
+    image = measured.image
+    result = measured.result
     rows = QTable({"row": sources["row"], "sky": sources["sky"].icrs})
     rows["kind"] = np.where(np.asarray(sources["profile"]) == "point", "star", "galaxy")
     xy = np.stack(image.wcs.world_to_pixel(sources["sky"]), axis=-1)
@@ -341,6 +350,6 @@ def place_names(xy, shape):
 
 def _taken(values, rows):
     """Values of rows; NaN for those of -1."""
-    taken = np.full(len(rows), np.nan)
-    taken[rows >= 0] = np.asarray(values)[rows[rows >= 0]]
-    return taken
+    labels = np.full(len(rows), np.nan)
+    labels[rows >= 0] = np.asarray(values)[rows[rows >= 0]]
+    return labels

@@ -39,7 +39,9 @@ def source_pages(save, folder, names, title, facts, order, shown, entry, sheet):
         strip for each (`PIL.Image.Image`), and where their stretches end.
     """
     for k, part in enumerate(chunks(len(order), CHUNK)):
-        rows, stem, tops = order[part], f"{folder}/{names[1]}/{k:03d}", {}
+        rows = order[part]
+        stem = f"{folder}/{names[1]}/{k:03d}"
+        tops = {}
         pictured = rows[shown[rows]]
         if pictured.size:
             picture, limits = sheet(pictured)
@@ -73,7 +75,9 @@ def rounded(values, digits=4):
     if not np.isfinite(values):
         return None
     value = float(f"{float(values):.{digits}g}")
-    return int(value) if value.is_integer() and abs(value) < 1e9 else value
+    if value.is_integer() and abs(value) < 1e9:
+        return int(value)
+    return value
 
 
 def _json(values):

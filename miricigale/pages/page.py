@@ -118,12 +118,17 @@ class Page:
             return self.text(empty)
         reasons = {cell.reason: cell for row in rows for cell in row if isinstance(cell, Missing)}
         # a single reason is not numbered
-        marks = {
-            reason: Markup("{}<sup>{}</sup>").format(cell, k) if len(reasons) > 1 else cell
-            for k, (reason, cell) in enumerate(reasons.items(), start=1)
-        }
+        marks = {}
+        for k, (reason, cell) in enumerate(reasons.items(), start=1):
+            if len(reasons) > 1:
+                marks[reason] = Markup("{}<sup>{}</sup>").format(cell, k)
+            else:
+                marks[reason] = cell
         shown = [[marks[c.reason] if isinstance(c, Missing) else c for c in row] for row in rows]
-        words = range(text) if isinstance(text, int) else text
+        if isinstance(text, int):
+            words = range(text)
+        else:
+            words = text
         return self._add("table", shown, header, set(words), caption, marks)
 
     def figure(self, figure, caption=""):

@@ -57,11 +57,13 @@ def image_of(figure, dpi):
     if figure.get_layout_engine() is None:
         figure.set_layout_engine("constrained")
     # dates and the version of matplotlib are omitted, and ids do not depend on chance
-    kind, options = "png", {"format": "png", "metadata": {"Software": None}, "dpi": 2 * dpi}
+    kind = "png"
+    options = {"format": "png", "metadata": {"Software": None}, "dpi": 2 * dpi}
     # faster than the default level, and smaller for pixels that are repeated
     options["pil_kwargs"] = {"compress_level": 2}
     if _count_marks(figure) <= _MOST_MARKS:
-        kind, options = "svg+xml", {"format": "svg", "metadata": {"Date": None, "Creator": None}}
+        kind = "svg+xml"
+        options = {"format": "svg", "metadata": {"Date": None, "Creator": None}}
     buffer = io.BytesIO()
     # laid out here: savefig draws all of a figure once more for its layout
     figure.set_dpi(options.get("dpi", figure.dpi))

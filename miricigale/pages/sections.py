@@ -48,7 +48,8 @@ class SectionWriter:
     facts = {}
 
     def __init__(self, report, texts):
-        self.report, self.texts = report, texts
+        self.report = report
+        self.texts = texts
         self._section = None
 
     def sentence(self, name, /, **facts):
@@ -62,7 +63,10 @@ class SectionWriter:
     def section(self, name, text="text", /, **facts):
         """Begin a section, with the paragraph ``text`` where it has that."""
         self._section = name
-        paragraph = self.sentence(text, **facts) if text in self.texts[name] else ""
+        if text in self.texts[name]:
+            paragraph = self.sentence(text, **facts)
+        else:
+            paragraph = ""
         title, closed = (self.texts[name].get(key, "") for key in ("title", "closed"))
         title = sentence(title, self.facts | facts)
         self.report.section(title, paragraph, closed=sentence(closed, self.facts | facts))
@@ -94,14 +98,18 @@ class SectionWriter:
 
     def table(self, name, rows, /, **facts):
         """Add a table as it is declared, from dictionaries; without columns it has all of their keys."""
-        table, rows, facts = self.texts[self._section][name], list(rows), self.facts | facts
-        keys = list(rows[0]) if rows else ()
-        columns = {
-            sentence(header, facts): column
-            for header, *column in table.get("columns", [(key, key) for key in keys])
-            if column[0] in keys
-        }
+        table = self.texts[self._section][name]
+        rows = list(rows)
+        facts = self.facts | facts
+        if rows:
+            keys = list(rows[0])
+        else:
+            keys = ()
+        columns = {}
+        for header, *column in table.get("columns", [(key, key) for key in keys]):
+            if column[0] in keys:
+                columns[sentence(header, facts)] = column
         cells = [[cell_of(row, column) for column in columns.values()] for row in rows]
-        about = {key: sentence(table.get(key, ""), facts) for key in ("caption", "empty")}
+        texts = {key: sentence(table.get(key, ""), facts) for key in ("caption", "empty")}
         with self.folding(name, **facts):
-            self.report.table(cells, header=tuple(columns), text=table.get("text", 1), **about)
+            self.report.table(cells, header=tuple(columns), text=table.get("text", 1), **texts)

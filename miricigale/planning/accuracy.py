@@ -6,9 +6,9 @@ from miricigale.evaluation import OUTLIER, bootstrap
 from miricigale.evaluation.estimates import median, scatter, weighted_share
 
 
-def _share(found, among):
+def _share(hits, population):
     """Share of sources found, by row: a statistic for `~miricigale.evaluation.bootstrap`."""
-    return np.sum(found, axis=-1) / np.sum(among, axis=-1)
+    return np.sum(hits, axis=-1) / np.sum(population, axis=-1)
 
 
 def sky_weights(sources, agn_limit):
@@ -34,14 +34,15 @@ def columns_of(sources, agn_limit):
     """What the numbers are made of, by source."""
     z, f = (np.asarray(sources[name], float) for name in ("redshift", "frac_agn"))
     dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
-    weight, agn = sky_weights(sources, agn_limit), f >= agn_limit
+    weight = sky_weights(sources, agn_limit)
+    agn = f >= agn_limit
     # AGN of other skies are for completeness and purity
     first = np.where(np.asarray(sources.columns.get("sky", 0)) > 0, np.nan, 1.0)
-    known = np.isfinite(dz * first)
+    compared = np.isfinite(dz * first)
     columns = {
         "dz": first * dz,
-        "known": known,
-        "outlier": known & (np.abs(dz) > OUTLIER),
+        "known": compared,
+        "outlier": compared & (np.abs(dz) > OUTLIER),
         "z_std": first * np.asarray(sources["redshift_std"], float) / (1 + z),
         "df": first * (np.asarray(sources["frac_agn_mean"], float) - f),
         "f_std": first * np.asarray(sources["frac_agn_std"], float),
@@ -73,7 +74,8 @@ def accuracy(sources, *, agn_limit=0.4, seed=0):
         ``z_width`` and ``frac_width``, median posterior standard deviations (of z over 1+z);
         ``completeness`` and ``purity`` of the selected AGN, the only ones for which AGN of other skies count.
     """
-    columns, numbers = columns_of(sources, agn_limit), {}
+    columns = columns_of(sources, agn_limit)
+    numbers = {}
     for name, (statistic, *wanted) in NUMBERS.items():
         values = [columns[key] for key in wanted]
         if statistic is _share:

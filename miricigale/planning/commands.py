@@ -43,7 +43,8 @@ def plan_table(*, quick=False):
     from miricigale.planning.config import NoiseSection
 
     exposures = ceers_exposures(SkyCoord(0 * u.deg, 0 * u.deg), 0 * u.deg, quick=quick)
-    noise, rows = NoiseSection(), []
+    noise = NoiseSection()
+    rows = []
     for name in dict.fromkeys(e.filter for e in exposures):
         mine = [e for e in exposures if e.filter == name]
         row = BandPlan(mine[0], len(mine), background_level(name), noise).numbers()
@@ -104,7 +105,10 @@ def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=F
     comparison = comparison_table(planner, plans)
     comparison.meta |= {"answer": answer(planner, plans, comparison)}
     comparison.meta |= {"noise": dataclasses.asdict(config.noise)}
-    areas = area_table(planner, planner.divide()) if config.survey.areas else None
+    if config.survey.areas:
+        areas = area_table(planner, planner.divide())
+    else:
+        areas = None
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / "plan.toml", overwrite=overwrite) as partial:
         partial.write_text(config.to_toml(), encoding="utf-8")

@@ -16,10 +16,14 @@ def _row(planner, plan, numbers):
         row |= {name: number.value, f"{name}_err": number.error}
     # of all sources of the sample
     agn = np.asarray(plan.sources["frac_agn"]) >= planner.config.agn.limit
-    detected, weight = planner.common([plan]), sky_weights(plan.sources, planner.config.agn.limit)
-    found = agn & detected & np.asarray(plan.sources["selected"], bool)
-    scale = planner.density * plan.area.to_value(u.arcmin**2) if plan.bands else np.nan
-    for name, chosen in (("n_detected", detected), ("n_agn", found), ("n_agn_true", agn)):
+    detected = planner.common([plan])
+    weight = sky_weights(plan.sources, planner.config.agn.limit)
+    recovered = agn & detected & np.asarray(plan.sources["selected"], bool)
+    if plan.bands:
+        scale = planner.density * plan.area.to_value(u.arcmin**2)
+    else:
+        scale = np.nan
+    for name, chosen in (("n_detected", detected), ("n_agn", recovered), ("n_agn_true", agn)):
         share = weighted_share(weight * chosen, weight)
         row |= {name: scale * share.value, f"{name}_err": scale * share.error}
     return row

@@ -128,8 +128,8 @@ class ExposureSection(Section):
         """``"time"``, ``"depth"`` or ``"dithers"`` of each band; the default for other bands is F770W's."""
         values = getattr(self, key)
         if not values:
-            known = _CEERS[key]
-            values = [known.get(name, known["miri.f770w"]) for name in self.bands]
+            survey_value = _CEERS[key]
+            values = [survey_value.get(name, survey_value["miri.f770w"]) for name in self.bands]
         return tuple(values) * (len(self.bands) // len(values))
 
 
@@ -320,14 +320,16 @@ class PlanConfig(Configuration):
     overheads: OverheadSection = dataclasses.field(default_factory=OverheadSection)
 
     def __post_init__(self):
-        exposures, agn, n = self.exposures, self.agn, len(self.exposures.bands)
+        exposures = self.exposures
+        agn = self.agn
+        n = len(self.exposures.bands)
         self.check(n, "exposures.bands", "must name at least one filter")
         wanted = f"must have one number, or one per band ({n})"
         for key in ("depth" if exposures.depth else "time", "dithers"):
             self.check_length(f"exposures.{key}", (0, 1, n), wanted)
         if not exposures.depth:
-            least = min(exposures.by_band("time"))
-            self.check(least > 0, "exposures.time", "must be positive", least)
+            shortest = min(exposures.by_band("time"))
+            self.check(shortest > 0, "exposures.time", "must be positive", shortest)
         good = not (exposures.hours and exposures.depth)
         self.check(good, "exposures.hours", "must be left out with depths", exposures.hours)
         wanted = f"must have one number per fracAGN ({len(agn.frac_agn)})"
@@ -352,10 +354,10 @@ class PlanConfig(Configuration):
         """Bands of one of the ``sets``, in order of wavelength."""
         if name == "all":
             return self.exposures.bands
-        found = [one.strip() for one in name.split(",") if one.strip()]
-        found = [one if one.startswith("miri.") else f"miri.{one}" for one in found]
+        bands = [band.strip() for band in name.split(",") if band.strip()]
+        bands = [band if band.startswith("miri.") else f"miri.{band}" for band in bands]
         order = imager_filters()
-        return tuple(sorted(found, key=lambda one: order.index(one) if one in order else -1))
+        return tuple(sorted(bands, key=lambda band: order.index(band) if band in order else -1))
 
 
 def load_plan(path=None, *, overrides=None):
@@ -386,5 +388,8 @@ def load_plan(path=None, *, overrides=None):
     >>> config.exposures.time
     (900.0,)
     """
-    texts = [] if path is None else [(str(path), read_text(path))]
+    if path is None:
+        texts = []
+    else:
+        texts = [(str(path), read_text(path))]
     return PlanConfig.from_texts(texts, overrides)

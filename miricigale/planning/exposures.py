@@ -80,8 +80,8 @@ class BandPlan:
 
     @property
     def _noise(self):
-        known = {"n_dithers": self.n_dithers, "residual": self.noise.residual or None}
-        return self._light | known
+        options = {"n_dithers": self.n_dithers, "residual": self.noise.residual or None}
+        return self._light | options
 
     @functools.cached_property
     def limit(self):
@@ -170,7 +170,8 @@ class BandPlan:
 
 def background_options(config):
     """Arguments of `band_background`, but for the filter, and of `background_text`."""
-    options, position = config.background, None
+    options = config.background
+    position = None
     if options.ra >= 0:
         position = SkyCoord(options.ra * u.deg, options.dec * u.deg)
     levels = {"filters": config.exposures.bands, "levels": options.level}
@@ -179,7 +180,8 @@ def background_options(config):
 
 def _band_plan(filter, time, n_dithers, config):
     """The exposures of one band that last a time."""
-    options, background = config.exposures, band_background(filter, **background_options(config))
+    options = config.exposures
+    background = band_background(filter, **background_options(config))
     # the time for which Exposure.from_time allows is of the low background
     brighter = saturation_time(filter) / saturation_time(filter, background=background)
     exposure = Exposure.from_time(
@@ -198,7 +200,10 @@ def _band_plan(filter, time, n_dithers, config):
 def _detector(photom, date):
     """The imager's detector, with the response of a day where one is given."""
     with of_option("[exposures] photom, date:", ValueError):
-        response = imager_response(photom, date=date) if photom or date else ()
+        if photom or date:
+            response = imager_response(photom, date=date)
+        else:
+            response = ()
     return miri_detector().replace(response=response)
 
 
@@ -237,12 +242,16 @@ def band_plans(config, *, share=1.0, bands=None):
     -------
     plans : dict of str to `BandPlan`
     """
-    options, plans = config.exposures, {}
+    options = config.exposures
+    plans = {}
     values = options.by_band("depth" if options.depth else "time")
     for name, value, dithers in zip(options.bands, values, options.by_band("dithers"), strict=True):
         if bands is not None and name not in bands:
             continue
-        time = _time_to(value, name, dithers, config) if options.depth else value * u.s
+        if options.depth:
+            time = _time_to(value, name, dithers, config)
+        else:
+            time = value * u.s
         plans[name] = _band_plan(name, share * time, dithers, config)
     return plans
 

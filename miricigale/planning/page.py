@@ -34,9 +34,10 @@ def write_page(path, planner, plans, comparison, areas=None, *, overwrite=False)
     -------
     path : `pathlib.Path`
     """
-    config, miri = planner.config, [plan for plan in plans if plan.bands]
+    config = planner.config
+    miri = [plan for plan in plans if plan.bands]
     best = next(plan for plan in miri if plan.name == comparison["plan"][1])
-    every = max(miri, key=lambda plan: len(plan.bands))
+    deepest = max(miri, key=lambda plan: len(plan.bands))
     report = Page(f"Plan {config.plan.name}", subtitle=comparison.meta["answer"])
     page = SectionWriter(report, declared("miricigale.planning"))
     _notices(page, planner)
@@ -47,8 +48,8 @@ def write_page(path, planner, plans, comparison, areas=None, *, overwrite=False)
     page.table("table", rows, n=rows[0]["n"], min_detected=planner.min_detected, merit=merit)
     page.table("accuracy", rows)
     page.figure("figure", _comparison_figure(comparison))
-    _write_exposures(page, config, miri, every)
-    shown = list({plan.name: plan for plan in (plans[0], best, every)}.values())
+    _write_exposures(page, config, miri, deepest)
+    shown = list({plan.name: plan for plan in (plans[0], best, deepest)}.values())
     chosen = planner.common(plans)
     page.section("fits")
     fits = {plan.name: plan.sources[chosen] for plan in shown}
@@ -69,21 +70,31 @@ def answer(planner, plans, comparison):
     """What the best set reaches and finds, in one sentence."""
     row = comparison[1]
     plan = next(plan for plan in plans if plan.name == row["plan"])
-    bands, facts = plan.bands.values(), {"limit": planner.config.agn.limit}
-    facts["mix"] = " of a made-up mix" if planner.sources.meta.get("agn") == "mix" else ""
+    bands = plan.bands.values()
+    facts = {"limit": planner.config.agn.limit}
+    if planner.sources.meta.get("agn") == "mix":
+        facts["mix"] = " of a made-up mix"
+    else:
+        facts["mix"] = ""
     facts["bands"] = " + ".join(name.removeprefix("miri.").upper() for name in plan.bands)
     for key, values in {
         "times": [f"{band.time.to_value(u.s):.0f}" for band in bands],
         "dithers": [str(band.n_dithers) for band in bands],
         "limits": [f"{band.errors().limiting_magnitude(band.filter).value:.1f}" for band in bands],
     }.items():
-        same = key != "limits" and len(set(values)) == 1
-        facts[key] = values[0] if same else ", ".join(values)
+        is_shared = key != "limits" and len(set(values)) == 1
+        if is_shared:
+            facts[key] = values[0]
+        else:
+            facts[key] = ", ".join(values)
     for name, spec in (("n_agn", ".1f"), ("n_agn_true", ".1f"), ("purity", ".0f %")):
         facts[name] = number(row[name], spec, "not known", error=row[f"{name}_err"])
     facts |= {"area": f"{plan.area.value:.1f}", "hours": f"{plan.time.to_value(u.h):.1f}"}
-    known = "text" if np.isfinite(row["n_agn"]) else "no_area"
-    return str(sentence(declared("miricigale.planning")["answer"][known], facts))
+    if np.isfinite(row["n_agn"]):
+        reason = "text"
+    else:
+        reason = "no_area"
+    return str(sentence(declared("miricigale.planning")["answer"][reason], facts))
 
 
 def _entries(table):
@@ -100,14 +111,18 @@ def _entries(table):
 
 def _notices(page, planner):
     """What a reader has to know first."""
-    config, agn = planner.config, planner.config.agn
+    config = planner.config
+    agn = planner.config.agn
     skies = planner.sources.meta.get("n_skies", 1)
     n = np.count_nonzero(np.asarray(planner.sources.columns.get("sky", 0)) == 0)
     page.notice("skies" if skies > 1 else "sample", n=n, skies=skies, seed=config.plan.seed)
     page.notice("noise")
     noise = dataclasses.asdict(config.noise)
     page.notice("errors", **noise | {"fractional": 100 * noise["fractional"]})
-    models = "models_ceers" if config.sed.infrared == "ceers" else "models"
+    if config.sed.infrared == "ceers":
+        models = "models_ceers"
+    else:
+        models = "models"
     page.notice(models, model_error=100 * config.fit.model_error)
     page.notice("hours")
     if planner._caller_sources is None:
@@ -118,21 +133,22 @@ def _notices(page, planner):
         page.notice("library", library=library)
 
 
-def _write_exposures(page, config, plans, every):
+def _write_exposures(page, config, plans, full_plan):
     """The section on the exposures of all sets of bands, the one of most bands first."""
     n = config.exposures.pointings
     page.section(
         "exposures",
         "budget" if config.exposures.hours else "text",
-        plan=every.name,
-        light=sum(band.time.to_value(u.h) for band in every.bands.values()),
+        plan=full_plan.name,
+        light=sum(band.time.to_value(u.h) for band in full_plan.bands.values()),
         where="one pointing" if n == 1 else f"each of {n} pointings",
-        area=every.area.value,
-        time=every.time.to_value(u.h),
+        area=full_plan.area.value,
+        time=full_plan.time.to_value(u.h),
         hours=config.exposures.hours,
     )
-    rows, shown = [], set()
-    for plan in sorted(plans, key=lambda one: one is not every):
+    rows = []
+    shown = set()
+    for plan in sorted(plans, key=lambda candidate: candidate is not full_plan):
         for entry in _entries(plan.band_table()):
             exposure = entry["band"], entry["time"], entry["frames"]
             if exposure not in shown:
@@ -147,7 +163,8 @@ def _comparison_figure(table):
     hours = table["time"].to_value(u.h)
     labels = (r"$\Delta z / (1 + z)$", "fracAGN")
     for ax, name, label in zip(axes[0], ("z", "frac"), labels, strict=True):
-        scatter, error = table[f"{name}_scatter"], table[f"{name}_scatter_err"]
+        scatter = table[f"{name}_scatter"]
+        error = table[f"{name}_scatter_err"]
         ax.errorbar(hours, scatter, error, fmt="o", ms=5, color=MEASURED, label="scatter")
         ax.plot(hours, table[f"{name}_width"], "o", mfc="none", color=SECOND, label="width")
         for k, place in enumerate(zip(hours, scatter, strict=True)):
@@ -184,13 +201,14 @@ def _fraction_figure(fits, limit):
 def _area_figure(table):
     figure, axes = new_figure(1, 2, size=(4.6, 3.4))
     area = table["area"].to_value(u.arcmin**2)
-    left, right = axes[0]
-    z, fraction = (r"$\Delta z / (1 + z)$", "z_scatter"), ("fracAGN", "frac_scatter")
+    area_axes, right = axes[0]
+    z = (r"$\Delta z / (1 + z)$", "z_scatter")
+    fraction = ("fracAGN", "frac_scatter")
     for (label, name), color in ((z, SECOND), (fraction, MEASURED)):
         right.errorbar(area, table[name], table[f"{name}_err"], fmt="o-", color=color, label=label)
-    left.plot(area, table["n_detected"], "o-", color=SECOND, label="detected")
-    left.plot(area, table["n_agn"], "o-", color=MEASURED, label="AGN found")
-    for ax, label in ((left, "sources"), (right, "scatter of the means")):
+    area_axes.plot(area, table["n_detected"], "o-", color=SECOND, label="detected")
+    area_axes.plot(area, table["n_agn"], "o-", color=MEASURED, label="AGN found")
+    for ax, label in ((area_axes, "sources"), (right, "scatter of the means")):
         ax.set(xlabel="area (square arcmin)", ylabel=label, xscale="log", ylim=(0, None))
         ax.set_xticks(area, [f"{v:.1f}" for v in area])
         ax.set_xticks([], minor=True)

@@ -88,8 +88,8 @@ class Plan:
                 "limit_used": np.round(plan.errors().limiting_magnitude(name), 2),
                 "saturates": np.round(plan.saturation, 1),
             }
-            for what in ("saturated", "missing"):
-                row[f"n_{what}"] = int(np.count_nonzero(self.sources[f"{name}_{what}"]))
+            for problem in ("saturated", "missing"):
+                row[f"n_{problem}"] = int(np.count_nonzero(self.sources[f"{name}_{problem}"]))
             rows.append(row)
         return QTable(rows)
 
@@ -124,7 +124,10 @@ class Planner:
     """
 
     def __init__(self, config=None, *, sources=None, executor=None):
-        self.config = PlanConfig() if config is None else config
+        if config is None:
+            self.config = PlanConfig()
+        else:
+            self.config = config
         self.executor = executor
         #: Sources of the caller, if there are any.
         self._caller_sources = sources
@@ -188,7 +191,8 @@ class Planner:
         check_names(bands, "band of the plan", exposures.bands)
         if not exposures.hours or not bands:
             return 1.0
-        pointings = exposures.pointings if pointings is None else pointings
+        if pointings is None:
+            pointings = exposures.pointings
 
         def charged(share):
             plans = self.band_plans(share, bands)
@@ -201,19 +205,25 @@ class Planner:
         dithers = np.array(exposures.by_band("dithers"))[rows]
         group = frames_per_group(exposures.readout) * frame_time(exposures.readout).value
         low = float(np.max(_LEAST * group * dithers / times))
-        least = charged(low)
-        if least > exposures.hours:
+        shortest = charged(low)
+        if shortest > exposures.hours:
             names = ", ".join(name.removeprefix("miri.") for name in bands)
             raise config_error(
                 "[exposures] hours",
-                f"must be at least {least:.2f} for {names}, got {exposures.hours:g}",
+                f"must be at least {shortest:.2f} for {names}, got {exposures.hours:g}",
             )
         high = low * 2
         while charged(high) <= exposures.hours:
-            low, high = high, high * 2
+            low = high
+            high = high * 2
         while high > 1.001 * low:
             middle = np.sqrt(low * high)
-            low, high = (middle, high) if charged(middle) <= exposures.hours else (low, middle)
+            if charged(middle) <= exposures.hours:
+                low = middle
+                high = high
+            else:
+                low = low
+                high = middle
         return low
 
     @functools.cached_property
@@ -242,7 +252,10 @@ class Planner:
         """
         table = QTable(self._existing, copy=True)
         for plan in plans:
-            found = self._mock(plan) if measured is None else measured
+            if measured is None:
+                found = self._mock(plan)
+            else:
+                found = measured
             for column in (plan.filter, error_column(plan.filter)):
                 table[column] = found[column]
         return table
@@ -253,19 +266,22 @@ class Planner:
 
         Sources that saturate have the errors of the groups before, NaN where there is no slope.
         """
-        columns, seed = self.sources[["id", plan.filter]], self.config.plan.seed
-        good, node = self._good_groups(plan), np.zeros(len(columns), int)
+        columns = self.sources[["id", plan.filter]]
+        seed = self.config.plan.seed
+        good = self._good_groups(plan)
+        node = np.zeros(len(columns), int)
         if self.config.noise.sizes:
             node = np.argmin(np.abs(self._size[:, None] - _SIZES), axis=1)
         # a power of two, so that few errors are computed
-        kept = 2 ** np.log2(np.maximum(good, 2)).astype(int)
-        kept[good == plan.exposure.n_groups] = plan.exposure.n_groups
-        parts, rows = [], []
-        for k, n_groups in np.unique([node, kept], axis=1).T:
-            here = np.flatnonzero((node == k) & (kept == n_groups))
+        rounded = 2 ** np.log2(np.maximum(good, 2)).astype(int)
+        rounded[good == plan.exposure.n_groups] = plan.exposure.n_groups
+        parts = []
+        rows = []
+        for k, n_groups in np.unique([node, rounded], axis=1).T:
+            members = np.flatnonzero((node == k) & (rounded == n_groups))
             errors = plan.cut(n_groups).errors(_SIZES[k] * u.arcsec)
-            parts.append(errors.perturb(columns[here], seed=seed))
-            rows.append(here)
+            parts.append(errors.perturb(columns[members], seed=seed))
+            rows.append(members)
         joined = vstack(parts, metadata_conflicts="silent")
         joined = joined[np.argsort(np.concatenate(rows), kind="stable")]
         for column in (plan.filter, error_column(plan.filter)):
@@ -275,8 +291,10 @@ class Planner:
     @property
     def _size(self):
         """Widths of the sources in arcsec, 0 where they are not known."""
-        known = "size" in self.sources.colnames
-        return self.sources["size"].to_value(u.arcsec) if known else np.zeros(len(self.sources))
+        has_sizes = "size" in self.sources.colnames
+        if has_sizes:
+            return self.sources["size"].to_value(u.arcsec)
+        return np.zeros(len(self.sources))
 
     def _good_groups(self, plan):
         """Groups before the sources of the sample saturate in a band."""
@@ -304,18 +322,23 @@ class Planner:
         plan : `Plan`
         """
         config = self.config
-        bands = config.exposures.bands if bands is None else tuple(bands)
+        if bands is None:
+            bands = config.exposures.bands
+        else:
+            bands = tuple(bands)
         wanted = f"some of {list(config.exposures.bands)}"
         check_that(set(bands) <= set(config.exposures.bands), "bands", wanted, list(bands))
-        known = self.band_plans(share, bands)
-        plans = {band: known[band] for band in bands}
+        planned = self.band_plans(share, bands)
+        plans = {band: planned[band] for band in bands}
         photometry = self.photometry(plans.values(), measured)
-        every = [*config.fit.bands, *bands]
-        fitter = study_fitter(config.fit, every, axes=fit_plan(config, name))
+        all_bands = [*config.fit.bands, *bands]
+        fitter = study_fitter(config.fit, all_bands, axes=fit_plan(config, name))
         results = fitter.fit(photometry, executor=self.executor)
         table = self._results(results, photometry, plans)
-        pointings = config.exposures.pointings if pointings is None else pointings
-        time, area = 0 * u.h, (pointings * _FIELD).to(u.arcmin**2)
+        if pointings is None:
+            pointings = config.exposures.pointings
+        time = 0 * u.h
+        area = (pointings * _FIELD).to(u.arcmin**2)
         if plans:
             time = wall_clock(plans.values(), config.overheads, pointings=pointings)
         name = name or ", ".join(b.removeprefix("miri.") for b in bands) or EXISTING
@@ -324,9 +347,12 @@ class Planner:
     def _results(self, results, photometry, plans):
         """The table of sources of a `Plan`."""
         agn = self.config.agn
-        own = ("id", "redshift", "frac_agn", "sky")
-        table = self.sources[[name for name in own if name in self.sources.colnames]]
-        detected = detected_bands(photometry, list(plans)) if plans else np.zeros(len(table), int)
+        source_columns = ("id", "redshift", "frac_agn", "sky")
+        table = self.sources[[name for name in source_columns if name in self.sources.colnames]]
+        if plans:
+            detected = detected_bands(photometry, list(plans))
+        else:
+            detected = np.zeros(len(table), int)
         table["n_detected"] = detected
         for name in ("redshift", "frac_agn"):
             table[f"{name}_mean"] = u.Quantity(results.mean(name)).value
@@ -386,7 +412,10 @@ class Planner:
         areas = self.config.survey.areas
         if not self.config.exposures.hours:
             return [self.evaluate(bands, name=str(n), share=1.0 / n, pointings=n) for n in areas]
-        chosen = self.config.exposures.bands if bands is None else tuple(bands)
+        if bands is None:
+            chosen = self.config.exposures.bands
+        else:
+            chosen = tuple(bands)
         plans = []
         for n in areas:
             share = self.share(chosen, n)
@@ -409,6 +438,10 @@ class Planner:
         chosen : bool array-like, optional
             Sources that count; those of `common` by default.
         """
-        chosen = self.common([plan]) if chosen is None else np.asarray(chosen, bool)
-        agn_limit, seed = self.config.agn.limit, self.config.plan.seed
+        if chosen is None:
+            chosen = self.common([plan])
+        else:
+            chosen = np.asarray(chosen, bool)
+        agn_limit = self.config.agn.limit
+        seed = self.config.plan.seed
         return accuracy(plan.sources[chosen], agn_limit=agn_limit, seed=seed)

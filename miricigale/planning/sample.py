@@ -73,7 +73,8 @@ def make_sample(config, bands, *, executor=None):
     >>> sources = make_sample(config, ["wfc3.f160w", "miri.f770w"])  # doctest: +SKIP
     >>> sources["redshift", "frac_agn", "miri.f770w"]  # doctest: +SKIP
     """
-    options, seed = config.sample, config.plan.seed
+    options = config.sample
+    seed = config.plan.seed
     study = StudyConfig(catalog=config.catalog, sed=config.sed)
     catalog = study_catalog(config.catalog)
     catalog = bright_sources(catalog, config.catalog, study.highres.filter)
@@ -94,10 +95,13 @@ def make_sample(config, bands, *, executor=None):
         sources["frac_agn"] = np.asarray(catalog["frac_agn"], float)
     with np.errstate(divide="ignore", invalid="ignore"):
         luminosity = np.log10(sources["luminosity"].value)
-        known = np.isfinite(sources["mass"].value) & np.isfinite(luminosity)
+        is_complete = np.isfinite(sources["mass"].value) & np.isfinite(luminosity)
         inside = (luminosity >= options.luminosity[0]) & (luminosity <= options.luminosity[1])
-    sources = _cut(sources, known & inside, "[sample] luminosity")
-    density = np.nan if area is None else len(sources) / area.to_value(u.arcmin**2)
+    sources = _cut(sources, is_complete & inside, "[sample] luminosity")
+    if area is None:
+        density = np.nan
+    else:
+        density = len(sources) / area.to_value(u.arcmin**2)
     rng = stream(seed, "plan", "sample")
     if options.luminosity_function:
         sources, density = _by_luminosity(sources, options, rng)
@@ -108,21 +112,29 @@ def make_sample(config, bands, *, executor=None):
         # the same galaxies in other skies: with AGN and noise of their own
         sources = sources[np.arange(options.n_sources) % len(sources)]
         sources["template"], sources["id"] = sources["id"], np.arange(1, len(sources) + 1)
-    agn, given = "catalog", sources.columns.get("frac_agn")
-    if given is None:
-        agn = "mix" if config.agn.frac_agn else "field"
+    agn = "catalog"
+    fractions = sources.columns.get("frac_agn")
+    if fractions is None:
+        if config.agn.frac_agn:
+            agn = "mix"
+        else:
+            agn = "field"
     model = SEDModel.yang2021()
-    sources["sky"], n_skies = 0, 1
+    sources["sky"] = 0
+    n_skies = 1
     if agn == "field":
         add_field_agn(sources, model, next(iter(bands)), seed)
         n_skies += _DRAWS // len(sources)
         options = {"least": config.agn.limit, "seed": seed}
-        others, _ = other_skies(sources, model, next(iter(bands)), n_skies - 1, **options)
-        sources = vstack([sources, others], metadata_conflicts="silent")
+        sky_rows, _ = other_skies(sources, model, next(iter(bands)), n_skies - 1, **options)
+        sources = vstack([sources, sky_rows], metadata_conflicts="silent")
     else:
         add_agn(sources, 0.0, seed)
-        mixed = given is None
-        sources["frac_agn"] = agn_mix(config.agn, len(sources), rng) if mixed else given
+        mixed = fractions is None
+        if mixed:
+            sources["frac_agn"] = agn_mix(config.agn, len(sources), rng)
+        else:
+            sources["frac_agn"] = fractions
     light = library_fluxes(model, sources, list(bands))
     for name in bands:
         sources[name] = light[name]
@@ -133,9 +145,9 @@ def make_sample(config, bands, *, executor=None):
     return sources
 
 
-def _cut(table, chosen, what):
+def _cut(table, chosen, reason):
     if not np.any(chosen):
-        raise config_error(what, f"leaves none of the {len(table)} sources")
+        raise config_error(reason, f"leaves none of the {len(table)} sources")
     return table[chosen]
 
 
@@ -159,8 +171,8 @@ def _by_luminosity(sources, options, rng):
     try:
         table = read_table(options.luminosity_function, wanted="a luminosity function")
     except OSError as err:
-        where = f"[sample] luminosity_function = {options.luminosity_function!r}"
-        raise config_error(where, f"cannot be read: {err}") from err
+        option = f"[sample] luminosity_function = {options.luminosity_function!r}"
+        raise config_error(option, f"cannot be read: {err}") from err
     names = ("log_luminosity", "redshift", "phi")
     require_columns(table, names, "luminosity_function")
     log_luminosity, redshift, phi = (
@@ -170,7 +182,8 @@ def _by_luminosity(sources, options, rng):
         n_bad = np.count_nonzero(~np.isfinite(numbers))
         wanted = f"a table of finite numbers in {name!r}"
         check_that(not n_bad, "luminosity_function", wanted, f"{n_bad} that are not")
-    levels, steps = np.unique(log_luminosity), np.unique(redshift)
+    levels = np.unique(log_luminosity)
+    steps = np.unique(redshift)
     if len(levels) < 2 or len(steps) < 2 or len(table) != len(levels) * len(steps):
         wanted = "a grid of at least two luminosities and two redshifts, a row for each pair"
         raise argument_error("luminosity_function", wanted, f"{len(table)} rows")
@@ -189,8 +202,10 @@ def _by_luminosity(sources, options, rng):
     check_that(np.all(cells >= 0) and cells.sum() > 0, "luminosity_function", wanted, "none")
     n = options.n_sources or 500
     drawn = rng.choice(cells.size, n, p=(cells / cells.sum()).ravel())
-    z, logs = z[drawn // 200], logs[drawn % 200]
-    own_z, own_log = np.asarray(sources["redshift"]), np.log10(sources["luminosity"].value)
+    z = z[drawn // 200]
+    logs = logs[drawn % 200]
+    own_z = np.asarray(sources["redshift"])
+    own_log = np.log10(sources["luminosity"].value)
     distance = (np.log1p(own_z) - np.log1p(z)[:, None]) ** 2 / 0.01
     distance += (own_log - logs[:, None]) ** 2 / 0.04
     nearest = np.argmin(distance, axis=1)
