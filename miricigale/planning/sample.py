@@ -111,7 +111,8 @@ def make_sample(config, bands, *, executor=None):
     elif options.n_sources > len(sources):
         # the same galaxies in other skies: with AGN and noise of their own
         sources = sources[np.arange(options.n_sources) % len(sources)]
-        sources["template"], sources["id"] = sources["id"], np.arange(1, len(sources) + 1)
+        sources["template"] = sources["id"]
+        sources["id"] = np.arange(1, len(sources) + 1)
     agn = "catalog"
     fractions = sources.columns.get("frac_agn")
     if fractions is None:

@@ -26,12 +26,12 @@ _SHARED = {"sharex": True, "sharey": True}
 
 
 def magnitude_figure(table, bands):
-    """Measured against true magnitude; ticks are sources without positive flux or off the axis."""
+    """Draw measured against true magnitude; ticks are sources without positive flux or off the axis."""
     figure, axes = panels(bands, height=3.3, **_SHARED)
     true = {name: ab_magnitude(table[f"{name}_true"]) for name in bands}
     measured = {name: ab_magnitude(table[name]) for name in bands}
-    known = np.concatenate([values[np.isfinite(values)] for values in true.values()])
-    high = known.max(initial=20) + 1.5
+    magnitudes = np.concatenate([values[np.isfinite(values)] for values in true.values()])
+    high = magnitudes.max(initial=20) + 1.5
     for name, ax in axes.items():
         ax.plot(true[name], measured[name], ".", ms=3.5, color=MEASURED, alpha=0.7)
         ax.axline((high, high), slope=1, color=TRUE, lw=1)
@@ -39,7 +39,7 @@ def magnitude_figure(table, bands):
         at_bottom = {"transform": ax.get_xaxis_transform()}
         ax.plot(lost, np.full(len(lost), 0.02), "|", color=TRUE, ms=6, **at_bottom)
         ax.set_title(band_title(name))
-    low = known.min(initial=high)
+    low = magnitudes.min(initial=high)
     bright = np.nanmin(np.concatenate([*measured.values(), [low]]))
     ax.set(xlim=(low - 0.4, high - 1.1), ylim=(high, min(low, bright) - 0.4))
     label_outer(axes, "true magnitude (AB)", "measured magnitude (AB)")
@@ -48,15 +48,15 @@ def magnitude_figure(table, bands):
 
 def offset_figure(table, bands, limits, marks=()):
     """
-    Magnitude differences of matched sources with running medians.
+    Draw magnitude differences of matched sources with running medians.
 
     ``limits`` are 5-sigma limits (AB), drawn as lines; ``marks`` are bit of the condition, marker and
     label of the sources that are marked.
     """
     figure, axes = panels(bands, height=2.9, **_SHARED)
     for name, ax in axes.items():
-        true, measured = ab_magnitude(table[f"{name}_true"]), ab_magnitude(table[name])
-        offset = measured - true
+        true = ab_magnitude(table[f"{name}_true"])
+        offset = ab_magnitude(table[name]) - true
         good = np.isfinite(offset)
         running = running_median(true[good], offset[good], size=20)
         plot_offsets(true[good], offset[good], running=running, ax=ax, title=band_title(name))
@@ -73,7 +73,7 @@ def offset_figure(table, bands, limits, marks=()):
 
 
 def error_figure(errors, bands, limits):
-    """The error function of every band, with the 5-sigma limits in uJy."""
+    """Draw the error function of every band, with the 5-sigma limits in uJy."""
     from matplotlib import colormaps
 
     figure, [[ax]] = new_figure(size=(WIDTH, 4.2))
@@ -82,10 +82,16 @@ def error_figure(errors, bands, limits):
     flux = np.geomspace(0.02, max(300, 30 * max(finite, default=1)), 120) * u.uJy
     # darker at shorter wavelengths, distinct to color-blind readers
     shades = colormaps["viridis"](np.linspace(0, 0.82, len(order)))
-    sigma = {band_label(name): errors.sigma(flux, name).to_value(u.uJy) for name in order}
-    ends = {band_label(name): limits[name] for name in order}
-    options = {"limits": ends, "colors": dict(zip(sigma, shades, strict=True))}
-    plot_error_function(dict.fromkeys(sigma, flux.value), sigma, ax=ax, **options)
+    sigma = {}
+    label_limits = {}
+    colors = {}
+    for name, shade in zip(order, shades, strict=True):
+        label = band_label(name)
+        sigma[label] = errors.sigma(flux, name).to_value(u.uJy)
+        label_limits[label] = limits[name]
+        colors[label] = shade
+    fluxes = dict.fromkeys(sigma, flux.value)
+    plot_error_function(fluxes, sigma, ax=ax, limits=label_limits, colors=colors)
     legend(ax, ncols=2)
     return figure
 
@@ -100,7 +106,7 @@ _LIMITS = {
 
 def limit_figure(entries):
     """
-    Limits against wavelength.
+    Draw limits against wavelength.
 
     Entries have ``limit``, ``formal_limit``, ``etc_limit``, ``proposal`` (AB or NaN) and ``ceers``,
     whether the exposures are those of the proposal.
@@ -108,19 +114,25 @@ def limit_figure(entries):
     figure, [[ax]] = new_figure(size=(WIDTH, 3.4))
     bands = by_wavelength(entries)
     wave = np.array([Filter.from_name(name).pivot.to_value(u.um) for name in bands])
-    keys = (*_LIMITS, "proposal")
-    values = {key: np.array([entries[name][key] for name in bands], float) for key in keys}
-    own = np.array([entries[name]["ceers"] for name in bands], bool)
+    values = {}
+    for key in (*_LIMITS, "proposal"):
+        values[key] = np.array([entries[name][key] for name in bands], float)
     for key, (fmt, color, fill, label) in _LIMITS.items():
         ax.plot(wave, values[key], fmt, color=color, mfc=fill, lw=1.2, label=label)
-    for keep, fill, label in (
-        (own, "0.35", "CEERS proposal"),
-        (~own, "none", "CEERS proposal, for other exposures"),
+    as_ceers = np.array([entries[name]["ceers"] for name in bands], bool)
+    proposal = values["proposal"]
+    for rows, fill, label in (
+        (as_ceers, "0.35", "CEERS proposal"),
+        (~as_ceers, "none", "CEERS proposal, for other exposures"),
     ):
-        if np.any(keep & np.isfinite(values["proposal"])):
-            ax.plot(wave[keep], values["proposal"][keep], "D", color="0.35", mfc=fill, label=label)
-    shown = np.concatenate([v[np.isfinite(v)] for v in values.values()])
-    low, high = (shown.min(), shown.max()) if shown.size else (20, 26)
+        if np.any(rows & np.isfinite(proposal)):
+            ax.plot(wave[rows], proposal[rows], "D", color="0.35", mfc=fill, label=label)
+    shown = np.concatenate([limits[np.isfinite(limits)] for limits in values.values()])
+    low = 20
+    high = 26
+    if shown.size:
+        low = shown.min()
+        high = shown.max()
     for x, name in zip(wave, bands, strict=True):
         ax.text(x, high + 0.35, band_title(name), ha="center", va="bottom", fontsize=8, rotation=30)
     ax.set(xlim=(wave.min() - 1.5, wave.max() + 1.5), xlabel="wavelength (µm)")
@@ -131,7 +143,7 @@ def limit_figure(entries):
 
 def variant_figure(numbers, labels):
     """
-    Limits of several images against the calculator's.
+    Draw limits of several images against the calculator's.
 
     ``numbers`` are those of `~miricigale.workflow.stages.variants.variant_numbers`, ``labels`` the names of
     images to what they are called.
@@ -155,18 +167,20 @@ def variant_figure(numbers, labels):
 
 
 def point_figure(points, bands):
-    """Measured over true flux of the bright point sources of each band; triangles lie beyond."""
+    """Draw measured over true flux of the bright point sources of each band; triangles lie beyond."""
     figure, [[ax]] = new_figure(size=(WIDTH, 3.2))
     ratios = [(points[n]["flux"] / points[n]["flux_true"]).to_value(u.one) for n in bands]
-    finite = np.concatenate([r[np.isfinite(r)] for r in ratios])
-    far = np.percentile(np.abs(finite - 1), 98, method="higher") if finite.size else 0.0
+    finite = np.concatenate([ratio[np.isfinite(ratio)] for ratio in ratios])
+    far = 0.0
+    if finite.size:
+        far = np.percentile(np.abs(finite - 1), 98, method="higher")
     reach = np.clip(1.3 * far, 0.05, 0.5)
     for k, ratio in enumerate(ratios):
         x = k + np.linspace(-0.3, 0.3, len(ratio))
-        inside, above = np.abs(ratio - 1) <= reach, ratio > 1 + reach
-        for keep, marker in ((inside, "."), (above, "^"), (ratio < 1 - reach, "v")):
-            y = np.clip(ratio[keep], 1 - 0.97 * reach, 1 + 0.97 * reach)
-            ax.plot(x[keep], y, marker, ms=4, color=MEASURED, alpha=0.6)
+        marks = {".": np.abs(ratio - 1) <= reach, "^": ratio > 1 + reach, "v": ratio < 1 - reach}
+        for marker, rows in marks.items():
+            y = np.clip(ratio[rows], 1 - 0.97 * reach, 1 + 0.97 * reach)
+            ax.plot(x[rows], y, marker, ms=4, color=MEASURED, alpha=0.6)
         if np.isfinite(ratio).any():
             ax.plot([k - 0.35, k + 0.35], [np.nanmedian(ratio)] * 2, color=SECOND, lw=2)
     ax.axhline(1, color="0.4", lw=1)
@@ -179,52 +193,61 @@ def point_figure(points, bands):
 
 def rival_figure(table):
     """
-    Source Extractor in a band against the truth and against the template fit, with both error functions.
+    Draw Source Extractor in a band against the truth and the template fit, with both error functions.
 
     ``table`` is one of `~miricigale.workflow.stages.rivals.rival_table` with the fluxes of both.
     """
-    names = ("flux_true", "source_extractor", "yang2021")
-    true, blind, forced = (ab_magnitude(table[name]) for name in names)
+    true = ab_magnitude(table["flux_true"])
+    blind = ab_magnitude(table["source_extractor"])
+    forced = ab_magnitude(table["yang2021"])
     usable = np.asarray(table["field"]) & ~np.asarray(table["edge"]) & np.isfinite(true)
-    bright, spheroid = usable & (table["snr"] > 5), np.asarray(table["shape"]) == "n >= 2"
+    bright = usable & (table["snr"] > 5)
+    spheroid = np.asarray(table["shape"]) == "n >= 2"
     titles = ("Source Extractor", "error functions", "points and n < 2", "n ≥ 2")
     figure, axes = panels(titles, height=3.1)
-    first, second, *lower = axes.values()
-    labels = ("Source Extractor (AB)", "Source Extractor - template fit (mag)")
-    for ax, x, y, rows, names in (
-        (first, true, blind - true, usable, ("true magnitude (AB)", "measured - true (mag)")),
-        (lower[0], blind, blind - forced, bright & ~spheroid, labels),
-        (lower[1], blind, blind - forced, bright & spheroid, labels),
-    ):
-        rows = rows & np.isfinite(y)
-        x, y, title = x[rows], y[rows], f"{ax.get_title()} ({np.count_nonzero(rows)})"
-        plot_offsets(x, y, running=running_median(x, y), ax=ax, title=title)
-        ax.set(xlabel=names[0], ylabel=names[1])
-        if y.size:
-            note = f"median {np.median(y):+.3f} mag"
-            ax.text(0.96, 0.95, note, transform=ax.transAxes, ha="right", va="top", fontsize=8)
-    lower[1].sharex(lower[0])
+    accuracy, errors, disks, spheroids = axes.values()
+    _draw_differences(accuracy, true, blind - true, usable)
+    accuracy.set(xlabel="true magnitude (AB)", ylabel="measured - true (mag)")
+    for ax, rows in ((disks, bright & ~spheroid), (spheroids, bright & spheroid)):
+        _draw_differences(ax, blind, blind - forced, rows)
+        ax.set(xlabel="Source Extractor (AB)", ylabel="Source Extractor - template fit (mag)")
+    spheroids.sharex(disks)
     methods = (("template fit", forced, MEASURED), ("Source Extractor", blind, SECOND))
-    for label, found, color in methods:
-        rows = usable & np.isfinite(found)
-        x, y = true[rows], np.abs(found - true)[rows]
-        second.semilogy(x, y, ".", ms=3, color=color, alpha=0.3)
+    for label, measured, color in methods:
+        rows = usable & np.isfinite(measured)
+        x = true[rows]
+        y = np.abs(measured - true)[rows]
+        errors.semilogy(x, y, ".", ms=3, color=color, alpha=0.3)
         middle, error, _ = running_median(x, y)
-        second.plot(middle, error, color=color, lw=1.8, label=label)
-    second.axhline(0.2, color=TRUE, lw=0.8, ls="--")
-    second.set(ylim=(2e-3, 2), xlabel="true magnitude (AB)", ylabel="|measured - true| (mag)")
-    legend(second, loc="upper left")
+        errors.plot(middle, error, color=color, lw=1.8, label=label)
+    errors.axhline(0.2, color=TRUE, lw=0.8, ls="--")
+    errors.set(ylim=(2e-3, 2), xlabel="true magnitude (AB)", ylabel="|measured - true| (mag)")
+    legend(errors, loc="upper left")
     return figure
 
 
-#: Least values that the figure of the inputs shows, and redshifts of its panels.
-LEAST_RATE, LEAST_MASS = 1e-3 * u.Msun / u.yr, 1e7 * u.Msun
+def _draw_differences(ax, magnitude, difference, rows):
+    """Draw differences of magnitudes with their running median; number in the title, median in the corner."""
+    rows = rows & np.isfinite(difference)
+    x = magnitude[rows]
+    y = difference[rows]
+    title = f"{ax.get_title()} ({np.count_nonzero(rows)})"
+    plot_offsets(x, y, running=running_median(x, y), ax=ax, title=title)
+    if y.size:
+        note = f"median {np.median(y):+.3f} mag"
+        ax.text(0.96, 0.95, note, transform=ax.transAxes, ha="right", va="top", fontsize=8)
+
+
+#: Least star-formation rate and stellar mass that the figure of the inputs shows.
+MIN_RATE = 1e-3 * u.Msun / u.yr
+MIN_MASS = 1e7 * u.Msun
+#: Redshifts of its panels.
 INPUT_REDSHIFTS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0))
 
 
 def input_figure(galaxies):
     """
-    Star-formation rate against mass in ranges of redshift, with the main sequence at their middle.
+    Draw star-formation rate against mass in ranges of redshift, with the main sequence at their middle.
 
     Of a table with ``redshift``, ``stellar_mass`` and ``sfr_100myr``. Returns the figure and the number of
     galaxies that it does not show: beyond its redshifts, or below the axes.
@@ -232,31 +255,35 @@ def input_figure(galaxies):
     titles = [f"{low:g} < z < {high:g}" for low, high in INPUT_REDSHIFTS]
     figure, axes = panels(titles, height=3.4, **_SHARED)
     redshift = np.asarray(galaxies["redshift"])
-    mass, rate = galaxies["stellar_mass"], galaxies["sfr_100myr"]
-    seen = (rate >= LEAST_RATE) & (mass >= LEAST_MASS)
+    mass = galaxies["stellar_mass"]
+    rate = galaxies["sfr_100myr"]
+    on_axes = (rate >= MIN_RATE) & (mass >= MIN_MASS)
     line = np.geomspace(1e8, 2e11, 30) * u.Msun
     shown = 0
     for (title, ax), (low, high) in zip(axes.items(), INPUT_REDSHIFTS, strict=True):
-        rows = seen & (redshift >= low) & (redshift < high)
+        rows = on_axes & (redshift >= low) & (redshift < high)
         shown += int(np.count_nonzero(rows))
         middle = 0.5 * (low + high)
         sequence = main_sequence_sfr(line, sed.COSMOLOGY.age(middle))
-        x, y = mass[rows].to_value(u.Msun), rate[rows].to_value(u.Msun / u.yr)
+        x = mass[rows].to_value(u.Msun)
+        y = rate[rows].to_value(u.Msun / u.yr)
         lines = [(line.value, sequence.value, f"main sequence, z = {middle:g}")]
         labels = (r"stellar mass / M$_\odot$", r"SFR (100 Myr) / (M$_\odot$/yr)")
         plot_relation(x, y, lines=lines, ax=ax, labels=labels)
         ax.set_title(f"{title} ({np.count_nonzero(rows)})", fontsize="medium")
     label_outer(axes)
-    ax.set(xlim=(LEAST_MASS.value, None), ylim=(LEAST_RATE.value, None))
+    ax.set(xlim=(MIN_MASS.value, None), ylim=(MIN_RATE.value, None))
     return figure, len(galaxies) - shown
 
 
 def counts_figure(galaxies, bands, area):
-    """Number counts of the injected fluxes in every band."""
+    """Draw number counts of the injected fluxes in every band."""
     figure, axes = panels(bands, height=2.7, **_SHARED)
     edges = np.arange(15, 30.1, 0.5)
     for name, ax in axes.items():
-        counts, error = (v.to_value(u.deg**-2) for v in number_counts(galaxies[name], area, edges))
+        counts, error = number_counts(galaxies[name], area, edges)
+        counts = counts.to_value(u.deg**-2)
+        error = error.to_value(u.deg**-2)
         good = counts > 0
         middle = 0.5 * (edges[1:] + edges[:-1])[good]
         ax.errorbar(middle, counts[good], error[good], fmt="o", ms=4, color=MEASURED, lw=1)

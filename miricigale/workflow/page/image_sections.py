@@ -13,10 +13,10 @@ from miricigale.workflow.stages.sample import CUTS
 
 
 def write_summary(page, truths, numbers, caveats):
-    """What was found at each fracAGN, headline numbers, links to the sources of each truth, and ``caveats``."""
-    m = page.metrics
-    values = m | {"n_sample": browse(page.first.name, m["n_sample"], show="sample")}
-    for unit, fit in m["fits"].items():
+    """Write results at each fracAGN, headline numbers, links to the sources of each truth, and ``caveats``."""
+    values = dict(page.metrics)
+    values["n_sample"] = browse(page.first.name, values["n_sample"], show="sample")
+    for unit, fit in values["fits"].items():
         values |= {f"{key}_{unit}": value for key, value in fit.items()}
     page.section("summary")
     answer = study_figures.answer_figure(page.study, numbers)
@@ -30,58 +30,75 @@ def write_summary(page, truths, numbers, caveats):
 
 
 def write_images(page, mosaics, patch):
-    """The field, or a patch, in color or gray; an exposure before and after; mosaic, model and residual."""
-    config, image, sky = page.config, page.context.image, page.first.name
+    """Write the field, or a patch, in color or gray; an exposure before and after; mosaic, model and residual."""
+    config = page.config
+    image = page.context.image
+    sky = page.first.name
     bands = tuple(mosaics)
-    chosen, colors = three_bands(bands), color_bands(bands)
     page.section("images", "patch" if patch else "text", patch=patch)
-    field, sharp = [mosaics[name] for name in colors], image(f"{of_patch('f160w', patch)}.fits")
-    figure = pictures.field_figure(field, sharp, [*colors, config.highres.filter])
+    colors = color_bands(bands)
     kind = {3: "color", 6: "colors"}.get(len(colors), "gray")
+    prior = image(f"{of_patch('f160w', patch)}.fits")
+    field = [mosaics[name] for name in colors]
+    figure = pictures.field_figure(field, prior, [*colors, config.highres.filter])
     page.figure(kind, figure, bands=", ".join(map(band_label, colors)))
+    chosen = three_bands(bands)
     unit = next(n for n, e in study_exposures(config).items() if e.filter == chosen[-1])
-    rate, cal = (image(f"{sky}/exposures/{unit}_{kind}.fits") for kind in ("rate", "cal"))
+    rate = image(f"{sky}/exposures/{unit}_rate.fits")
+    cal = image(f"{sky}/exposures/{unit}_cal.fits")
     page.figure("subtraction", pictures.subtraction_figure(rate, cal, reducer_of(config)))
     suffix, _ = measured_mosaic(config)
-    paths = of_patch(f"{sky}/mosaic_{{}}{suffix}", patch), of_patch(f"{sky}/photometry/{{}}", patch)
-    paths = f"{paths[0]}.fits", f"{paths[1]}_model.fits"
-    pairs = [tuple(image(path.format(name)) for path in paths) for name in chosen]
+    pairs = []
+    for name in chosen:
+        mosaic = image(f"{of_patch(f'{sky}/mosaic_{name}{suffix}', patch)}.fits")
+        model = image(f"{of_patch(f'{sky}/photometry/{name}', patch)}_model.fits")
+        pairs.append((mosaic, model))
     page.figure("residual", pictures.residual_figure(pairs, chosen))
     middle = len(chosen) // 2
-    whole = pictures.residual_figure(pairs[middle:][:1], chosen[middle:][:1], size=None)
-    page.figure("maps", whole, band=band_label(chosen[middle]))
+    figure = pictures.residual_figure([pairs[middle]], [chosen[middle]], size=None)
+    page.figure("maps", figure, band=band_label(chosen[middle]))
 
 
 def write_detections(page):
-    """Which galaxies are detected, and why the others are not in the fit."""
-    m, none, prior = page.metrics, "no galaxy", page.facts["prior"]
+    """Write which galaxies are detected, and why the others are not in the fit."""
+    metrics = page.metrics
+    prior = page.facts["prior"]
     # a column without any value is left out
-    unknown = {"to_proposal"} if all(np.isnan(row["to_proposal"]) for row in m["detected"]) else ()
+    has_proposal = not all(np.isnan(row["to_proposal"]) for row in metrics["detected"])
     rows = []
-    for row in m["detected"]:
-        low, high = (number(row[end], ".1f %", none) for end in ("low", "high"))
-        interval = f"{low} to {high}" if row["n"] else low
-        known = {key: value for key, value in row.items() if key not in unknown}
-        rows.append({"sample": f"{prior} < {row['limit']:g}", "interval": interval, **known})
+    for entry in metrics["detected"]:
+        interval = number(entry["low"], ".1f %", "no galaxy")
+        if entry["n"]:
+            interval = f"{interval} to {number(entry['high'], '.1f %', 'no galaxy')}"
+        row = {"sample": f"{prior} < {entry['limit']:g}", "interval": interval} | entry
+        if not has_proposal:
+            del row["to_proposal"]
+        rows.append(row)
     page.section("detections")
-    others = "" if m["as_paper"] else ", six bands, other exposures"
+    exposures = "" if metrics["as_paper"] else ", six bands, other exposures"
     sigma = page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else ""
-    page.table("shares", rows, other_exposures=others, paper_sigma=sigma)
-    reasons = {name.replace("_", " "): n for name, n in m["n_left_out"].items() if n}
-    outside = reasons.pop("outside field", 0)
-    links = {name: browse(page.first.name, n, flag=name) for name, n in reasons.items()}
-    rows = [{"reason": name, "sources": link} for name, link in links.items()]
-    cuts = [f"{key} {m['n_left_out'][key]}" for key in CUTS if getattr(page.config.fit, key)]
+    page.table("shares", rows, other_exposures=exposures, paper_sigma=sigma)
+    rows = []
+    for flag, n in metrics["n_left_out"].items():
+        if n and flag != "outside_field":
+            reason = flag.replace("_", " ")
+            link = browse(page.first.name, n, flag=reason)
+            rows.append({"reason": reason, "sources": link})
+    cuts = []
+    for key in CUTS:
+        if getattr(page.config.fit, key):
+            cuts.append(f"{key} {metrics['n_left_out'][key]}")
     if cuts:
         page.text("cuts", counts=", ".join(cuts))
-    page.table("left_out", rows, n_outside=outside)
+    page.table("left_out", rows, n_outside=metrics["n_left_out"]["outside_field"])
     if page.first.field.any():
         page.figure("luminosity", study_figures.detection_figure(page.study))
 
 
 def field_text(config):
-    """Where the telescope looks, in words."""
-    centers, options = study_pointings(config), config.pointing
+    """Return where the telescope looks, in words."""
+    centers = study_pointings(config)
+    options = config.pointing
     field = "a MIRI field" if len(centers) == 1 else f"{len(centers)} MIRI pointings"
     if options.centers:
         return f"{field}, the first at RA {centers[0].ra.deg:.5f}, Dec {centers[0].dec.deg:.5f}"

@@ -17,12 +17,13 @@ from miricigale.evaluation import (
 from miricigale.instrument import CEERS_FILTERS, ceers_exposures
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.stages.conditions import (
-    _usable,
     band_conditions,
     bright_isolated,
     detection_counts,
     fit_conditions,
     has_flag,
+    is_complete,
+    is_matched,
 )
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
 from miricigale.workflow.stages.fits import true_ranks
@@ -39,7 +40,7 @@ PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
 
 
 def _table(path):
-    """A table of a truth, by its path within the run, that is read when it is first asked for."""
+    """Declare a table of a truth, by its path within the run, that is read when it is first asked for."""
     return functools.cached_property(lambda self: self._context.table(path.format(self._name)))
 
 
@@ -56,7 +57,8 @@ class StudyTables:
     """
 
     def __init__(self, context, name):
-        self._context, self._name = context, name
+        self._context = context
+        self._name = name
 
     #: The sources of the catalog with their true fluxes (stage 3).
     truth = _table("{}/truth.ecsv")
@@ -73,15 +75,19 @@ class StudyTables:
     @functools.cached_property
     def results(self):
         """Fits of the sample by set of bands (`~miricigale.workflow.stages.inputs.FitPieces`)."""
-        sets, n = self._context.config.fit.sets, len(self.truth)
-        return {unit: FitPieces(self._context, f"{self._name}/fits_{unit}", n) for unit in sets}
+        n = len(self.truth)
+        results = {}
+        for unit in self._context.config.fit.sets:
+            results[unit] = FitPieces(self._context, f"{self._name}/fits_{unit}", n)
+        return results
 
     @functools.cached_property
     def points(self):
         """Bright point sources by band; empty where that check was not made."""
         config = self._context.config
-        bands = config.exposures.filters if config.point_sources.enabled else ()
-        return self._context.tables("points", bands)
+        if not config.point_sources.enabled:
+            return {}
+        return self._context.tables("points", config.exposures.filters)
 
     @property
     def sample(self):
@@ -104,53 +110,58 @@ class StudyTables:
         return {unit: results.to_table() for unit, results in self.results.items()}
 
     def galaxies(self, *, field=False):
-        """Rows of the truth that are galaxies with a model, of the imaged field or all."""
-        known = np.isfinite(self.truth["stellar_mass"].value)
-        known &= ~np.asarray(self.truth["star"], bool)
-        return self.truth[known & self.inside if field else known]
+        """Return rows of the truth that are galaxies with a model, of the imaged field or all."""
+        rows = np.isfinite(self.truth["stellar_mass"].value)
+        rows &= ~np.asarray(self.truth["star"], bool)
+        if field:
+            rows &= self.inside
+        return self.truth[rows]
 
 
 def as_ceers(config, name):
-    """Whether a band is exposed as CEERS did: readout, frames in each dither, number of dithers."""
+    """Tell whether a band is exposed as CEERS did: readout, frames in each dither, number of dithers."""
     if name not in CEERS_FILTERS:
         return False
+    exposures = pointing_exposures(config, name)
+    return _frames(exposures) == _frames(_of_ceers(exposures[0], name))
 
-    own = pointing_exposures(config, name)
+
+def _frames(exposures):
+    """Return readout, sub-array and frames of each exposure."""
     # the split of the frames into groups and integrations is not the survey's
-    frames = [
-        [(e.readout, e.subarray, e.n_groups * e.n_integrations) for e in exposures]
-        for exposures in (own, _of_ceers(own[0], name))
-    ]
-    return frames[0] == frames[1]
+    return [(e.readout, e.subarray, e.n_groups * e.n_integrations) for e in exposures]
 
 
 def _of_ceers(exposure, name):
-    """The exposures of CEERS in a band, at the pointing of another exposure."""
+    """Return the exposures of CEERS in a band, at the pointing of another exposure."""
     return ceers_exposures(exposure.pointing, exposure.roll, filters=[name])
 
 
 def _proposal(name, exposure):
-    """The limit that the CEERS proposal quotes for a band, and the time that it is for."""
-    limit = time = np.nan
-    if name in CEERS_FILTERS:
-        limit = float(depth.proposal_limit(name).value)
-        time = sum(e.exposure_time for e in _of_ceers(exposure, name)).to_value(u.s)
-    return {"proposal": limit, "proposal_time": time}
+    """Return the limit that the CEERS proposal quotes for a band, and the time that it is for."""
+    if name not in CEERS_FILTERS:
+        return {"proposal": np.nan, "proposal_time": np.nan}
+    time = sum(dither.exposure_time for dither in _of_ceers(exposure, name))
+    limit = float(depth.proposal_limit(name).value)
+    return {"proposal": limit, "proposal_time": time.to_value(u.s)}
 
 
 def above_proposal(truth, bands):
-    """Bands in which each true flux is above the limit of the CEERS proposal; None if a band has none."""
+    """Count bands with a true flux above the limit of the CEERS proposal, by source; None if a band has none."""
     if not set(bands) <= set(CEERS_FILTERS):
         return None
-    limits = {name: depth.proposal_limit(name).value for name in bands}
-    return sum((ab_magnitude(truth[name]) < limit).astype(int) for name, limit in limits.items())
+    counts = np.zeros(len(truth), int)
+    for name in bands:
+        counts += ab_magnitude(truth[name]) < depth.proposal_limit(name).value
+    return counts
 
 
 def as_paper(config):
-    """Whether exposures, bands and selection are those of Yang et al. 2021."""
+    """Tell whether exposures, bands and selection are those of Yang et al. 2021."""
     bands = config.exposures.filters
-    alike = set(bands) == set(CEERS_FILTERS) and config.highres.filter == "wfc3.f160w"
-    return alike and all(as_ceers(config, name) for name in bands)
+    if set(bands) != set(CEERS_FILTERS) or config.highres.filter != "wfc3.f160w":
+        return False
+    return all(as_ceers(config, name) for name in bands)
 
 
 #: Exposure times, in units of that of one pointing, that limit the rows of depths.
@@ -158,13 +169,13 @@ _TIMES = (0.0, 0.8, 1.5, np.inf)
 
 
 def _depth_by_time(tables, name, time):
-    """Galaxies of the field by exposure time in a band, with its median and the limit there."""
-    seen = (tables.matched[f"{name}_time"] / time).to_value(u.one)
+    """Count galaxies of the field by exposure time in a band, with its median and the limit there."""
+    times = (tables.matched[f"{name}_time"] / time).to_value(u.one)
     rows = []
     for low, high in itertools.pairwise(_TIMES):
-        chosen = tables.field & (seen >= low) & (seen < high)
+        chosen = tables.field & (times >= low) & (times < high)
         if np.any(chosen):
-            share = float(np.median(seen[chosen]))
+            share = float(np.median(times[chosen]))
             # the error at a flux is that of one pointing, over the root of the share
             limit = tables.errors.limiting_magnitude(name, 5.0 / np.sqrt(share))
             rows.append({"n": int(chosen.sum()), "share": share, "limit": float(limit.value)})
@@ -172,18 +183,57 @@ def _depth_by_time(tables, name, time):
 
 
 def _light(galaxies, bands, area):
-    """Light of all galaxies together, where it is published."""
+    """Measure the light of all galaxies together, where it is published."""
     rows = []
-    names = ("band", "wavelength", "least", "n", "light", "light_err")
-    names += ("published", "down", "up", "reference")
-    for name, wave, least, *published in PUBLISHED_LIGHT:
+    for name, wave, min_flux, published, down, up, reference in PUBLISHED_LIGHT:
         if name in bands:
-            flux = galaxies[name][galaxies[name] >= least * u.uJy]
-            light = [one.value for one in integrated_light(flux, area, wave * u.um)]
-            # without sources the error is undefined too
-            light = light if len(flux) else [np.nan, np.nan]
-            values = (name, wave, least, len(flux), *light, *published)
-            rows.append(dict(zip(names, values, strict=True)))
+            flux = galaxies[name][galaxies[name] >= min_flux * u.uJy]
+            light, error = integrated_light(flux, area, wave * u.um)
+            row = {
+                "band": name,
+                "wavelength": wave,
+                "least": min_flux,
+                "n": len(flux),
+                "light": light.value,
+                "light_err": error.value,
+                "published": published,
+                "down": down,
+                "up": up,
+                "reference": reference,
+            }
+            if len(flux) == 0:
+                # without sources the error is undefined too
+                row["light"] = np.nan
+                row["light_err"] = np.nan
+            rows.append(row)
+    return rows
+
+
+def _detected(config, tables, n_bands):
+    """Measure shares of the galaxies of the field detected in enough bands, by limit of the prior's magnitude."""
+    prior = ab_magnitude(tables.truth[config.highres.filter])
+    proposal = above_proposal(tables.truth, config.exposures.filters)
+    detected = tables.matched["n_detected"] >= n_bands
+    rows = []
+    for limit, paper in PAPER_DETECTED:
+        if limit > config.catalog.mag_limit:
+            continue
+        chosen = tables.field & (prior < limit)
+        n = int(chosen.sum())
+        fraction, low, high = fraction_interval(int(np.count_nonzero(chosen & detected)), n)
+        to_proposal = np.nan
+        if proposal is not None and n > 0:
+            to_proposal = float(np.mean(proposal[chosen] >= n_bands))
+        row = {
+            "limit": limit,
+            "n": n,
+            "fraction": fraction,
+            "low": low,
+            "high": high,
+            "to_proposal": to_proposal,
+            "paper": paper,
+        }
+        rows.append(row)
     return rows
 
 
@@ -206,15 +256,16 @@ def _detected(config, tables, least):
 
 
 def _band_numbers(config, tables, name):
-    """Recovery, limits and conditions of one band."""
-    matched, errors = tables.matched, tables.errors
-    usable, whole = _usable(matched, name)
-    flux, true = matched[name].value, matched[f"{name}_true"].value
+    """Measure recovery, limits and conditions of one band."""
+    matched = tables.matched
+    usable = is_matched(matched)
+    flux = matched[name].value
+    true = matched[f"{name}_true"].value
     formal = matched[f"{name}_formal_err"].value
     isolated = bright_isolated(matched, name)
     bright = recovery_metrics(true[isolated], flux[isolated], relative=True)
     with np.errstate(invalid="ignore"):
-        faint = usable & whole & (true < 20 * formal) & np.isfinite(flux)
+        faint = usable & is_complete(matched, name) & (true < 20 * formal) & np.isfinite(flux)
     pulls = (flux[faint] - true[faint]) / formal[faint]
     time = pointing_time(config, name)
     median = np.nanmedian(formal[usable]) if usable.any() else np.nan
@@ -224,7 +275,7 @@ def _band_numbers(config, tables, name):
         "pull_n": int(pulls.size),
         "pull_median": float(np.median(pulls)) if pulls.size else np.nan,
         "pull_scatter": sigma_mad(pulls),
-        "limit": float(errors.limiting_magnitude(name).value),
+        "limit": float(tables.errors.limiting_magnitude(name).value),
         "etc_limit": float(depth.scaled_limit(name, time).to_value(u.ABmag)),
         "coverage": _depth_by_time(tables, name, time) if config.errors.coverage else [],
         **_proposal(name, pointing_exposures(config, name)[0]),
@@ -236,10 +287,11 @@ def _band_numbers(config, tables, name):
     }
     if name in tables.points:
         points = tables.points[name]
-        good = points[np.asarray(points["in_field"], bool)]
-        found = recovery_metrics(good["flux_true"].value, good["flux"].value, relative=True)
-        entry |= {"points_n": found.n, "points_median": found.median}
-        entry["points_scatter"] = found.sigma_mad
+        inside = points[np.asarray(points["in_field"], bool)]
+        recovery = recovery_metrics(inside["flux_true"].value, inside["flux"].value, relative=True)
+        entry["points_n"] = recovery.n
+        entry["points_median"] = recovery.median
+        entry["points_scatter"] = recovery.sigma_mad
         for key in ("f_scaling", "f_scaling_err", "f_aper"):
             entry[key] = float(points.meta.get(key, np.nan))
     return entry
@@ -247,18 +299,23 @@ def _band_numbers(config, tables, name):
 
 def study_metrics(config, tables, area):
     """
-    Numbers of the field and of its bands, as plain values for ``report/metrics.json``.
+    Measure the numbers of the field and of its bands, as plain values for ``report/metrics.json``.
 
     ``tables`` are those of the reference truth, ``area`` is the solid angle of the imaged
     field; NaN where there is nothing to count.
     """
     bands = config.exposures.filters
-    field, selection = tables.field, np.asarray(tables.matched["selection"])
-    off = np.where(tables.inside, ~0, SampleFlags.OUTSIDE_FIELD)
-    # what else a source outside of the field may be is no matter
-    left_out = {f.name.lower(): int(np.count_nonzero(selection & f & off)) for f in SampleFlags}
+    field = tables.field
+    selection = np.asarray(tables.matched["selection"])
+    left_out = {}
+    for flag in SampleFlags:
+        rows = (selection & flag) > 0
+        if flag != SampleFlags.OUTSIDE_FIELD:
+            # what else a source outside of the field may be is no matter
+            rows &= tables.inside
+        left_out[flag.name.lower()] = int(np.count_nonzero(rows))
     # with a single band, detections in that band are counted
-    least = min(2, len(bands))
+    n_bands = min(2, len(bands))
     return {
         "n_catalog": len(tables.truth),
         "n_field": int(field.sum()),
@@ -268,9 +325,9 @@ def study_metrics(config, tables, area):
         "area": float(area.to_value(u.arcmin**2)),
         "as_paper": as_paper(config),
         "detections": detection_counts(tables.detections, bands),
-        "n_bands_detected": least,
+        "n_bands_detected": n_bands,
         "bands": {name: _band_numbers(config, tables, name) for name in bands},
-        "detected": _detected(config, tables, least),
+        "detected": _detected(config, tables, n_bands),
         "light": _light(tables.galaxies(field=True), bands, area),
     }
 
@@ -298,31 +355,30 @@ def whole_sample(numbers):
 
 def truth_metrics(truth, tables, numbers, bands, seed):
     """
-    Numbers of one truth as plain values: how well redshift and fracAGN are recovered, by set of bands.
+    Return numbers of one truth as plain values: recovery of redshift and fracAGN, by set of bands.
 
     ``truth`` is a `~miricigale.workflow.truths.Truth`, ``tables`` are its `StudyTables`, ``numbers`` those of
     `whole_sample`, and ``seed`` is that of the ranks (`true_ranks`).
     """
-    sample, fits = tables.sample, {}
+    sample = tables.sample
     matched = tables.matched[np.asarray(tables.matched["selection"]) == 0]
+    fits = {}
     for unit, table in tables.fits.items():
-        rows = {key: numbers[truth.name, unit, quantity] for key, quantity in _OF_FIT.items()}
-        values = {key: float(row["value"]) for key, row in rows.items()}
-        outliers = rows["photoz_outliers"]
+        outliers = numbers[truth.name, unit, "z_outliers"]
         n = int(outliers["n"])
+        fit = {"n": n}
+        for key, quantity in _OF_FIT.items():
+            fit[key] = float(numbers[truth.name, unit, quantity]["value"])
+        fit["photoz_n_outliers"] = round(n * fit["photoz_outliers"]) if n else 0
+        fit["photoz_outliers_low"] = float(outliers["low"])
+        fit["photoz_outliers_high"] = float(outliers["high"])
         rank = np.empty(0)
         if len(table):
             rank = true_ranks(tables.results[unit], sample, "redshift", seed)
-        known = np.isfinite(rank)
-        inside = np.abs(rank[known] - 0.5) <= 0.34
-        fits[unit] = {
-            "n": n,
-            **values,
-            "photoz_n_outliers": round(n * values["photoz_outliers"]) if n else 0,
-            "photoz_outliers_low": float(outliers["low"]),
-            "photoz_outliers_high": float(outliers["high"]),
-            # as in the table of the coverage of all parameters
-            "redshift_coverage": fraction_interval(int(inside.sum()), int(known.sum()))[0],
-            "conditions": fit_conditions(matched, sample["redshift"], table, bands),
-        }
+        rank = rank[np.isfinite(rank)]
+        inside = np.count_nonzero(np.abs(rank - 0.5) <= 0.34)
+        # as in the table of the coverage of all parameters
+        fit["redshift_coverage"] = fraction_interval(inside, rank.size)[0]
+        fit["conditions"] = fit_conditions(matched, sample["redshift"], table, bands)
+        fits[unit] = fit
     return {**truth.values(), "n_sample": len(sample), "fits": fits}

@@ -14,62 +14,86 @@ from miricigale.workflow.stages.sample import matched_errors
 _MAG = 2.5 / np.log(10)
 
 
-def study_results(config, truths, every, metrics):
+def study_results(config, truths, tables, metrics):
     """
-    All truths as `~miricigale.evaluation.StudyResults`.
+    Return all truths as `~miricigale.evaluation.StudyResults`.
 
-    ``truths`` and ``every`` are `~miricigale.workflow.truths.Truth` and ``StudyTables`` by name, the
+    ``truths`` and ``tables`` are `~miricigale.workflow.truths.Truth` and ``StudyTables`` by name, the
     reference first; ``metrics`` are those of the report.
     """
     bands = config.exposures.filters
-    reference = next(iter(every.values()))
+    reference = next(iter(tables.values()))
     # the paper's limits are where the median absolute difference is a fifth of the flux
-    options = {"statistic": "median_abs", "bin_size": config.errors.bin_size}
-    errors = matched_errors(reference.matched, reference.inside, bands, **options)
-    results, crowded = [], ConditionFlags.CROWDED
-    for name, tables in every.items():
-        fraction, matched = truths[name].frac_agn, tables.matched
-        fraction = None if isinstance(fraction, str) else fraction
-        parts = fraction, tables.truth, matched, tables.fits, tables.field
-        near = {band: has_flag(matched, f"{band}_condition", crowded) for band in bands}
-        results.append(TruthResults(name, *parts, near))
-    limits = {name: float(errors.limiting_magnitude(name).value) for name in bands}
-    calculator = {name: metrics["bands"][name]["etc_limit"] for name in bands}
+    errors = matched_errors(
+        reference.matched,
+        reference.inside,
+        bands,
+        statistic="median_abs",
+        bin_size=config.errors.bin_size,
+    )
+    limits = {}
+    calculator = {}
+    for band in bands:
+        limits[band] = float(errors.limiting_magnitude(band).value)
+        calculator[band] = metrics["bands"][band]["etc_limit"]
+    results = []
+    for name, study in tables.items():
+        frac_agn = truths[name].frac_agn
+        if isinstance(frac_agn, str):
+            frac_agn = None
+        crowded = {}
+        for band in bands:
+            column = f"{band}_condition"
+            crowded[band] = has_flag(study.matched, column, ConditionFlags.CROWDED)
+        results.append(
+            TruthResults(
+                name, frac_agn, study.truth, study.matched, study.fits, study.field, crowded
+            )
+        )
     return StudyResults(tuple(results), bands, config.highres.filter, limits, calculator)
 
 
 def extra_numbers(study, metrics, kernels):
     """
-    Numbers by key of `~miricigale.evaluation.PUBLISHED` that are not of the tables of the truths.
+    Return numbers by key of `~miricigale.evaluation.PUBLISHED` that are not of the tables of the truths.
 
     Of detection, kernels (`~miricigale.psf.MatchingKernel` by band) and bright point sources.
     """
-    n, one = metrics["detections"]["n_field"], study.truths[0]
-    found = np.asarray(one.matched["matched"], bool)[one.field]
+    reference = study.truths[0]
+    matched = np.asarray(reference.matched["matched"], bool)[reference.field]
     extra = {
-        "detected_catalog": Estimate.of_count(n),
-        "matched_catalog": Estimate.of_fraction(np.count_nonzero(found), found.size),
+        "detected_catalog": Estimate.of_count(metrics["detections"]["n_field"]),
+        "matched_catalog": Estimate.of_fraction(np.count_nonzero(matched), matched.size),
     }
-    for one in study.truths:
-        if one.frac_agn is None:
-            n_agn = np.count_nonzero(one.field & (np.asarray(one.truth["frac_agn"]) > 0))
+    for truth in study.truths:
+        if truth.frac_agn is None:
+            n_agn = np.count_nonzero(truth.field & (np.asarray(truth.truth["frac_agn"]) > 0))
             extra["agn.field"] = Estimate.of_count(n_agn)
-    off = {band: np.abs(one.encircled_energy_error()).max() for band, one in kernels.items()}
-    extra["kernels"] = Estimate(max(off.values()), n=len(off))
-    red = [value for band, value in off.items() if band != "miri.f770w"]
-    extra["kernels.red"] = Estimate(max(red, default=np.nan), n=len(red))
-    points = {band: one for band, one in metrics["bands"].items() if "points_n" in one}
-    for band, one in points.items():
-        label, scaling, error = band.rpartition(".")[2], one["f_scaling"], one["f_scaling_err"]
-        ends = (scaling - error, scaling + error)
-        extra[f"f_scaling.{label}"] = Estimate(scaling, *ends, one["points_n"])
-        extra[f"f_aper.{label}"] = Estimate(one["f_aper"])
-    for key, name in (("points.offset", "points_median"), ("points.scatter", "points_scatter")):
-        sizes = [(abs(_MAG * one[name]), one["points_n"]) for one in points.values()]
+    errors = {}
+    for band, kernel in kernels.items():
+        errors[band] = np.abs(kernel.encircled_energy_error()).max()
+    extra["kernels"] = Estimate(max(errors.values()), n=len(errors))
+    errors.pop("miri.f770w", None)
+    extra["kernels.red"] = Estimate(max(errors.values(), default=np.nan), n=len(errors))
+    offsets = []
+    scatters = []
+    for band, entry in metrics["bands"].items():
+        if "points_n" not in entry:
+            continue
+        n = entry["points_n"]
+        label = band.rpartition(".")[2]
+        scaling = entry["f_scaling"]
+        error = entry["f_scaling_err"]
+        extra[f"f_scaling.{label}"] = Estimate(scaling, scaling - error, scaling + error, n)
+        extra[f"f_aper.{label}"] = Estimate(entry["f_aper"])
+        offsets.append((abs(_MAG * entry["points_median"]), n))
+        scatters.append((abs(_MAG * entry["points_scatter"]), n))
+    for key, sizes in (("points.offset", offsets), ("points.scatter", scatters)):
+        # the largest of all bands
         sizes = [(size, n) for size, n in sizes if np.isfinite(size)]
         if sizes:
-            value, count = max(sizes)
-            extra[key] = Estimate(value, n=count)
+            size, n = max(sizes)
+            extra[key] = Estimate(size, n=n)
     return extra
 
 
@@ -78,10 +102,11 @@ _PAPER_ALPHA = 1.0
 
 
 def differences_of(config, metrics, model):
-    """What a run does otherwise than Yang et al. 2021: a list of sentences."""
-    deeper = [m["limit"] - m["proposal"] for m in metrics["bands"].values()]
+    """Return what a run does otherwise than Yang et al. 2021: a list of sentences."""
+    deeper = [entry["limit"] - entry["proposal"] for entry in metrics["bands"].values()]
     shares = {row["limit"]: row["to_proposal"] for row in metrics["detected"]}
     stand_ins = [name for name in model.resources if name in texts_of("stand_ins")]
+    to_proposal = [f"{100 * share:.0f} % of H < {limit:g}" for limit, share in shares.items()]
     differs = {
         "field": True,
         "exposures": not metrics["as_paper"],
@@ -97,7 +122,7 @@ def differences_of(config, metrics, model):
         "n_field": metrics["n_field"],
         "least_deeper": min(deeper),
         "most_deeper": max(deeper),
-        "to_proposal": " and ".join(f"{100 * x:.0f} % of H < {h:g}" for h, x in shares.items()),
+        "to_proposal": " and ".join(to_proposal),
         "alpha": config.sed.alpha,
         "stand_ins": ", ".join(stand_ins),
     }
@@ -110,25 +135,38 @@ _VERDICTS = {"agrees": "agree", "differs": "differ"}
 
 
 def write_comparison(page, reasons, sentences):
-    """The section with all numbers of Yang et al. 2021 and those of the run."""
-    same = page.metrics["as_paper"]
-    options = {"seed": page.context.seed, "reasons": reasons, "same_exposures": same}
-    table = compare_with_paper(page.study, **options)
+    """Write the section with all numbers of Yang et al. 2021 and those of the run."""
+    same_exposures = page.metrics["as_paper"]
+    table = compare_with_paper(
+        page.study,
+        seed=page.context.seed,
+        reasons=reasons,
+        same_exposures=same_exposures,
+    )
     counts = collections.Counter(_VERDICTS.get(v.split()[0], v) for v in table["verdict"])
     verdicts = ", ".join(f"{n} {verdict}" for verdict, n in counts.most_common())
     page.numbers("paper", table, verdicts=verdicts)
-    page.text("judged" if same else "other_exposures")
+    page.text("judged" if same_exposures else "other_exposures")
     with page.folding("differences", n_differences=len(sentences)):
         page.report.bullets(sentences)
     rows = []
-    for row in table:
-        mark = {"=": "", "~": "about "}.get(row["relation"], f"{row['relation']} ")
-        low, high = row["low"], row["high"]
-        known = np.isfinite([low, high]).all()
-        form = f"{{:.3g}} ± {0.5 * (high - low):.2g}" if known else ".3g"
-        cells = {
-            "paper": f"{mark}{row['paper']:.3g}",
-            "ours": number(row["ours"], form, "not measured in this study"),
-        }
-        rows.append({name: row[name] for name in table.colnames} | cells)
+    for numbers in table:
+        row = {name: numbers[name] for name in table.colnames}
+        row["paper"] = f"{_relation(row['relation'])}{row['paper']:.3g}"
+        form = ".3g"
+        low = row["low"]
+        high = row["high"]
+        if np.isfinite(low) and np.isfinite(high):
+            form = f"{{:.3g}} ± {0.5 * (high - low):.2g}"
+        row["ours"] = number(row["ours"], form, "not measured in this study")
+        rows.append(row)
     page.table("table", rows, n_numbers=len(rows))
+
+
+def _relation(sign):
+    """Return the relation of a number in front of it: nothing for an equal one."""
+    if sign == "=":
+        return ""
+    if sign == "~":
+        return "about "
+    return f"{sign} "

@@ -26,142 +26,177 @@ from miricigale.workflow.stages.inputs import DUST_SHOWS, catalog_bands, existin
 
 def exposure_kinds(config, forecasts, bands):
     """
-    Kinds of exposures of each band as dictionaries, with what the dithers of a pointing have together.
+    Return kinds of exposures of each band as dictionaries, with what the dithers of a pointing have together.
 
     ``forecasts`` are tables by unit, ``bands`` the plain numbers of the bands; filling and saturation
     are the highest of the dithers.
     """
-    kinds, n_pointings = {}, len(study_pointings(config))
+    n_pointings = len(study_pointings(config))
+    kinds = {}
     for unit, e in study_exposures(config).items():
         key = (e.filter, f"{e.readout} {e.subarray}", e.n_groups, e.n_integrations)
-        kinds.setdefault(key, []).append((e, forecasts[unit]))
-    return [
-        {
+        kinds.setdefault(key, []).append(unit)
+    exposures = study_exposures(config)
+    rows = []
+    for (name, readout, n_groups, n_integrations), units in kinds.items():
+        tables = [forecasts[unit] for unit in units]
+        time = sum(exposures[unit].exposure_time for unit in units).to_value(u.s)
+        n_exposures = f"{n_pointings} x {len(units) // n_pointings}"
+        if len(units) % n_pointings:
+            n_exposures = f"{len(units)} at {n_pointings} pointings"
+        row = {
             "band": band_label(name),
             "as_ceers": "yes" if bands[name]["ceers"] else "no",
             "readout": readout,
             "frames": f"{n_groups} x {n_integrations}",
-            "exposures": f"{len(group)} at {n_pointings} pointings"
-            if len(group) % n_pointings
-            else f"{n_pointings} x {len(group) // n_pointings}",
-            "time": sum(e.exposure_time for e, _ in group).to_value(u.s) / n_pointings,
+            "exposures": n_exposures,
+            "time": time / n_pointings,
             "background": study_background(config, name).value,
-            "fill": max(float(table["sky_fraction"][0]) for _, table in group),
-            "saturated": max(int(table["n_pixels"][0]) for _, table in group),
+            "fill": max(float(table["sky_fraction"][0]) for table in tables),
+            "saturated": max(int(table["n_pixels"][0]) for table in tables),
         }
-        for (name, readout, n_groups, n_integrations), group in kinds.items()
-    ]
+        rows.append(row)
+    return rows
 
 
 def stand_ins(config, model):
-    """Sentences on everything that is not what Yang et al. 2021, or the observatory, have."""
-    texts, residual = texts_of("stand_ins"), config.detector.residual
-    chosen = [name for name in model.resources if name in texts]
-    chosen += ["instrument", "no_residual" if residual == 0.0 else "residual"]
-    chosen += ["rates"] if config.exposures.kind == "rates" else []
+    """Return sentences on everything that is not what Yang et al. 2021, or the observatory, have."""
+    texts = texts_of("stand_ins")
+    residual = config.detector.residual
+    names = [name for name in model.resources if name in texts]
+    names.append("instrument")
+    names.append("no_residual" if residual == 0.0 else "residual")
+    if config.exposures.kind == "rates":
+        names.append("rates")
+    names.append("existing" if all(existing_bands(config).values()) else "own")
     rays = ", read-out and cosmic rays" if config.detector.cosmic_rays else " and read-out"
-    facts = {"rays": rays, "residual": residual}
-    chosen.append("existing" if all(existing_bands(config).values()) else "own")
-    return [sentence(texts[name], facts) for name in chosen]
+    return [sentence(texts[name], {"rays": rays, "residual": residual}) for name in names]
 
 
 def library_rows(model):
-    """Role, component, and reference data of each component of a model."""
+    """Return role, component, and reference data of each component of a model."""
     rows = []
     for part in model.components:
+        library = "closed form"
+        reference = part.reference
         record = resources().get(part.resource) if part.resource else None
-        what = f"{record.title} ({part.resource})" if record else "closed form"
+        if record:
+            library = f"{record.title} ({part.resource})"
+            reference = reference or record.citation
         if part.role == "stellar":
-            what += f"; IMF {part.imf}"
-        cite = part.reference or (record.citation if record else "")
-        rows.append((part.role, part.name, what, cite))
+            library += f"; IMF {part.imf}"
+        rows.append((part.role, part.name, library, reference or ""))
     return rows
 
 
 def catalog_facts(config, catalog):
-    """What the sources that were taken are, and how their SEDs are fitted: dict of text."""
-    options, limit = config.catalog, config.sed.max_wavelength
+    """Describe the sources of the catalog, and how their SEDs are fitted: dict of text."""
+    options = config.catalog
     # the folder of a user's file is not part of the result
     source = f"{Path(options.source).name}, the user's file"
     if options.source in resources():
         source = f"{options.source}: {resource(options.source).title}"
-    bands = catalog_bands(catalog)
-    descriptions = [catalog[name].info.description for name in bands]
-    described = "; ".join(dict.fromkeys(text for text in descriptions if text is not None))
-    fluxes = f"; the description in the file: {described}"
-    if not described:
-        fluxes = ", as the file gives them, without a description"
-    fitted, longest = input_bands(catalog, limit)
-    own = [name for name, errors in fitted.items() if errors]
-    guess = f"{100 * config.sed.catalog_error:g} % error each"
-    if not own:
-        how = f" (pivot up to {limit:g} µm), {guess}, for the catalog gives none"
-    else:
-        others = "" if len(own) == len(fitted) else f" in {', '.join(own)}; {guess} in the others"
-        how = f", with the catalog's errors{others}"
-    if longest > DUST_SHOWS:
-        how += "; the dust's alpha is fitted too, of sources with a flux there"
-    if config.highres.filter in bands:
-        how += f"; each SED is scaled to the flux in {config.highres.filter}"
-    n_all, known = catalog.meta.get("n_sources"), np.asarray(catalog["redshift"], float) > 0
-    number = f"{len(catalog)} of {n_all}" if n_all else f"{len(catalog)}"
+    n_sources = str(len(catalog))
+    if n_all := catalog.meta.get("n_sources"):
+        n_sources = f"{len(catalog)} of {n_all}"
     facts = {
         "source": source,
-        "cut": f"{options.mag_column} <= {options.mag_limit:g}, {number} sources",
-        "fluxes": f"{len(bands)} bands{fluxes}",
-        "input SEDs fitted to": ", ".join(fitted) + how,
+        "cut": f"{options.mag_column} <= {options.mag_limit:g}, {n_sources} sources",
+        "fluxes": _fluxes_text(catalog),
+        "input SEDs fitted to": _input_text(config, catalog),
     }
     if config.sed.infrared == "ceers":
         n = CEERS_DUST[sed.SEDModel.yang2021(agn=False).component("dust").name][-1]
         drawn = f"drawn from CEERS' distribution, measured on {n} sources"
         facts["dust colors"] = f"{drawn}, where no band of the fit of the input SED shows the dust"
-    if none := np.count_nonzero(~known & ~np.asarray(catalog["star"], bool)):
-        facts["galaxies without redshift"] = f"{none}: without a model SED, and so on no image"
+    has_redshift = np.asarray(catalog["redshift"], float) > 0
+    is_star = np.asarray(catalog["star"], bool)
+    if n := np.count_nonzero(~has_redshift & ~is_star):
+        facts["galaxies without redshift"] = f"{n}: without a model SED, and so on no image"
     existing = existing_bands(config)
-    own = "depths" if all(existing.values()) else "the errors of each source in the catalog"
-    of = f"{len(existing)} existing bands, with {own} ({', '.join(existing)})"
-    facts["fitted in the end"] = f"{of}, and {len(config.exposures.filters)} of MIRI"
+    errors = "depths" if all(existing.values()) else "the errors of each source in the catalog"
+    fitted = f"{len(existing)} existing bands, with {errors} ({', '.join(existing)})"
+    facts["fitted in the end"] = f"{fitted}, and {len(config.exposures.filters)} of MIRI"
     excess = " or ".join(f"{value:g}" for value in config.fit.dust_excess)
     facts["dust of the fit"] = f"{excess or 1} times the power that attenuation takes"
     if "redshift_source" in catalog.colnames:
         kinds, counts = np.unique(np.asarray(catalog["redshift_source"], str), return_counts=True)
-        pairs = zip(kinds, counts, strict=True)
-        facts["redshifts"] = ", ".join(f"{n} {kind}" for kind, n in pairs)
-    return facts | {"stars": str(np.count_nonzero(catalog["star"]))}
+        pairs = zip(counts, kinds, strict=True)
+        facts["redshifts"] = ", ".join(f"{n} {kind}" for n, kind in pairs)
+    facts["stars"] = str(np.count_nonzero(is_star))
+    return facts
+
+
+def _fluxes_text(catalog):
+    """Return the number of bands of a catalog, and how its file describes them."""
+    bands = catalog_bands(catalog)
+    descriptions = dict.fromkeys(catalog[name].info.description for name in bands)
+    text = "; ".join(filter(None, descriptions))
+    if not text:
+        return f"{len(bands)} bands, as the file gives them, without a description"
+    return f"{len(bands)} bands; the description in the file: {text}"
+
+
+def _input_text(config, catalog):
+    """Return the bands that the input SEDs are fitted to, and how."""
+    limit = config.sed.max_wavelength
+    bands, longest = input_bands(catalog, limit)
+    with_errors = [name for name, has_errors in bands.items() if has_errors]
+    guess = f"{100 * config.sed.catalog_error:g} % error each"
+    text = ", ".join(bands)
+    if not with_errors:
+        text += f" (pivot up to {limit:g} µm), {guess}, for the catalog gives none"
+    elif len(with_errors) == len(bands):
+        text += ", with the catalog's errors"
+    else:
+        text += f", with the catalog's errors in {', '.join(with_errors)}; {guess} in the others"
+    if longest > DUST_SHOWS:
+        text += "; the dust's alpha is fitted too, of sources with a flux there"
+    if config.highres.filter in catalog_bands(catalog):
+        text += f"; each SED is scaled to the flux in {config.highres.filter}"
+    return text
 
 
 def versions(*metas):
     """
-    Software: pairs of package and version.
+    Return software as pairs of package and version.
 
     ``metas`` are those of products, whose version of this package may be another than today's.
     """
-    here = provenance()["version"]
-    made = sorted({meta["version"] for meta in metas if "version" in meta})
-    own = here if made in ([], [here]) else f"{here} (products: {', '.join(made)})"
-    packages = ("numpy", "astropy", "photutils", "numba", "scipy", "drizzle", "astro-sedpy")
-    return [("miricigale", own), *((name, importlib.metadata.version(name)) for name in packages)]
+    version = provenance()["version"]
+    of_products = sorted({meta["version"] for meta in metas if "version" in meta})
+    if of_products not in ([], [version]):
+        version = f"{version} (products: {', '.join(of_products)})"
+    rows = [("miricigale", version)]
+    for name in ("numpy", "astropy", "photutils", "numba", "scipy", "drizzle", "astro-sedpy"):
+        rows.append((name, importlib.metadata.version(name)))
+    return rows
 
 
 def sources_to_cite(names, metas):
     """
-    What to cite for resources (``names``) and for products (their ``metas``), each once.
+    Return what to cite for resources (``names``) and for products (their ``metas``), each once.
 
     Entries are sorted, and one that another contains is left out.
     """
-    entries = {entry for meta in metas for entry in meta.get("citations", ())}
-    entries |= set(citations(*names))
-    return sorted(one for one in entries if not any(one != two and one in two for two in entries))
+    entries = set(citations(*names))
+    for meta in metas:
+        entries.update(meta.get("citations", ()))
+    longest = []
+    for entry in sorted(entries):
+        if not any(entry != longer and entry in longer for longer in entries):
+            longest.append(entry)
+    return longest
 
 
 def write_exposures(page):
-    """The section on what was exposed, of the reference truth, and of which sources."""
-    config, context = page.config, page.context
+    """Write the section on what was exposed, of the reference truth, and of which sources."""
+    config = page.config
+    context = page.context
     page.section("exposures")
-    forecasts = {
-        unit: context.table(f"{page.first.name}/exposures/{unit}_forecast.ecsv")
-        for unit in study_exposures(config)
-    }
+    forecasts = {}
+    for unit in study_exposures(config):
+        forecasts[unit] = context.table(f"{page.first.name}/exposures/{unit}_forecast.ecsv")
     page.table("exposures", exposure_kinds(config, forecasts, page.metrics["bands"]))
     page.report.text(f"Dithers: {dithers_text(config)}. {_background_sentence(config)}.")
     catalog = context.table("catalog.ecsv")
@@ -169,7 +204,7 @@ def write_exposures(page):
 
 
 def _background_sentence(config):
-    """Which background the images have, where it is from and how it varies."""
+    """Return which background the images have, where it is from and how it varies."""
     options = config.scene
     text = f"Background at the center of the field: {background_text(**background_options(config))}"
     if options.background_scale != 1:
@@ -183,8 +218,9 @@ def _background_sentence(config):
 
 
 def write_origin(page, metas):
-    """The section on libraries, software and citations; ``metas`` are those of products."""
-    report, model = page.report, page.model
+    """Write the section on libraries, software and citations; ``metas`` are those of products."""
+    report = page.report
+    model = page.model
     page.section("origin")
     header = ("part", "component", "library", "reference")
     report.table(library_rows(model), header=header, caption=page.sentence("library"), text=4)

@@ -15,6 +15,7 @@ from miricigale.psf import MatchingKernel
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page import paper
 from miricigale.workflow.page.derived_sections import (
+    measured_reasons,
     write_experiments,
     write_perturbed,
     write_rivals,
@@ -35,7 +36,7 @@ from miricigale.workflow.page.photometry_sections import (
 from miricigale.workflow.page.provenance import stand_ins, write_exposures, write_origin
 from miricigale.workflow.page.result_sections import write_results
 from miricigale.workflow.page.study_page import StudyPage
-from miricigale.workflow.stages import rivals, variants
+from miricigale.workflow.stages import rivals
 from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, IMAGES, exposure_plan
 from miricigale.workflow.stages.grids import (
     grid_of,
@@ -70,32 +71,35 @@ _MEASURED = ("highres", "photometry", "errors", "fit", "point_sources", "perturb
 )
 def make_report(context, _):
     """Stage 14: the page with its figures, and the numbers as JSON."""
-    config, truths, model = context.config, study_truths(context.config), sed.SEDModel.yang2021()
-    every = {name: StudyTables(context, name) for name in truths}
-    shown, bands = reference(config), config.exposures.filters
+    config = context.config
+    bands = config.exposures.filters
+    truths = study_truths(config)
+    shown = reference(config)
+    model = sed.SEDModel.yang2021()
+    tables = {name: StudyTables(context, name) for name in truths}
+    # truths of whose sky the analysis knows all
+    unperturbed = {name: truth for name, truth in truths.items() if not truth.perturbations}
+    study_tables = {name: tables[name] for name in unperturbed}
     area = _field_area(context, shown)
+    metrics = study_metrics(config, tables[shown], area)
+    study = paper.study_results(config, unperturbed, study_tables, metrics)
     patch = shown_patch(config)
-    own = study_patches(config)[patch].bands
-    path = of_patch(f"{shown}/mosaic_{{}}", patch)
-    mosaics = {name: context.image(f"{path.format(name)}.fits") for name in own}
-    metrics = study_metrics(config, every[shown], area)
-    # those of whose sky the analysis knows all
-    known = {name: truth for name, truth in truths.items() if not truth.perturbations}
-    tables = {name: every[name] for name in known}
-    others = rivals.read_rivals(context)
-    study = paper.study_results(config, known, tables, metrics)
-    path = of_patch("kernel_{}", patch)
-    kernels = {n: MatchingKernel.read(context.path(f"{path.format(n)}.fits")) for n in own}
+    mosaics = {}
+    kernels = {}
+    for name in study_patches(config)[patch].bands:
+        mosaics[name] = context.image(f"{of_patch(f'{shown}/mosaic_{name}', patch)}.fits")
+        path = context.path(f"{of_patch(f'kernel_{name}', patch)}.fits")
+        kernels[name] = MatchingKernel.read(path)
+    rival_tables = rivals.read_rivals(context)
     extra = paper.extra_numbers(study, metrics, kernels)
-    extra |= rivals.source_extractor_numbers(others, context.seed)
+    extra |= rivals.source_extractor_numbers(rival_tables, context.seed)
     study = dataclasses.replace(study, extra=extra)
     numbers = study_numbers(study, seed=context.seed, n_draws=300)
     context.save_table("report/numbers.ecsv", numbers)
     numbers = whole_sample(numbers)
-    metrics["truths"] = {
-        name: truth_metrics(truth, tables[name], numbers, bands, context.seed)
-        for name, truth in known.items()
-    }
+    metrics["truths"] = {}
+    for name, truth in unperturbed.items():
+        metrics["truths"][name] = truth_metrics(truth, tables[name], numbers, bands, context.seed)
     metrics["fits"] = metrics["truths"][shown]["fits"]
     if metrics["n_sample"] == 0:
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
@@ -106,46 +110,50 @@ def make_report(context, _):
     subtitle += f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
     title = f"miricigale: {config.run.name}"
     report = Page(title, subtitle=subtitle, dpi=config.report.dpi)
-    page = StudyPage(report, context, tables, study, metrics, kernels, model, area)
+    page = StudyPage(report, context, study_tables, study, metrics, kernels, model, area)
     write_summary(page, truths, numbers, stand_ins(config, model))
     write_exposures(page)
     write_images(page, mosaics, patch)
     write_detections(page)
     write_photometry(page)
-    write_rivals(page, others)
+    write_rivals(page, rival_tables)
     write_errors(page)
     calculator = {name: entry["etc_limit"] for name, entry in metrics["bands"].items()}
     matched = page.tables.matched
-    switched = write_variants(page, matched, calculator)
+    variants = write_variants(page, matched, calculator)
     write_results(page, numbers)
-    write_experiments(page, tables)
-    reasons = variants.measured_reasons(switched, config)
+    write_experiments(page, study_tables)
+    reasons = measured_reasons(variants, config)
     paper.write_comparison(page, reasons, paper.differences_of(config, metrics, model))
-    write_perturbed(page, truths, every)
+    write_perturbed(page, truths, tables)
     write_inputs(page)
     write_origin(page, [page.tables.truth.meta, matched.meta])
     context.save("report/index.html", lambda path: report.write(path))
 
 
 def _field_area(context, truth):
-    """Solid angle of the field of all bands, that of each patch in its core."""
-    config, area = context.config, 0 * u.arcmin**2
-    for patch, one in study_patches(config).items():
-        if one.bands == tuple(config.exposures.filters):
-            path = of_patch(f"{truth}/mosaic_{{}}", patch)
-            mosaics = [context.image(f"{path.format(band)}.fits") for band in one.bands]
-            area += footprint_area(mosaics, _core_of(config, patch, mosaics[0].wcs))
+    """Return the solid angle of the field of all bands, that of each patch in its core."""
+    config = context.config
+    area = 0 * u.arcmin**2
+    for name, patch in study_patches(config).items():
+        if patch.bands == tuple(config.exposures.filters):
+            mosaics = []
+            for band in patch.bands:
+                path = of_patch(f"{truth}/mosaic_{band}", name)
+                mosaics.append(context.image(f"{path}.fits"))
+            area += footprint_area(mosaics, _core_of(config, name, mosaics[0].wcs))
     return area
 
 
 def _core_of(config, patch, wcs):
-    """Which pixels of a mosaic are in the core of its patch."""
+    """Tell which pixels of a mosaic are in the core of its patch."""
     if not patch:
         return True
-    grid, whole = patch_grid(config), grid_of(config, config.highres.pixel_scale)
+    grid = patch_grid(config)
+    prior = grid_of(config, config.highres.pixel_scale)
     nx, ny = wcs.pixel_shape
     # both grids have the same axes
-    x = pixel_to_pixel(wcs, whole, np.arange(nx), np.zeros(nx))[0]
-    y = pixel_to_pixel(wcs, whole, np.zeros(ny), np.arange(ny))[1]
+    x = pixel_to_pixel(wcs, prior, np.arange(nx), np.zeros(nx))[0]
+    y = pixel_to_pixel(wcs, prior, np.zeros(ny), np.arange(ny))[1]
     holder = grid.holder(np.stack(np.meshgrid(x, y), axis=-1))
     return (holder == grid.names.index(patch)).reshape(ny, nx)

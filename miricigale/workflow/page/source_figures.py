@@ -20,34 +20,39 @@ _AXES = {"redshift": "redshift", "frac_agn": "fracAGN"}
 
 def spectra_figure(study, key, model):
     """
-    Spectra of one source with AGN of several fractions, PAH features marked, above the curves of the filters.
+    Draw spectra of a source with AGN of several fractions and PAH features, above the curves of the filters.
 
     ``model`` is one with AGN.
     """
     from matplotlib import colormaps
 
     values = {}
-    for one in (*study.with_agn[:1], study.truths[0]):
-        row = one.truth[np.asarray(one.truth["id"]) == key][0]
+    for truth in (*study.with_agn[:1], study.truths[0]):
+        row = truth.truth[np.asarray(truth.truth["id"]) == key][0]
         values |= {name: row[name] for name in row.colnames if name in model.parameters}
     figure, axes = new_figure(2, 1, size=(8.5, 2.6), sharex=True, height_ratios=(2.6, 1))
-    (ax, lower), light = axes[:, 0], []
+    ax, lower = axes[:, 0]
+    light = []
     for fraction, shade in zip(SEQUENCE, np.linspace(0.0, 0.85, len(SEQUENCE)), strict=True):
-        sed = model.evaluate(**{**values, "frac_agn": fraction})
+        sed = model.evaluate(**(values | {"frac_agn": fraction}))
         wave = sed.wave.to_value(u.um)
         # the whole range of the bands, and of the features that are marked
         shown = (wave > 0.3) & (wave < 40)
-        wave, flux = wave[shown], sed.fnu.to_value(FNU)[shown]
-        style = {"color": colormaps["plasma"](shade), "lw": 1.6}
-        plot_spectrum(wave, flux, ax=ax, label=f"fracAGN {fraction:g}", **style)
+        wave = wave[shown]
+        flux = sed.fnu.to_value(FNU)[shown]
+        color = colormaps["plasma"](shade)
+        label = f"fracAGN {fraction:g}"
+        plot_spectrum(wave, flux, ax=ax, label=label, color=color, lw=1.6)
         light.append(flux[flux > 0])
     top = np.concatenate(light).max()
     bottom = max(np.concatenate(light).min(), 1e-5 * top)
     span = np.log10(top / bottom)
     ax.set_xlim(wave.min(), wave.max())
     ax.set_ylim(bottom * 10 ** (-0.12 * span), top * 10 ** (0.1 * span))
-    bands = [Filter.from_name(name) for name in by_wavelength(study.bands)]
-    curves = [(one.wave.value, one.throughput, band_label(one.name)) for one in bands]
+    curves = []
+    for name in by_wavelength(study.bands):
+        band = Filter.from_name(name)
+        curves.append((band.wave.value, band.throughput, band_label(name)))
     plot_filters(curves, ax=lower, lw=1.4)
     legend(lower, loc="upper left", ncols=2, fontsize=7)
     redshift = float(values["redshift"])
@@ -67,7 +72,7 @@ def spectra_figure(study, key, model):
 
 def example_figure(results, row, key, model):
     """
-    One source: photometry with the best model and residuals, and posteriors of redshift and fracAGN.
+    Draw a source: photometry with the best model and residuals, and posteriors of redshift and fracAGN.
 
     ``results`` has a `~miricigale.fitting.FitResults` for each set of bands, "all" among them; "none" is
     drawn too if it is there. ``row`` of the truth has ``redshift`` and ``frac_agn``; ``model`` is that of
@@ -75,8 +80,12 @@ def example_figure(results, row, key, model):
     """
     from matplotlib.figure import Figure
 
-    fits = {name: results[name].loc[key] for name in _SETS if name in results}
-    fits = {name: one for name, one in fits.items() if np.isfinite(one.chi2)}
+    fits = {}
+    for name in _SETS:
+        if name in results:
+            result = results[name].loc[key]
+            if np.isfinite(result.chi2):
+                fits[name] = result
     figure = Figure(figsize=(WIDTH, 7.2), layout="constrained")
     grid = figure.add_gridspec(3, 4, height_ratios=(2.6, 0.9, 2.6))
     upper = figure.add_subplot(grid[0, :])
@@ -89,23 +98,28 @@ def example_figure(results, row, key, model):
     legend(upper, loc="upper left", ncols=3)
     for k, (axis, label) in enumerate(_AXES.items()):
         ax = figure.add_subplot(grid[2, k])
-        _draw_posteriors(ax, {name: one.distribution(axis) for name, one in fits.items()})
+        _draw_posteriors(ax, {name: result.distribution(axis) for name, result in fits.items()})
         ax.axvline(row[axis], ymax=0.6, color="0.2", ls=":", lw=1.4, label="truth")
         ax.set_xlabel(label)
         if k == 0:
             ax.set_ylabel("posterior density (peak 1)")
             legend(ax, loc="upper left")
     planes = []
-    for k, (name, one) in enumerate(fits.items()):
+    for k, (name, result) in enumerate(fits.items()):
         ax = figure.add_subplot(grid[2, 2 + k])
-        edges = [u.Quantity(one.distribution(axis)[0]).value for axis in _AXES]
-        truth = tuple(float(row[axis]) for axis in _AXES)
-        style = {"labels": tuple(_AXES.values()), "truth": truth, "cmap": _SETS[name][2]}
-        plot_pdf_2d(*edges, one.joint_pdf(*_AXES), ax=ax, **style)
+        plot_pdf_2d(
+            *[u.Quantity(result.distribution(axis)[0]).value for axis in _AXES],
+            result.joint_pdf(*_AXES),
+            ax=ax,
+            labels=tuple(_AXES.values()),
+            truth=tuple(float(row[axis]) for axis in _AXES),
+            cmap=_SETS[name][2],
+        )
         ax.set_title(SET_LABELS[name], fontsize="medium")
         planes.append(ax)
     # both planes alike, so that the areas can be compared
-    xlim, ylim = [ax.get_xlim() for ax in planes], [ax.get_ylim() for ax in planes]
+    xlim = [ax.get_xlim() for ax in planes]
+    ylim = [ax.get_ylim() for ax in planes]
     for ax in planes:
         ax.set(xlim=(np.min(xlim), np.max(xlim)), ylim=(np.min(ylim), np.max(ylim)))
     for ax in planes[1:]:
@@ -114,33 +128,34 @@ def example_figure(results, row, key, model):
 
 
 def _draw_fit(ax, best, without, row, model):
-    """Photometry and residuals on a pair of axes, with the best models, parts of them, and the truth in words."""
+    """Draw photometry and residuals on a pair of axes, with the best models, their parts, and the truth."""
     parts = {}
     if without is not None:
-        other = without.best_sed(model)
-        parts["best model without MIRI"] = (other.wave, other.fnu)
-    redshift, fraction = (best.best[axis].value for axis in _AXES)
+        spectrum = without.best_sed(model)
+        parts["best model without MIRI"] = (spectrum.wave, spectrum.fnu)
+    redshift = best.best["redshift"].value
+    fraction = best.best["frac_agn"].value
     if fraction > 0:
-        total, galaxy = best.best_sed(model), best.best_sed(model, frac_agn=0.0)
+        total = best.best_sed(model)
+        galaxy = best.best_sed(model, frac_agn=0.0)
         parts["galaxy of the best model"] = (galaxy.wave, galaxy.fnu)
         parts["AGN of the best model"] = (total.wave, total.fnu - galaxy.fnu)
-    best.plot_sed(
-        ax=ax,
-        model=model,
-        parts=parts,
-        groups=["MIRI" if n.startswith("miri.") else "existing bands" for n in best.filters],
-        title=f"source {plain_text(row['id'])}: injected z = {row['redshift']:.3f}, "
+    groups = ["MIRI" if name.startswith("miri.") else "existing bands" for name in best.filters]
+    title = (
+        f"source {plain_text(row['id'])}: injected z = {row['redshift']:.3f}, "
         f"fracAGN = {row['frac_agn']:.2g}; "
         f"best model with MIRI: z = {redshift:.3f}, fracAGN = {fraction:g}, "
-        f"chi2 = {best.chi2:.1f} in {best.n_bands} bands",
+        f"chi2 = {best.chi2:.1f} in {best.n_bands} bands"
     )
+    best.plot_sed(ax=ax, model=model, parts=parts, groups=groups, title=title)
 
 
 def _draw_posteriors(ax, distributions):
-    """One-dimensional posteriors over each other, as curves with a peak of 1; the axis holds 99.8 % of each."""
+    """Draw posteriors of a parameter over each other, as curves with a peak of 1, over 99.8 % of each."""
     ends = []
     for name, (edges, weights) in distributions.items():
-        edges, weights = u.Quantity(edges).value, np.asarray(weights, float)
+        edges = u.Quantity(edges).value
+        weights = np.asarray(weights, float)
         color, line, _ = _SETS[name]
         width = np.diff(edges)
         density = np.divide(weights, width, out=np.zeros(width.size), where=width > 0)

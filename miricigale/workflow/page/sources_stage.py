@@ -53,16 +53,17 @@ FLAGS = {
 )
 def make_sources(context, name):
     """Stage 14, in addition: the page of a truth, and what it shows of its sources."""
-    config, tables = context.config, _Sources(context, name)
+    config = context.config
+    tables = _Sources(context, name)
     suffix, _ = measured_mosaic(config)
     # pictures are of one patch where there are more
     patch = shown_patch(config)
-    paths = [of_patch(f"mosaic_{{}}{suffix}", patch)]
-    paths += [f"{of_patch('photometry/{}', patch)}_{kind}" for kind in ("model", "residual")]
-    bands = {
-        band: [context.image(f"{name}/{path.format(band)}.fits") for path in paths]
-        for band in study_patches(config)[patch].bands
-    }
+    bands = {}
+    for band in study_patches(config)[patch].bands:
+        mosaic = of_patch(f"{name}/mosaic_{band}{suffix}", patch)
+        measured = of_patch(f"{name}/photometry/{band}", patch)
+        paths = (f"{mosaic}.fits", f"{measured}_model.fits", f"{measured}_residual.fits")
+        bands[band] = [context.image(path) for path in paths]
     cutouts = Cutouts(context.image(f"{of_patch('f160w', patch)}.fits"), bands)
     sky = tables.truth["sky"]
     imaged = cutouts.on_image(sky)
@@ -93,12 +94,14 @@ def make_sources(context, name):
 
 
 class _Sources(StudyTables):
-    """What the page shows of a truth: photometry, spectra, posteriors, parameters and flags of its sources."""
+    """Photometry, spectra, posteriors, parameters and flags of the sources of a truth, as the page has them."""
 
     def __init__(self, context, name):
         super().__init__(context, name)
-        config, truth = context.config, self.truth
-        self.model, self.prior = sed.SEDModel.yang2021(), config.highres.filter
+        config = context.config
+        truth = self.truth
+        self.model = sed.SEDModel.yang2021()
+        self.prior = config.highres.filter
         self.miri = tuple(config.exposures.filters)
         existing = (band for band in existing_bands(config) if band not in self.miri)
         self.bands = (*existing, *self.miri)
@@ -106,35 +109,43 @@ class _Sources(StudyTables):
         self.edges = np.geomspace(0.7 * self.pivots.min(), 1.4 * self.pivots.max(), N_WAVE + 1)
         self.sampled = np.asarray(self.matched["selection"]) == 0
         # with and without MIRI: the sets in the table and the figure of the spectrum
-        both = [unit for unit in ("all", "none") if unit in self.results]
-        self.compared = both or list(self.results)[:2]
+        self.compared = [unit for unit in ("all", "none") if unit in self.results]
+        if not self.compared:
+            self.compared = list(self.results)[:2]
         # all sets are fitted with the same model
-        fitted = next(iter(self.results.values())).first
-        known = [name for name in fitted.parameters if name in truth.colnames]
-        self.units = {name: fitted.unit(name) for name in known}
-        # columns without a unit are in that of the parameter
-        values = (u.Quantity(truth[k], unit, dtype=float) for k, unit in self.units.items())
-        self.parameters = np.transpose([one.value for one in values])
+        fits = next(iter(self.results.values())).first
+        self.units = {}
+        parameters = []
+        for parameter in fits.parameters:
+            if parameter in truth.colnames:
+                unit = fits.unit(parameter)
+                self.units[parameter] = unit
+                # columns without a unit are in that of the parameter
+                parameters.append(u.Quantity(truth[parameter], unit, dtype=float).value)
+        self.parameters = np.transpose(parameters)
         self.true = np.transpose([truth[band].to_value(FNU) for band in self.bands])
-        pairs = zip(*map(self._measured, self.bands), strict=True)
-        self.flux, self.error = map(np.transpose, pairs)
+        measured = [self._measured(band) for band in self.bands]
+        self.flux = np.transpose([flux for flux, _ in measured])
+        self.error = np.transpose([error for _, error in measured])
 
     def _measured(self, band):
-        """Fluxes of all sources in a band and their errors; mock fluxes are of the sample, and of all sets."""
+        """Return fluxes and errors (uJy) of all sources in a band; mock ones are of the sample alone."""
         if band in self.miri:
-            return [self.matched[key].to_value(FNU) for key in (band, error_column(band))]
+            flux = self.matched[band].to_value(FNU)
+            return flux, self.matched[error_column(band)].to_value(FNU)
         results = next(iter(self.results.values()))
-        at = results.first.filters.index(band)
-        return [self.of_sources(results.of(name)[:, at]) for name in ("flux", "flux_err")]
+        k = results.first.filters.index(band)
+        flux = self.of_sources(results.of("flux")[:, k])
+        return flux, self.of_sources(results.of("flux_err")[:, k])
 
     def of_sources(self, values):
-        """Values of the rows of the fits as values of the sources, NaN without a fit."""
+        """Return values of the rows of the fits as values of the sources, NaN without a fit."""
         out = np.full(len(self.truth), np.nan)
         out[self.sampled] = values
         return out
 
     def first_of(self, rows, n):
-        """Which of some rows (bool) are shown if at most ``n`` can be: fitted ones, then the brightest."""
+        """Tell which of some rows (bool) are shown if at most ``n`` can be: fitted ones, then the brightest."""
         bright = np.nan_to_num(self.truth[self.prior].value, nan=-np.inf)
         order = np.lexsort((-bright, ~self.sampled, ~rows))
         first = np.zeros(len(rows), bool)
@@ -142,8 +153,9 @@ class _Sources(StudyTables):
         return first & rows
 
     def columns(self, order):
-        """Columns of the table of all sources, in the order of the files."""
-        truth, matched = self.truth, self.matched
+        """Return columns of the table of all sources, in the order of the files."""
+        truth = self.truth
+        matched = self.matched
         columns = {
             "id": truth["id"],
             "mag": ab_magnitude(truth[self.prior]),
@@ -161,40 +173,44 @@ class _Sources(StudyTables):
             columns[f"chi2_{unit}"] = self.of_sources(fits["reduced_chi2"])
         for band in self.miri:
             flux, error = self._measured(band)
-            none = np.full(len(flux), np.nan)
-            columns[f"sn_{band}"] = np.divide(flux, error, out=none, where=error > 0)
+            unknown = np.full(len(flux), np.nan)
+            columns[f"sn_{band}"] = np.divide(flux, error, out=unknown, where=error > 0)
             digits[f"sn_{band}"] = 3
-        columns |= {key: matched[key] for key in ("n_detected", "selection", "association")}
+        for key in ("n_detected", "selection", "association"):
+            columns[key] = matched[key]
         columns["condition"] = any_condition(matched, self.miri)
         for unit, fits in self.fits.items():
             columns[f"fit_{unit}"] = np.nan_to_num(self.of_sources(fits["flags"])).astype(int)
-        return {
-            key: rounded(np.asarray(values)[order], digits.get(key, 4))
-            for key, values in columns.items()
-        }
+        for key, values in columns.items():
+            columns[key] = rounded(np.asarray(values)[order], digits.get(key, 4))
+        return columns
 
     def describe(self):
-        """What all sources have in common."""
+        """Return what all sources have in common."""
+        sets = []
+        edges = {}
+        for unit, results in self.results.items():
+            color = to_hex(SET_COLORS[unit])
+            sets.append({"name": unit, "label": SET_LABELS[unit], "color": color})
+            edges[unit] = {}
+            for key in DRAWN:
+                edges[unit][key] = rounded(results.first.distribution(key)[0].value)
+        bands = []
+        for name, wave in zip(self.bands, rounded(self.pivots), strict=True):
+            band = {"name": name, "label": band_label(name), "wave": wave}
+            band["miri"] = name in self.miri
+            bands.append(band)
         return {
-            "sets": [
-                {"name": unit, "label": SET_LABELS[unit], "color": to_hex(SET_COLORS[unit])}
-                for unit in self.results
-            ],
+            "sets": sets,
             "compared": self.compared,
-            "bands": [
-                {"name": name, "label": band_label(name), "wave": wave, "miri": name in self.miri}
-                for name, wave in zip(self.bands, rounded(self.pivots), strict=True)
-            ],
+            "bands": bands,
             "wave": rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
-            "pdf_edges": {
-                unit: {key: rounded(found.first.distribution(key)[0].value) for key in DRAWN}
-                for unit, found in self.results.items()
-            },
+            "pdf_edges": edges,
             "parameters": [{"name": key, "unit": str(unit)} for key, unit in self.units.items()],
         }
 
     def entry(self, row):
-        """What belongs to the source in a row of the truth."""
+        """Return what belongs to the source in a row of the truth."""
         entry = {
             "id": self.truth["id"][row].item(),
             "true": rounded(self.true[row]),
@@ -209,21 +225,22 @@ class _Sources(StudyTables):
         return entry
 
     def _fit(self, unit, key):
-        """Chi2, posteriors and moments of a source, and the spectrum of its best model."""
-        one = self.results[unit].loc[key]
-        if not one.fitted:
+        """Return chi2, posteriors and moments of a source, and the spectrum of its best model."""
+        result = self.results[unit].loc[key]
+        if not result.fitted:
             return None
+        moments = []
+        for name, parameter_unit in self.units.items():
+            mean = rounded(result.mean(name).to_value(parameter_unit))
+            moments.append([mean, rounded(result.std(name).to_value(parameter_unit))])
         fit = {
-            "chi2": rounded(one.chi2),
-            "n_bands": int(one.n_bands),
-            "moments": [
-                [rounded(moment(name).to_value(own)) for moment in (one.mean, one.std)]
-                for name, own in self.units.items()
-            ],
-            "pdf": {name: _weights(one.pdf[name]) for name in DRAWN},
+            "chi2": rounded(result.chi2),
+            "n_bands": int(result.n_bands),
+            "moments": moments,
+            "pdf": {name: _weights(result.pdf[name]) for name in DRAWN},
         }
         if unit in self.compared:
-            best = one.best_sed(self.model)
+            best = result.best_sed(self.model)
             means = _cell_means(best.wave.to_value(WAVE), best.fnu.to_value(FNU), self.edges)
             # thousandths of log10
             fit["spectrum"] = [round(1000 * np.log10(x)) if x > 0 else None for x in means]
@@ -231,7 +248,7 @@ class _Sources(StudyTables):
 
 
 def _weights(pdf):
-    """Posterior weights in thousandths: index of the first cell that is not empty, and the weights."""
+    """Return weights of a posterior in thousandths: index of the first cell that is not empty, and the weights."""
     weights = np.round(1000 * pdf).astype(int)
     filled = np.flatnonzero(weights)
     if filled.size == 0:
@@ -240,7 +257,7 @@ def _weights(pdf):
 
 
 def _cell_means(x, y, edges):
-    """Means of a function, given by points that straight lines join, between edges."""
+    """Return means of a function, given by points that straight lines join, between edges."""
     steps = 0.5 * (y[1:] + y[:-1]) * np.diff(x)
     total = np.concatenate([[0.0], np.cumsum(steps)])
     return np.diff(np.interp(edges, x, total)) / np.diff(edges)

@@ -49,45 +49,53 @@ _RANK_BINS = 10
 FEATURES = PAH_FEATURES[1:3]
 
 
-def _both(one):
-    """The fits with and without MIRI that a truth has: name and label."""
-    return {name: SET_LABELS[name] for name in ("all", "none") if name in one.fits}
+def _main_sets(truth):
+    """Return the fits with and without MIRI that a truth has: name and label."""
+    return {name: SET_LABELS[name] for name in ("all", "none") if name in truth.fits}
 
 
 def answer_figure(study, numbers):
     """
-    Outliers and scatter of redshifts, and fitted fracAGN, against the injected one, with and without MIRI.
+    Draw outliers and scatter of redshifts, and fitted fracAGN, against the injected one, with and without MIRI.
 
     ``numbers`` are as for `~miricigale.workflow.page.result_sections.write_results`; None of one truth.
     """
-    truths = [one for one in study.truths if one.frac_agn is not None and one.sample.any()]
+    truths = []
+    for truth in study.truths:
+        if truth.frac_agn is not None and truth.sample.any():
+            truths.append(truth)
     if len(truths) < 2:
         return None
     figure, axes = panels(("redshift outliers (%)", "redshift scatter (%)", "fitted fracAGN"))
-    injected = np.array([one.frac_agn for one in truths])
-    for k, (name, label) in enumerate(_both(truths[0]).items()):
-        color, marker = STYLES[k]
-        place = injected + 0.012 * (k - 0.5)
-        quantities = (("z_outliers", 100), ("z_scatter", 100), ("frac_offset", 1))
-        for ax, (quantity, scale) in zip(axes.values(), quantities, strict=True):
-            rows = [numbers[one.name, name, quantity] for one in truths]
-            found = [[row[column] for row in rows] for column in ("value", "low", "high")]
-            value, low, high = scale * np.array(found)
-            if quantity == "frac_offset":
-                scatter = [numbers[one.name, name, "frac_scatter"]["value"] for one in truths]
-                value = value + injected
-                low, high = value - scatter, value + scatter
-            spread = np.abs([value - low, high - value])
-            style = {"fmt": marker, "ls": "-", "ms": 4.5, "color": color, "lw": 1.2}
-            ax.errorbar(place, value, spread, label=label, **style)
-            ax.set_xlabel("injected fracAGN")
-    list(axes.values())[-1].plot([0, 1], [0, 1], color=TRUE, lw=0.8, ls="--")
-    legend(next(iter(axes.values())), loc="upper left")
+    outliers, scatter, fraction = axes.values()
+    injected = np.array([truth.frac_agn for truth in truths])
+    for k, (unit, label) in enumerate(_main_sets(truths[0]).items()):
+        for ax, quantity in ((outliers, "z_outliers"), (scatter, "z_scatter")):
+            rows = [numbers[truth.name, unit, quantity] for truth in truths]
+            ends = [100 * np.array([row[key] for row in rows]) for key in ("value", "low", "high")]
+            _draw_estimates(ax, k, injected, *ends, label)
+        offsets = [numbers[truth.name, unit, "frac_offset"]["value"] for truth in truths]
+        width = [numbers[truth.name, unit, "frac_scatter"]["value"] for truth in truths]
+        fitted = np.array(offsets) + injected
+        _draw_estimates(fraction, k, injected, fitted, fitted - width, fitted + width, label)
+    fraction.plot([0, 1], [0, 1], color=TRUE, lw=0.8, ls="--")
+    legend(outliers, loc="upper left")
     return figure
 
 
+def _draw_estimates(ax, k, injected, value, low, high, label):
+    """Draw values with their intervals against the injected fracAGN, for the k-th set of bands."""
+    color, marker = STYLES[k]
+    spread = np.abs([value - low, high - value])
+    # the sets apart
+    place = injected + 0.012 * (k - 0.5)
+    style = {"fmt": marker, "ls": "-", "ms": 4.5, "color": color, "lw": 1.2}
+    ax.errorbar(place, value, spread, label=label, **style)
+    ax.set_xlabel("injected fracAGN")
+
+
 def _fitted(column):
-    return lambda one, name: one.fitted(name, column)
+    return lambda truth, name: truth.fitted(name, column)
 
 
 #: Histograms: values of a truth and a set of bands, edges of bins, and label.
@@ -101,7 +109,7 @@ _HISTOGRAMS = {
 
 def histogram_figure(study, quantity):
     """
-    Histograms of ``"redshift"`` errors, or the ``"fraction"`` of the AGN or its ``"width"``, by truth.
+    Draw histograms of ``"redshift"`` errors, or the ``"fraction"`` of the AGN or its ``"width"``, by truth.
 
     Or of its ``"difference"`` to that of the first truth, by bin of redshift. A step line for each set of bands,
     with median, scatter and, of redshifts, the share of outliers; values beyond the bins are counted in the
@@ -109,28 +117,38 @@ def histogram_figure(study, quantity):
     """
     values, bins, xlabel = _HISTOGRAMS[quantity]
     bins = np.linspace(*bins)
-    shown = {truth_label(one): (one, (0, np.inf)) for one in study.truths if one.sample.any()}
+    # truth and range of redshifts of each panel
+    shown = {}
     if quantity == "difference":
-        one = study.truths[0]
-        labels = [f"{low:g} < z < {high:g}".removesuffix(" < inf") for low, high in REDSHIFT_BINS]
-        shown = {label: (one, span) for label, span in zip(labels, REDSHIFT_BINS, strict=True)}
+        for low, high in REDSHIFT_BINS:
+            label = f"{low:g} < z < {high:g}".removesuffix(" < inf")
+            shown[label] = (study.truths[0], low, high)
+    else:
+        for truth in study.truths:
+            if truth.sample.any():
+                shown[truth_label(truth)] = (truth, 0, np.inf)
     figure, axes = panels(shown, sharex=True)
     ends = 0.5 * (bins[[0, -2]] + bins[[1, -1]])
     for title, ax in axes.items():
-        one, (low, high) = shown[title]
-        true = {"fraction": one.frac_agn, "width": None}.get(quantity, 0.0)
-        inside = (one.true("redshift") >= low) & (one.true("redshift") < high)
-        for k, (name, label) in enumerate(_both(one).items()):
-            some = values(one, name)[inside]
-            some = some[np.isfinite(some)]
+        truth, low, high = shown[title]
+        true = {"fraction": truth.frac_agn, "width": None}.get(quantity, 0.0)
+        inside = (truth.true("redshift") >= low) & (truth.true("redshift") < high)
+        for k, (name, label) in enumerate(_main_sets(truth).items()):
+            sample = values(truth, name)[inside]
+            sample = sample[np.isfinite(sample)]
             color = STYLES[k][0]
-            ax.hist(np.clip(some, *ends), bins, label=label, histtype="step", color=color, lw=1.6)
-            if some.size:
-                note = f"{np.median(some):.3f} ± {sigma_mad(some):.3f}"
+            style = {"histtype": "step", "color": color, "lw": 1.6}
+            ax.hist(np.clip(sample, *ends), bins, label=label, **style)
+            if sample.size:
+                note = f"{np.median(sample):.3f} ± {sigma_mad(sample):.3f}"
                 if quantity == "redshift":
-                    note += f"\n{100 * outlier_share(some):.1f} % outliers"
+                    note += f"\n{100 * outlier_share(sample):.1f} % outliers"
                 # away from the truth
-                x, side = (0.03, "left") if (true or 0) > 0.5 else (0.97, "right")
+                x = 0.97
+                side = "right"
+                if true is not None and true > 0.5:
+                    x = 0.03
+                    side = "left"
                 at = {"transform": ax.transAxes, "va": "top", "ha": side, "fontsize": 7.5}
                 ax.text(x, 0.97 - 0.2 * k, note, color=color, **at)
         if true is not None:
@@ -144,7 +162,7 @@ def histogram_figure(study, quantity):
 
 
 def redshift_figure(fits):
-    """Fitted against true redshifts: by title, the true ones, and the table of the fit."""
+    """Draw fitted against true redshifts: by title, the true ones, and the table of the fit."""
     figure, axes = panels(fits, height=4.7)
     for title, ax in axes.items():
         true, table = fits[title]
@@ -156,27 +174,29 @@ def redshift_figure(fits):
 
 def disk_figure(study):
     """
-    Fitted against true accretion power of each truth with AGN, with a factor of two marked.
+    Draw fitted against true accretion power of each truth with AGN, with a factor of two marked.
 
     None if there is no such truth.
     """
-    values, unit = {}, u.erg / u.s
-    for one in study.truths:
-        if "all" not in one.fits or "accretion_power" not in one.truth.colnames:
+    unit = u.erg / u.s
+    values = {}
+    powers = []
+    for truth in study.truths:
+        if "all" not in truth.fits or "accretion_power" not in truth.truth.colnames:
             continue
-        error = one.power_error("all")
+        error = truth.power_error("all")
         error = error[np.isfinite(error)]
         if error.size:
-            true = one.truth["accretion_power"][one.sample].to_value(unit)
-            fitted = one.fits["all"]["accretion_power_mean"].to_value(unit)
+            true = truth.truth["accretion_power"][truth.sample].to_value(unit)
+            fitted = truth.fits["all"]["accretion_power_mean"].to_value(unit)
             good = (true > 0) & (fitted > 0) & np.isfinite(true * fitted)
             note = f"median {np.median(error):+.2f} dex, scatter {sigma_mad(error):.2f} dex ({error.size})"
-            values[truth_label(one)] = (true[good], fitted[good], note)
+            values[truth_label(truth)] = (true[good], fitted[good], note)
+            powers += [true[good], fitted[good]]
     if not values:
         return None
     figure, axes = panels(values, height=2.7, sharex=True, sharey=True)
-    every = np.concatenate([v for true, fitted, _ in values.values() for v in (true, fitted)])
-    ends = np.percentile(every, [0.5, 99.5]) * [0.5, 2]
+    ends = np.percentile(np.concatenate(powers), [0.5, 99.5]) * [0.5, 2]
     for label, ax in axes.items():
         true, fitted, note = values[label]
         ax.loglog(true, fitted, ".", ms=4, color=MEASURED, alpha=0.6)
@@ -190,39 +210,46 @@ def disk_figure(study):
 
 def xray_figure(study, seed):
     """
-    X-ray fluxes of the injected AGN of the field and of those in the sample, and the share found beneath.
+    Draw X-ray fluxes of the injected AGN of the field and of those in the sample, and the share found beneath.
 
     With the limits of other surveys (dotted where they are estimates) and the flux of 50 % completeness; None
     without an AGN.
     """
-    truths = study.with_agn or study.truths
-    truths = [one for one in truths if "l_6um" in one.truth.colnames]
-    values = np.concatenate([[], *(xray_fluxes(one)[one.field] for one in truths)])
-    found = np.concatenate([np.zeros(0, bool), *(one.sample[one.field] for one in truths)])
+    # without an AGN values are empty
+    values = [np.zeros(0)]
+    in_sample = [np.zeros(0, bool)]
+    for truth in study.with_agn or study.truths:
+        if "l_6um" in truth.truth.colnames:
+            values.append(xray_fluxes(truth)[truth.field])
+            in_sample.append(truth.sample[truth.field])
+    values = np.concatenate(values)
+    in_sample = np.concatenate(in_sample)
     good = np.isfinite(values)
-    if not found[good].any():
+    if not in_sample[good].any():
         return None
-    ends = np.percentile(values[good], [0.5, 99.5])
-    bins = np.arange(np.floor(4 * ends[0]) / 4, np.ceil(4 * ends[1]) / 4 + 0.01, 0.25)
-    table = completeness(values, found, bins)
-    form = {"size": (7.0, 2.2), "sharex": True, "height_ratios": (1.5, 1)}
-    figure, [[upper], [lower]] = new_figure(2, 1, **form)
+    low, high = np.percentile(values[good], [0.5, 99.5])
+    bins = np.arange(np.floor(4 * low) / 4, np.ceil(4 * high) / 4 + 0.01, 0.25)
+    table = completeness(values, in_sample, bins)
+    figure, [[upper], [lower]] = new_figure(
+        2, 1, size=(7.0, 2.2), sharex=True, height_ratios=(1.5, 1)
+    )
     upper.stairs(table["n"], bins, color=TRUE, lw=1.6, label="all")
     upper.stairs(table["n_found"], bins, color=MEASURED, fill=True, alpha=0.35, label="found")
     upper.stairs(table["n_found"], bins, color=MEASURED, lw=1.6)
-    some = table[table["n"] > 0]
-    place = 0.5 * (some["low"] + some["high"])
-    lower.vlines(place, some["share_low"], some["share_high"], color=MEASURED, lw=1.2)
-    lower.plot(place, some["share"], "o", ms=4, color=MEASURED)
+    filled = table[table["n"] > 0]
+    place = 0.5 * (filled["low"] + filled["high"])
+    lower.vlines(place, filled["share_low"], filled["share_high"], color=MEASURED, lw=1.2)
+    lower.plot(place, filled["share"], "o", ms=4, color=MEASURED)
     lower.axhline(0.5, color=TRUE, lw=0.8, ls="--")
     half = measure(study, "xray_half", truth=None, seed=seed) if study.with_agn else None
     for ax in (upper, lower):
         if half is not None and np.isfinite(half.value):
             ax.axvspan(half.low, half.high, color=MEASURED, alpha=0.15, lw=0)
             ax.axvline(half.value, color=MEASURED, lw=1.2, label="50 % of these")
-        for one, color in zip(XRAY_LIMITS, (SECOND, "0.2", "#15803d"), strict=True):
-            style = {"color": color, "ls": "-" if one.checked else ":", "lw": 1.6}
-            ax.axvline(np.log10(one.flux.value), label=f"{one.survey}, {one.kind}", **style)
+        for limit, color in zip(XRAY_LIMITS, (SECOND, "0.2", "#15803d"), strict=True):
+            style = {"color": color, "ls": "-" if limit.checked else ":", "lw": 1.6}
+            label = f"{limit.survey}, {limit.kind}"
+            ax.axvline(np.log10(limit.flux.value), label=label, **style)
     # above the axes, which are full of lines
     legend(upper, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
     upper.set(ylabel="sources", xlim=(bins[0], bins[-1]))
@@ -232,20 +259,24 @@ def xray_figure(study, seed):
 
 
 def detection_figure(study):
-    """Infrared luminosities of the reference truth against redshift, and which are detected."""
-    one = study.truths[0]
-    table, least = one.truth, min(2, len(study.bands))
-    named = "two or more MIRI bands" if least == 2 else "the MIRI band"
-    seen = np.asarray(one.matched["n_detected"]) >= least
-    groups = {f"detected in {named}": seen}
+    """Draw infrared luminosities of the reference truth against redshift, and which are detected."""
+    reference = study.truths[0]
+    table = reference.truth
+    n_detected = np.asarray(reference.matched["n_detected"])
+    if len(study.bands) > 1:
+        groups = {"detected in two or more MIRI bands": n_detected >= 2}
+    else:
+        groups = {"detected in the MIRI band": n_detected >= 1}
     if "mips.24" in table.colnames:
         with np.errstate(invalid="ignore"):
             groups["MIPS 24 µm above its limit"] = ab_magnitude(table["mips.24"]) < MIPS_LIMIT
-    z, power = np.asarray(table["redshift"], float), table["ir_luminosity"].to_value(u.Lsun)
-    good = one.field & (power > 0) & np.isfinite(z)
+    z = np.asarray(table["redshift"], float)
+    power = table["ir_luminosity"].to_value(u.Lsun)
+    good = reference.field & (power > 0) & np.isfinite(z)
     figure, [[ax]] = new_figure(size=(7.0, 3.8))
-    rest = good & ~np.any(list(groups.values()), axis=0)
-    ax.semilogy(z[rest], power[rest], ".", ms=4, color="0.75", label="not detected", zorder=1)
+    undetected = good & ~np.any(list(groups.values()), axis=0)
+    style = {"ms": 4, "color": "0.75", "zorder": 1}
+    ax.semilogy(z[undetected], power[undetected], ".", label="not detected", **style)
     for k, (name, rows) in enumerate(groups.items()):
         color, marker = STYLES[k]
         style = {"ms": 3 + 2.5 * k, "color": color, "mfc": "none" if k else color, "alpha": 0.75}
@@ -255,7 +286,7 @@ def detection_figure(study):
         ax.set(xlim=(0, 1.03 * z[good].max()), ylim=(0.5 * low, 2 * high))
     ax.set(xlabel="redshift", ylabel=r"L$_\mathrm{IR}$ (L$_\odot$)")
     # of light of AGN it is no star-formation rate
-    if one.frac_agn == 0:
+    if reference.frac_agn == 0:
         rate = 1 / sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun)
         right = ax.secondary_yaxis("right", functions=(lambda v: v * rate, lambda v: v / rate))
         right.set_ylabel(r"SFR (M$_\odot$/yr), Kennicutt 1998")
@@ -265,16 +296,18 @@ def detection_figure(study):
 
 
 def shape_figure(study):
-    """Magnitude errors of sources above 5 sigma by band and shape, crowded ones marked."""
-    one, groups = study.truths[0], {}
+    """Draw magnitude errors of sources above 5 sigma by band and shape, crowded ones marked."""
+    truth = study.truths[0]
     labels = {"point": "points", "n < 2": "n < 2", "n >= 2": "n ≥ 2"}
+    groups = {}
     for band in study.bands:
-        mag, error = ab_magnitude(one.matched[f"{band}_true"]), one.magnitude_error(band)
-        bright = one.field & one.is_bright(band) & np.isfinite(mag) & np.isfinite(error)
-        for shape, rows in one.shapes.items():
+        mag = ab_magnitude(truth.matched[f"{band}_true"])
+        error = truth.magnitude_error(band)
+        bright = truth.field & truth.is_bright(band) & np.isfinite(mag) & np.isfinite(error)
+        for shape, rows in truth.shapes.items():
             rows = bright & rows
             title = f"{band_title(band)}, {labels[shape]} ({np.count_nonzero(rows)})"
-            groups[title] = (mag[rows], error[rows], one.crowded[band][rows])
+            groups[title] = (mag[rows], error[rows], truth.crowded[band][rows])
     figure, axes = panels(groups, height=3.1, sharex=True, sharey=True)
     for title, ax in axes.items():
         mag, error, crowded = groups[title]
@@ -291,22 +324,22 @@ def shape_figure(study):
 
 def class_figure(tables):
     """
-    Shares of the sources of each true class that are found in each class, a panel for each set of bands.
+    Draw shares of the sources of each true class that are found in each class, a panel for each set of bands.
 
     ``tables`` are of `~miricigale.evaluation.study_confusion`, by the title of the panel.
     """
     figure, axes = new_figure(1, len(tables), size=(WIDTH / 2, 3.4), sharey=True)
     for ax, (title, table) in zip(axes[0], tables.items(), strict=True):
-        found = [name for name in CLASS_COLUMNS if name in table.colnames]
+        classes = [name for name in CLASS_COLUMNS if name in table.colnames]
         table = table[table["n"] > 0]
-        counts = np.transpose([table[name] for name in found])
+        counts = np.transpose([table[name] for name in classes])
         total = counts.sum(axis=1, keepdims=True)
         share = np.divide(counts, total, out=np.zeros(counts.shape), where=total > 0)
         ax.imshow(share, cmap="Oranges", vmin=0, vmax=1.2, aspect="auto")
         for (i, j), value in np.ndenumerate(share):
             text = f"{100 * value:.0f} %\n{counts[i, j]}"
             ax.text(j, i, text, ha="center", va="center", fontsize=9)
-        for axis, names in ((ax.xaxis, found), (ax.yaxis, table["class"])):
+        for axis, names in ((ax.xaxis, classes), (ax.yaxis, table["class"])):
             axis.set_ticks(range(len(names)), [class_label(name) for name in names])
         ax.tick_params(length=0)
         ax.spines[:].set_visible(False)
@@ -318,7 +351,7 @@ def class_figure(tables):
 
 def band_residuals(results, bands):
     """
-    Measured minus best-model magnitudes of the MIRI bands, of sources above 5 sigma in them.
+    Return measured minus best-model magnitudes of the MIRI bands, of sources above 5 sigma in them.
 
     ``results`` is a `~miricigale.workflow.stages.inputs.FitPieces`; dict of str to `~numpy.ndarray`, NaN where
     fainter.
@@ -326,29 +359,35 @@ def band_residuals(results, bands):
     out = {}
     for band in bands:
         k = results.first.filters.index(band)
-        flux, error, model = (results.of(n)[:, k] for n in ("flux", "flux_err", "best_flux"))
+        flux = results.of("flux")[:, k]
+        error = results.of("flux_err")[:, k]
+        model = results.of("best_flux")[:, k]
         with np.errstate(invalid="ignore", divide="ignore"):
             good = (flux > 5 * error) & (model > 0)
-            out[band] = np.where(good, -2.5 * np.log10(np.where(good, flux / model, 1.0)), np.nan)
+            ratio = np.where(good, flux / model, 1.0)
+        out[band] = np.where(good, -2.5 * np.log10(ratio), np.nan)
     return out
 
 
 def residual_figure(redshift, residuals):
     """
-    Residuals of the fit in each band (`band_residuals`) against redshift.
+    Draw residuals of the fit in each band (`band_residuals`) against redshift.
 
     Redshifts at which a PAH feature is within the band are shaded, with the median there.
     """
     figure, axes = panels(residuals, height=2.9, sharex=True, sharey=True)
     for k, (band, ax) in enumerate(axes.items()):
-        own, good = Filter.from_name(band), np.isfinite(redshift) & np.isfinite(residuals[band])
-        z, residual = redshift[good], residuals[band][good]
+        filter = Filter.from_name(band)
+        good = np.isfinite(redshift) & np.isfinite(residuals[band])
+        z = redshift[good]
+        residual = residuals[band][good]
         plot_offsets(z, residual, ax=ax, limit=0.6)
         ax.set_title(band_title(band), fontsize="medium")
-        for rest, color in zip(FEATURES, (SECOND, "#15803d"), strict=True):
-            low, high = feature_redshifts(rest, own.pivot, own.width)
+        for feature, color in zip(FEATURES, (SECOND, "#15803d"), strict=True):
+            low, high = feature_redshifts(feature, filter.pivot, filter.width)
             if high > low:
-                ax.axvspan(low, high, color=color, alpha=0.12, lw=0, label=f"{rest.value:g} µm")
+                label = f"{feature.value:g} µm"
+                ax.axvspan(low, high, color=color, alpha=0.12, lw=0, label=label)
                 inside = residual[(z >= low) & (z < high)]
                 if inside.size > 2:
                     ax.plot([low, high], [np.median(inside)] * 2, color=color, lw=2)
@@ -360,7 +399,7 @@ def residual_figure(redshift, residuals):
 
 def rank_figure(ranks):
     """
-    Histograms of the ranks of the truth in the posteriors, with what chance allows.
+    Draw histograms of the ranks of the truth in the posteriors, with what chance allows.
 
     ``ranks`` are arrays by set of bands and parameter, in which NaN is left out.
     """
@@ -370,15 +409,15 @@ def rank_figure(ranks):
             by_name.setdefault(parameter_label(name), {})[SET_LABELS[unit]] = values
     figure, axes = panels(by_name, height=2.6, sharex=True)
     for label, ax in axes.items():
-        most = 0
+        n_max = 0
         for k, (name, values) in enumerate(by_name[label].items()):
             n, edges = np.histogram(values[np.isfinite(values)], _RANK_BINS, (0, 1))
-            most = max(most, n.sum())
+            n_max = max(n_max, n.sum())
             style = {"color": STYLES[k][0], "lw": 1.6, "ls": ("-", "--")[k]}
             ax.stairs(n * _RANK_BINS / max(n.sum(), 1), edges, label=name, **style)
-        if most:
+        if n_max:
             # binomial, of a uniform distribution
-            error = np.sqrt((_RANK_BINS - 1) / most)
+            error = np.sqrt((_RANK_BINS - 1) / n_max)
             ax.axhspan(1 - error, 1 + error, color="0.88", zorder=0)
         ax.axhline(1, color=TRUE, lw=0.8)
         ax.set(xlim=(0, 1), ylim=(0, max(2.0, 1.05 * ax.get_ylim()[1])))

@@ -23,7 +23,8 @@ class DeclaredPage(SectionWriter):
 
     def __init__(self, report, context):
         super().__init__(report, declared("miricigale.workflow.page", "sections.toml"))
-        self.context, self.config = context, context.config
+        self.context = context
+        self.config = context.config
 
     def numbers(self, name, table, **facts):
         """Save numbers as ``report/<name>.ecsv``, and begin the section on them."""
@@ -39,8 +40,8 @@ class StudyPage(DeclaredPage):
     ----------
     report, context
         As for `DeclaredPage`.
-    every : dict of str to `~miricigale.workflow.page.numbers.StudyTables`
-        The tables of the truths of whose sky the analysis knows all, the reference first.
+    truth_tables : dict of str to `~miricigale.workflow.page.numbers.StudyTables`
+        Of the truths of whose sky the analysis knows all, the reference first.
     study : `~miricigale.evaluation.StudyResults`
         The same.
     metrics : dict
@@ -53,21 +54,27 @@ class StudyPage(DeclaredPage):
         Solid angle of the imaged field.
     """
 
-    def __init__(self, report, context, every, study, metrics, kernels, model, area):
+    def __init__(self, report, context, truth_tables, study, metrics, kernels, model, area):
         super().__init__(report, context)
-        self.every, self.study, self.first = every, study, study.truths[0]
-        self.tables = every[self.first.name]
+        self.truth_tables = truth_tables
+        self.study = study
+        self.first = study.truths[0]
+        self.tables = truth_tables[self.first.name]
         self.bands = self.config.exposures.filters
-        self.metrics, self.kernels, self.model, self.area = metrics, kernels, model, area
+        self.metrics = metrics
+        self.kernels = kernels
+        self.model = model
+        self.area = area
 
     @functools.cached_property
     def facts(self):
-        """What the sentences say of the run: dict of str to values."""
-        config, chosen = self.config, [band_label(n) for n in three_bands(self.bands)]
+        """Values that the sentences name, by name."""
+        config = self.config
+        longest = [band_label(name) for name in three_bands(self.bands)]
         facts = self.metrics | {
             "truth": truth_label(self.first),
-            "three_bands": ", ".join(chosen),
-            "longest": chosen[-1],
+            "three_bands": ", ".join(longest),
+            "longest": longest[-1],
             "detected_bands": "the one band" if len(self.bands) == 1 else "two or more bands",
             "prior": band_label(config.highres.filter),
             "mag_column": config.catalog.mag_column,
@@ -75,18 +82,27 @@ class StudyPage(DeclaredPage):
             "mips_limit": MIPS_LIMIT,
             "fewest": FEWEST,
             "model_error": 100 * config.fit.model_error,
-            **{name: self.model.meta[name] for name in ("cosmology", "frac_agn_definition")},
+            "cosmology": self.model.meta["cosmology"],
+            "frac_agn_definition": self.model.meta["frac_agn_definition"],
         }
-        wide, own = config.fit.model_error > 0, config.sed.infrared == "fit"
-        true = {"wide": wide, "same_templates": own, "own_models": wide and own}
-        true["field_agn"] = FIELD in config.sed.frac_agn
-        texts = self.texts["optional"]
-        return facts | {name: texts[name].format(**facts) if true[name] else "" for name in true}
+        has_model_error = config.fit.model_error > 0
+        keeps_energy = config.sed.infrared == "fit"
+        optional = {
+            "wide": has_model_error,
+            "same_templates": keeps_energy,
+            "own_models": has_model_error and keeps_energy,
+            "field_agn": FIELD in config.sed.frac_agn,
+        }
+        for name, is_true in optional.items():
+            facts[name] = ""
+            if is_true:
+                facts[name] = self.texts["optional"][name].format(**facts)
+        return facts
 
     @property
     def band_rows(self):
-        """The numbers of each band, with its name and what it is called."""
-        return [
-            {"name": name, "band": band_label(name), **entry}
-            for name, entry in self.metrics["bands"].items()
-        ]
+        """Numbers of each band, with its name and what it is called."""
+        rows = []
+        for name, entry in self.metrics["bands"].items():
+            rows.append({"name": name, "band": band_label(name)} | entry)
+        return rows

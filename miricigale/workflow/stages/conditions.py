@@ -30,7 +30,7 @@ _DOUBTFUL = sum(AssociationFlags[key] for key in ("SEVERAL_FIRST", "SEVERAL_SECO
 
 
 def has_flag(table, column, flag):
-    """Which rows have at least one of some flags in a column: array of bool."""
+    """Tell which rows have at least one of some flags in a column: array of bool."""
     return (np.asarray(table[column]) & flag) > 0
 
 
@@ -42,30 +42,33 @@ def add_conditions(table, bands, *, suffix="", detections=False):
     the flux and ``<band>_flags``; neighbors are compared by the fluxes ``<band><suffix>``, ``"_true"``
     for the truth. Detections without a source are spurious.
     """
-    alone = has_flag(table, "association", AssociationFlags.NONE_NEAR)
+    unmatched = has_flag(table, "association", AssociationFlags.NONE_NEAR)
     for name in bands:
-        found = {
+        conditions = {
             ConditionFlags.EDGE: has_flag(table, f"{name}_flags", photometry.ForcedFlags.EDGE),
             ConditionFlags.CROWDED: photometry.crowded(table["sky"], table[f"{name}{suffix}"]),
             ConditionFlags.AMBIGUOUS: has_flag(table, "association", _DOUBTFUL),
-            ConditionFlags.SPURIOUS: alone & detections,
+            ConditionFlags.SPURIOUS: unmatched & detections,
             ConditionFlags.NOT_MEASURED: ~np.isfinite(table[name].value),
         }
-        table[f"{name}_condition"] = sum(int(flag) * rows for flag, rows in found.items())
+        flags = sum(int(flag) * rows for flag, rows in conditions.items())
+        table[f"{name}_condition"] = flags
         table[f"{name}_condition"].info.description = ConditionFlags.describe()
 
 
 def any_condition(table, bands):
-    """The conditions of each row in any of the bands."""
+    """Return the conditions of each row in any of the bands."""
     return np.bitwise_or.reduce([np.asarray(table[f"{name}_condition"]) for name in bands])
 
 
 def _groups(condition):
-    """Rows of each group of `CONDITIONS`; a row may be in several but the first."""
-    return {
-        name: (condition & _ANY) == 0 if bit == 0 else (condition & bit) > 0
-        for name, bit in CONDITIONS.items()
-    }
+    """Return the rows of each group of `CONDITIONS`; a row may be in several but the first."""
+    groups = {}
+    for name, bit in CONDITIONS.items():
+        groups[name] = (condition & bit) > 0
+        if bit == 0:
+            groups[name] = (condition & _ANY) == 0
+    return groups
 
 
 def band_conditions(matched, name):
@@ -79,14 +82,19 @@ def band_conditions(matched, name):
     column = f"{name}_condition"
     field = ~has_flag(matched, "selection", SampleFlags.OUTSIDE_FIELD | SampleFlags.NO_MODEL)
     lost = has_flag(matched, column, ConditionFlags.NOT_MEASURED)
-    flux, true = matched[name].value, matched[f"{name}_true"].value
+    flux = matched[name].value
+    true = matched[f"{name}_true"].value
     bright = true > 5 * matched[f"{name}_formal_err"].value
     counts = {"n_field": int(field.sum()), "n_not_measured": int((field & lost).sum())}
     for group, rows in _groups(np.asarray(matched[column])).items():
         rows = rows & field & ~lost
-        found = recovery_metrics(true[rows & bright], flux[rows & bright], relative=True)
-        numbers = {"n_bright": found.n, "median": found.median, "scatter": found.sigma_mad}
-        counts[group] = {"n": int(rows.sum()), **numbers}
+        recovery = recovery_metrics(true[rows & bright], flux[rows & bright], relative=True)
+        counts[group] = {
+            "n": int(rows.sum()),
+            "n_bright": recovery.n,
+            "median": recovery.median,
+            "scatter": recovery.sigma_mad,
+        }
     return counts
 
 
@@ -97,22 +105,26 @@ def detection_counts(detections, bands):
     ``n``, ``n_field`` and of these ``n_spurious``, ``n_ambiguous``, and by band the spurious ones above
     five formal errors (``n_spurious_bright``).
     """
-    field, column = np.asarray(detections["in_field"], bool), f"{bands[0]}_condition"
+    field = np.asarray(detections["in_field"], bool)
+    column = f"{bands[0]}_condition"
     spurious = field & has_flag(detections, column, ConditionFlags.SPURIOUS)
     ambiguous = field & has_flag(detections, column, ConditionFlags.AMBIGUOUS)
-    bright = {n: detections[n] > 5 * detections[error_column(n)] for n in bands}
+    n_spurious_bright = {}
+    for band in bands:
+        bright = detections[band] > 5 * detections[error_column(band)]
+        n_spurious_bright[band] = int(np.sum(spurious & bright))
     return {
         "n": len(detections),
         "n_field": int(field.sum()),
         "n_spurious": int(spurious.sum()),
         "n_ambiguous": int(ambiguous.sum()),
-        "n_spurious_bright": {n: int(np.sum(spurious & seen)) for n, seen in bright.items()},
+        "n_spurious_bright": n_spurious_bright,
     }
 
 
 def fit_conditions(sample, redshift, table, bands):
     """
-    Quality of photometric redshifts by condition: ``n``, ``photoz_sigma_mad``, ``photoz_n_outliers``.
+    Measure photometric redshifts by condition: ``n``, ``photoz_sigma_mad``, ``photoz_n_outliers``.
 
     ``sample`` are the rows of ``matched`` that were fitted, ``redshift`` the true redshifts and
     ``table`` the fits of the same sources, row by row; a source has a condition if it has it in one of
@@ -120,23 +132,31 @@ def fit_conditions(sample, redshift, table, bands):
     """
     groups = {}
     for name, rows in _groups(any_condition(sample, bands)).items():
-        found = photoz_metrics(np.asarray(redshift)[rows], table["redshift_mean"][rows])
-        groups[name] = {"n": found.n, "photoz_sigma_mad": found.sigma_mad}
-        groups[name]["photoz_n_outliers"] = found.n_outliers
+        photoz = photoz_metrics(np.asarray(redshift)[rows], table["redshift_mean"][rows])
+        groups[name] = {
+            "n": photoz.n,
+            "photoz_sigma_mad": photoz.sigma_mad,
+            "photoz_n_outliers": photoz.n_outliers,
+        }
     return groups
 
 
-def _usable(matched, name):
-    """Sources that are measured in one band: in the field at all, and whole in the band."""
-    lost = SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED
-    off = photometry.ForcedFlags.EDGE | photometry.ForcedFlags.MASKED
-    return ~has_flag(matched, "selection", lost), ~has_flag(matched, f"{name}_flags", off)
+def is_matched(matched):
+    """Tell which sources are in the field and matched with a detection."""
+    return ~has_flag(matched, "selection", SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED)
+
+
+def is_complete(matched, name):
+    """Tell which sources are whole on the image of a band."""
+    incomplete = photometry.ForcedFlags.EDGE | photometry.ForcedFlags.MASKED
+    return ~has_flag(matched, f"{name}_flags", incomplete)
 
 
 def bright_isolated(matched, name):
-    """Which sources are isolated and above 20 sigma in one band, whole and in the field."""
-    usable, whole = _usable(matched, name)
+    """Tell which sources are isolated and above 20 sigma in one band, whole and in the field."""
+    usable = is_matched(matched) & is_complete(matched, name)
     crowded = has_flag(matched, f"{name}_condition", ConditionFlags.CROWDED)
-    true, formal = (matched[f"{name}_{end}"].value for end in ("true", "formal_err"))
+    true = matched[f"{name}_true"].value
+    formal = matched[f"{name}_formal_err"].value
     with np.errstate(invalid="ignore"):
-        return usable & whole & (true > 20 * formal) & ~crowded
+        return usable & (true > 20 * formal) & ~crowded

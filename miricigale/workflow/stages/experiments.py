@@ -10,7 +10,7 @@ from miricigale.workflow.derived import rows_of
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample, true_ranks
 from miricigale.workflow.stages.inputs import fit_plan, plain_axes, sed_resources
-from miricigale.workflow.truths import study_truths
+from miricigale.workflow.truths import study_truths, unit_names
 
 #: Most sources of each truth that are fitted with a freed torus.
 N_FREE = 100
@@ -29,36 +29,44 @@ _THINNER = {
 
 
 def experiment_units(config):
-    """Names of the experiments, ``<truth>/<experiment>``, of the truths without perturbations."""
-    known = [name for name, truth in study_truths(config).items() if not truth.perturbations]
-    return tuple(f"{of}/{name}" for of in known for name in config.fit.experiments)
+    """Return the names of the experiments, ``<truth>/<experiment>``, of the truths without perturbations."""
+    unperturbed = [name for name, truth in study_truths(config).items() if not truth.perturbations]
+    return unit_names(unperturbed, config.fit.experiments)
 
 
 def experiment_axes(name, config):
-    """Axes of the grid of an experiment of a study."""
+    """Return the axes of the grid of an experiment of a study."""
     axes = fit_plan(config, name)
-    if name != "free_agn":
-        return axes
-    return axes | (_THINNER if config.fit.axes == "fit" else {}) | _FREED
+    if name == "free_agn":
+        if config.fit.axes == "fit":
+            axes |= _THINNER
+        axes |= _FREED
+    return axes
 
 
 def _experiment_plan(config, unit):
-    """What an experiment takes from the package, for hashing."""
+    """Return what an experiment takes from the package, for hashing."""
     name = unit.partition("/")[2]
-    own = {"free_agn": {"n": N_FREE}, "between": {"agn_error": AGN_ERROR}}
-    own["far_infrared"] = {"depths": dict(HERSCHEL_DEPTHS)}
-    return {"axes": plain_axes(experiment_axes(name, config))} | own.get(name, {})
+    plan = {"axes": plain_axes(experiment_axes(name, config))}
+    if name == "free_agn":
+        plan["n"] = N_FREE
+    elif name == "between":
+        plan["agn_error"] = AGN_ERROR
+    elif name == "far_infrared":
+        plan["depths"] = dict(HERSCHEL_DEPTHS)
+    return plan
 
 
 def far_infrared_photometry(sample, *, seed):
     """
-    Mock photometry of sources in the bands of Herschel, with the depths of `HERSCHEL_DEPTHS`.
+    Simulate photometry of sources in the bands of Herschel, with the depths of `HERSCHEL_DEPTHS`.
 
     ``sample`` has the parameters of the model and ``id``; errors are depth / 5 and 10 % of the flux.
     """
-    model, bands = sed.SEDModel.yang2021(), list(HERSCHEL_DEPTHS)
-    known = [name for name in sample.colnames if name in model.parameters]
-    light = model.fluxes(sample["id", *known], bands)
+    model = sed.SEDModel.yang2021()
+    bands = list(HERSCHEL_DEPTHS)
+    parameters = [name for name in sample.colnames if name in model.parameters]
+    light = model.fluxes(sample["id", *parameters], bands)
     errors = photometry.ErrorModel.from_depths(HERSCHEL_DEPTHS, fractional=0.1)
     light["id"] = sample["id"]
     return errors.perturb(light["id", *bands], seed=seed)
@@ -75,15 +83,17 @@ def far_infrared_photometry(sample, *, seed):
 )
 def fit_experiment(context, unit):
     """Fit the sample of a truth, with all MIRI bands, in another way than the study does."""
-    config, plan = context.config, context.plan
-    of, name = unit.split("/")
-    truth, matched, mock = fit_sample(context, of)
+    plan = context.plan
+    truth_name, name = unit.split("/")
+    truth, matched, mock = fit_sample(context, truth_name)
     sample = truth[np.asarray(matched["selection"]) == 0]
-    bands, redshift = list(config.exposures.filters), None
-    options = {"axes": {key: np.array(values) for key, values in plan["axes"].items()}}
     if "n" in plan and len(mock) > plan["n"]:
         rows = np.linspace(0, len(mock) - 1, plan["n"]).round().astype(int)
-        mock, sample = mock[rows], sample[rows]
+        mock = mock[rows]
+        sample = sample[rows]
+    bands = list(context.config.exposures.filters)
+    redshift = None
+    options = {"axes": {key: np.array(values) for key, values in plan["axes"].items()}}
     if name == "far_infrared":
         light = far_infrared_photometry(sample, seed=context.seed)
         bands += list(HERSCHEL_DEPTHS)
@@ -96,12 +106,13 @@ def fit_experiment(context, unit):
     elif name == "between":
         options["settings"] = GridSettings(agn_error=AGN_ERROR)
     results = fit_mock(context, mock, bands, redshift=redshift, **options)
-    context.save_result(f"{of}/experiments/{name}.fits", results)
-    context.save_table(f"{of}/experiments/{name}.ecsv", ranked_table(results, sample, context.seed))
+    place = f"{truth_name}/experiments/{name}"
+    context.save_result(f"{place}.fits", results)
+    context.save_table(f"{place}.ecsv", ranked_table(results, sample, context.seed))
 
 
 def ranked_table(results, sample, seed):
-    """The table of results with the ranks of the true values (``<name>_rank``), for coverage."""
+    """Return the table of results with the ranks of the true values (``<name>_rank``), for coverage."""
     table = results.to_table()
     for name in RANKED:
         rank = np.full(len(table), np.nan)
@@ -115,7 +126,7 @@ def ranked_table(results, sample, seed):
 
 def experiment_numbers(sample, table):
     """
-    How well the sources of a table of fits are recovered.
+    Measure how well the sources of a table of fits are recovered.
 
     Parameters
     ----------
@@ -134,27 +145,31 @@ def experiment_numbers(sample, table):
     """
     true = rows_of(sample, table["id"])
     photoz = photoz_metrics(true["redshift"], table["redshift_mean"])
-    known = not np.isfinite(table["redshift_rank"]).any()
     fraction = recovery_metrics(true["frac_agn"], table["frac_agn_mean"])
     width = np.asarray(table["frac_agn_std"], float)
+    width = width[np.isfinite(width)]
     power = np.full(len(true), np.nan)
     if "accretion_power" in true.colnames and "accretion_power_mean" in table.colnames:
         with np.errstate(divide="ignore", invalid="ignore"):
             power = np.log10(table["accretion_power_mean"] / true["accretion_power"]).value
     power = recovery_metrics(np.zeros(power.size), power)
-    found = {
+    numbers = {
         "n": photoz.n,
-        "photoz_sigma_mad": np.nan if known else photoz.sigma_mad,
-        "photoz_outliers": np.nan if known else photoz.outlier_fraction,
+        "photoz_sigma_mad": photoz.sigma_mad,
+        "photoz_outliers": photoz.outlier_fraction,
         "frac_agn_bias": fraction.median,
         "frac_agn_sigma_mad": fraction.sigma_mad,
-        "frac_agn_width": float(np.nanmedian(width)) if np.isfinite(width).any() else np.nan,
+        "frac_agn_width": float(np.median(width)) if width.size else np.nan,
         "power_bias": power.median,
         "power_sigma_mad": power.sigma_mad,
     }
+    if not np.isfinite(table["redshift_rank"]).any():
+        # redshifts were not fitted
+        numbers["photoz_sigma_mad"] = np.nan
+        numbers["photoz_outliers"] = np.nan
     for name in RANKED:
         rank = np.asarray(table[f"{name}_rank"], float)
         rank = rank[np.isfinite(rank)]
         inside = np.count_nonzero(np.abs(rank - 0.5) <= 0.34)
-        found[f"{name}_coverage"] = fraction_interval(inside, rank.size)[0]
-    return found
+        numbers[f"{name}_coverage"] = fraction_interval(inside, rank.size)[0]
+    return numbers

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import operator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +24,7 @@ from miricigale.utils.positions import as_positions
 from miricigale.utils.table_files import read_table
 from miricigale.workflow.background import band_background, of_filter, text_by_filter
 from miricigale.workflow.options import of_option, require
-from miricigale.workflow.truths import truth_names
+from miricigale.workflow.truths import truth_names, unit_names
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +47,7 @@ EXPOSURE_RESOURCES = (*IMAGE_RESOURCES, "instrument.etc", "instrument.zodiacal")
 
 def study_exposures(config):
     """
-    The exposures of each truth: name, ``<filter>-<dither>``, to `Exposure`.
+    Return the exposures of each truth: name, ``<filter>-<dither>``, to `Exposure`.
 
     Dithers are counted through all pointings, so that each exposure has random numbers of its own.
     """
@@ -56,43 +55,49 @@ def study_exposures(config):
 
 
 def exposure_sections(config):
-    """What exposures follow from, as a key of caches: sections, dithers, state of the file of pointings."""
+    """Return what exposures follow from, as a key of caches: sections, dithers, state of the file of pointings."""
     options = config.exposures
     patterns = tuple(_dithers(options, k)[0] for k in range(len(options.filters)))
     return config.pointing, options, patterns, _stamp(config.pointing)
 
 
 def dithers_text(config):
-    """Where the dithers of the study are from, in words."""
+    """Return where the dithers of the study are from, in words."""
     options = config.exposures
-    return text_by_filter({f: _dithers(options, k)[1] for k, f in enumerate(options.filters)})
+    texts = {}
+    for k, name in enumerate(options.filters):
+        _, texts[name] = _dithers(options, k)
+    return text_by_filter(texts)
 
 
 def _dithers(options, k):
-    """Dithers of a filter, the name of a pattern or offsets in arcsec as pairs, and where they are from."""
+    """Return a filter's dithers, the name of a pattern or offsets (arcsec) as pairs, and where they are from."""
     name = of_filter(options.dithers or ("ceers",), k)
     if name in dither_patterns():
         form = "of the form of the observatory's but not its digits"
         return name, f"the package's pattern {name!r}, {form}"
-    path, part = Path(name).expanduser(), {}
+    path = Path(name).expanduser()
     wanted = f"must be a file or one of {list(dither_patterns())}"
     require(path.is_file(), "exposures", "dithers", wanted, repr(name))
+    selection = {}
     if path.suffix.lower() == ".pointing":
         if options.dither_observation:
-            part["observation"] = options.dither_observation
+            selection["observation"] = options.dither_observation
         if options.dither_exposures:
-            part["exposure"] = options.dither_exposures[k]
-    text = "".join(f", {key} {value}" for key, value in part.items())
+            selection["exposure"] = options.dither_exposures[k]
     stat = path.stat()
-    offsets = _file_pattern(path, stat.st_mtime_ns, stat.st_size, **part)
-    return offsets, f"offsets in the file {path.name}{text}"
+    offsets = _file_pattern(path, stat.st_mtime_ns, stat.st_size, **selection)
+    text = f"offsets in the file {path.name}"
+    for key, value in selection.items():
+        text += f", {key} {value}"
+    return offsets, text
 
 
 @cached(maxsize=64)
-def _file_pattern(path, *_, **part):
-    """Offsets in a file, which is read again when it has changed."""
+def _file_pattern(path, *_, **selection):
+    """Return the offsets in a file, which is read again when it has changed."""
     with of_option(f"[exposures] dithers: {path.name}:", ValueError, u.UnitsError):
-        offsets = read_dithers(path, **part)
+        offsets = read_dithers(path, **selection)
     return tuple(map(tuple, offsets.to_value(u.arcsec).tolist()))
 
 
@@ -119,8 +124,8 @@ class Pointing(NamedTuple):
 
 
 def study_pointings(config):
-    """Centers of the pointings."""
-    return tuple(one.center for one in _study_pointings(config))
+    """Return the centers of the pointings."""
+    return tuple(pointing.center for pointing in _study_pointings(config))
 
 
 def _study_pointings(config):
@@ -128,12 +133,12 @@ def _study_pointings(config):
 
 
 def pointing_of(config, exposure):
-    """Center of the pointing that an exposure is a dither of: the nearest one."""
+    """Return the center of the pointing that an exposure is a dither of: the nearest one."""
     return min(study_pointings(config), key=exposure.pointing.separation)
 
 
 def _stamp(field):
-    """Time and size of the file of pointings, which is read again when it has changed; none without one."""
+    """Return time and size of the file of pointings, which is read again when it has changed; None without one."""
     if field.table is None:
         return None
     with of_option("[pointing] centers:", OSError):
@@ -143,157 +148,199 @@ def _stamp(field):
 
 @cached(maxsize=8)
 def _pointings(field, filters, _):
-    """Pointings of a section of a configuration."""
+    """Return the pointings of a section of a configuration."""
     roll = field.roll * u.deg
     if field.table is not None:
         with of_option(f"[pointing] centers: {field.table.name}:", ValueError, u.UnitsError):
             if field.table.suffix.lower() == ".pointing":
-                centers, others = read_centers(field.table, roll)
-                if others:
+                centers, skipped = read_centers(field.table, roll)
+                if skipped:
                     text = "%s: exposures that are not of the full imager are not used: %s"
-                    log.warning(text, field.table.name, ", ".join(others))
-                return tuple(Pointing(center, roll, filters) for center in centers)
-            return _read_pointings(read_table(field.table, wanted="pointings"), roll, filters)
-    if field.centers:
+                    log.warning(text, field.table.name, ", ".join(skipped))
+            else:
+                table = read_table(field.table, wanted="pointings")
+                return _read_pointings(table, roll, filters)
+    elif field.centers:
         centers = [SkyCoord(*map(float, text.split()), unit="deg") for text in field.centers]
-        return tuple(Pointing(center, roll, filters) for center in centers)
-    center = SkyCoord(field.ra * u.deg, field.dec * u.deg)
-    if field.tiles == (1, 1):
-        return (Pointing(center, roll, filters),)
-    # as dithers are, along the axes of the imager
-    pa = Exposure("miri.f770w", n_groups=2, pointing=center, roll=roll).pa_aper
-    offsets = tile_offsets(*field.tiles, overlap=field.overlap)
-    return tuple(Pointing(tangent_offset(center, dx, dy, pa), roll, filters) for dx, dy in offsets)
+    else:
+        center = SkyCoord(field.ra * u.deg, field.dec * u.deg)
+        centers = [center]
+        if field.tiles != (1, 1):
+            # as dithers are, along the axes of the imager
+            pa = Exposure("miri.f770w", n_groups=2, pointing=center, roll=roll).pa_aper
+            offsets = tile_offsets(*field.tiles, overlap=field.overlap)
+            centers = [tangent_offset(center, dx, dy, pa) for dx, dy in offsets]
+    return tuple(Pointing(center, roll, filters) for center in centers)
 
 
 def _read_pointings(table, roll, filters):
-    """Pointings of the rows of a table; a row without a roll, bands or time has those of the study."""
-    known = {name.rpartition(".")[2]: name for name in filters}
-    columns, found = {name.lower(): name for name in table.colnames}, []
+    """Return the pointings of the rows of a table; a row without a roll, bands or time has those of the study."""
+    columns = {name.lower(): name for name in table.colnames}
+
+    def cell(row, name):
+        """Value of a column of a row; None without one."""
+        value = row[columns[name]] if name in columns else None
+        return None if np.ma.is_masked(value) else value
+
+    full_names = {name.rpartition(".")[2]: name for name in filters}
+    wanted = f"of [exposures] filters {list(filters)}"
+    pointings = []
     for row, center in zip(table, as_positions(table, "centers"), strict=True):
-        given = {"roll": roll, "time": None}
-        for name, unit in (("roll", u.deg), ("time", u.s)):
-            value = row[columns[name]] if name in columns else np.ma.masked
-            if not np.ma.is_masked(value):
-                given[name] = u.Quantity(value, unit)
-        text = row[columns["bands"]] if "bands" in columns else ""
-        names = [] if np.ma.is_masked(text) else str(text).lower().replace(",", " ").split()
-        bands = [known.get(name.rpartition(".")[2]) for name in names] or filters
-        wanted = f"of [exposures] filters {list(filters)}"
+        row_roll = cell(row, "roll")
+        time = cell(row, "time")
+        text = cell(row, "bands") or ""
+        bands = []
+        for name in str(text).lower().replace(",", " ").split():
+            bands.append(full_names.get(name.rpartition(".")[2]))
         check_that(None not in bands, "bands", wanted, repr(text))
-        found.append(Pointing(center, bands=tuple(bands), **given))
-    return tuple(found)
+        pointing = Pointing(
+            center,
+            roll if row_roll is None else u.Quantity(row_roll, u.deg),
+            tuple(bands or filters),
+            None if time is None else u.Quantity(time, u.s),
+        )
+        pointings.append(pointing)
+    return tuple(pointings)
 
 
 @cached(maxsize=8)
 def all_exposures(field, options, patterns, stamp):
-    """Exposures by name of what `exposure_sections` gives; not to be changed."""
+    """Return exposures by name of what `exposure_sections` gives; not to be changed."""
+    pointings = _pointings(field, options.filters, stamp)
     units = {}
     for k, name in enumerate(options.filters):
-        keys = ("n_groups", "n_integrations")
-        own = {key: getattr(options, key)[k] for key in keys if getattr(options, key)}
-        pattern, named = patterns[k], isinstance(patterns[k], str)
+        pattern = patterns[k]
         n_dithers = options.n_dithers[k] if options.n_dithers else None
-        if not named:
+        if not isinstance(pattern, str):
+            # offsets of a file
             n_dithers = n_dithers or len(pattern)
             wanted = f"must be at most {len(pattern)} for {name}, as its file of dithers has"
             good = n_dithers <= len(pattern)
             require(good, "exposures", "n_dithers", wanted, n_dithers)
-        offsets = pattern if named else pattern * u.arcsec
+            pattern = pattern * u.arcsec
         number = 0
-        for center, roll, bands, time in _pointings(field, options.filters, stamp):
-            if name not in bands:
-                continue
-            exposure, n = _planned(name, own, n_dithers, center, roll, options)
-            exposure = exposure if time is None else exposure.replace(time=time / n)
-            for dither in exposure.dithered(offsets, n):
-                units[f"{name}-{number}"] = dither.replace(dither=number)
-                number += 1
+        for pointing in pointings:
+            if name in pointing.bands:
+                exposure, n = _planned(k, pointing, n_dithers, options)
+                for dither in exposure.dithered(pattern, n):
+                    units[f"{name}-{number}"] = dither.replace(dither=number)
+                    number += 1
     return units
 
 
-def _planned(name, own, n_dithers, pointing, roll, options):
-    """The exposure of a band at a pointing and the number of its dithers, where not given those of the plan."""
-    if "n_groups" in own and n_dithers:
-        return Exposure(name, pointing=pointing, roll=roll, **own), n_dithers
-    planned = ceers_exposures(pointing, roll, filters=[name], quick=options.plan == "quick")
-    return planned[0].replace(pointing=pointing, **own), n_dithers or len(planned)
+def _planned(k, pointing, n_dithers, options):
+    """
+    Return the exposure of the k-th band at a pointing and the number of its dithers.
+
+    What the options do not say is as in the plan.
+    """
+    name = options.filters[k]
+    place = {"pointing": pointing.center, "roll": pointing.roll}
+    counts = {}
+    if options.n_groups:
+        counts["n_groups"] = options.n_groups[k]
+    if options.n_integrations:
+        counts["n_integrations"] = options.n_integrations[k]
+    if "n_groups" in counts and n_dithers:
+        exposure = Exposure(name, **place, **counts)
+    else:
+        is_quick = options.plan == "quick"
+        planned = ceers_exposures(**place, filters=[name], quick=is_quick)
+        exposure = planned[0].replace(pointing=pointing.center, **counts)
+        n_dithers = n_dithers or len(planned)
+    if pointing.time is not None:
+        exposure = exposure.replace(time=pointing.time / n_dithers)
+    return exposure, n_dithers
 
 
 def background_options(config):
-    """Arguments of `~miricigale.workflow.background.band_background`, but for the filter."""
+    """Return the arguments of `~miricigale.workflow.background.band_background`, but for the filter."""
     options = config.scene
-    at_pointing = options.background_date or options.background_of == "pointing"
+    position = None
+    if options.background_date or options.background_of == "pointing":
+        position = study_pointings(config)[0]
     return {
         "filters": config.exposures.filters,
         "levels": options.background,
-        "position": study_pointings(config)[0] if at_pointing else None,
+        "position": position,
         "date": options.background_date,
     }
 
 
 def study_background(config, filter):
-    """Surface brightness of sky and telescope at the center of the field in a filter."""
+    """Return the surface brightness of sky and telescope at the center of the field in a filter."""
     return config.scene.background_scale * band_background(filter, **background_options(config))
 
 
 def band_names(config):
-    """Names of the bands."""
+    """Return the names of the bands."""
     return config.exposures.filters
 
 
 def exposure_units(config):
-    """Names of all exposures, ``<truth>/<filter>-<dither>``."""
-    return tuple(f"{t}/{name}" for t in truth_names(config) for name in study_exposures(config))
+    """Return the names of all exposures, ``<truth>/<filter>-<dither>``."""
+    return unit_names(truth_names(config), study_exposures(config))
 
 
 def exposures_of(config, unit=""):
-    """Exposures by name of a unit that ends with the name of an exposure or of a band; all without one."""
+    """Return exposures by name of a unit that ends with the name of an exposure or of a band; all without one."""
     name = unit.rpartition("/")[2]
-    every = study_exposures(config)
-    if name in every:
-        return {name: every[name]}
-    return {own: e for own, e in every.items() if name in ("", e.filter)}
+    exposures = study_exposures(config)
+    if not name:
+        return dict(exposures)
+    if name in exposures:
+        return {name: exposures[name]}
+    return {key: exposure for key, exposure in exposures.items() if exposure.filter == name}
 
 
 def exposure_plan(config, unit=""):
-    """Plain values of the exposures of a unit, a filter, or the whole study, for hashing."""
+    """Return plain values of the exposures of a unit, a filter, or the whole study, for hashing."""
     return plain_exposures(exposures_of(config, unit))
 
 
 def plain_exposures(exposures):
-    """Plain values of exposures by name."""
-    counts = operator.attrgetter("readout", "n_groups", "n_integrations", "subarray")
-    return {
-        name: [*counts(e), e.pointing.ra.deg, e.pointing.dec.deg, e.roll.value]
-        for name, e in exposures.items()
-    }
+    """Return plain values of exposures by name."""
+    values = {}
+    for name, exposure in exposures.items():
+        values[name] = [
+            exposure.readout,
+            exposure.n_groups,
+            exposure.n_integrations,
+            exposure.subarray,
+            exposure.pointing.ra.deg,
+            exposure.pointing.dec.deg,
+            exposure.roll.value,
+        ]
+    return values
 
 
 def band_exposures(config, name):
-    """The exposures of one band, in order."""
+    """Return the exposures of one band, in order."""
     return list(exposures_of(config, name).values())
 
 
 def pointing_exposures(config, name):
-    """The exposures of one band at its first pointing; there are as many dithers at the others."""
-    own = band_exposures(config, name)
-    return own[: len(own) // sum(name in one.bands for one in _study_pointings(config))]
+    """Return the exposures of one band at its first pointing; there are as many dithers at the others."""
+    exposures = band_exposures(config, name)
+    n_pointings = sum(name in pointing.bands for pointing in _study_pointings(config))
+    return exposures[: len(exposures) // n_pointings]
 
 
 def pointing_time(config, name):
-    """Exposure time of one band at one pointing; where pointings overlap it is longer."""
+    """Return the exposure time of one band at one pointing; where pointings overlap it is longer."""
     return sum(exposure.exposure_time for exposure in pointing_exposures(config, name))
 
 
 def exposure_memory(config, unit):
     """
-    About how many bytes a process takes for an exposure, of a unit or the largest of a filter.
+    Estimate how many bytes a process takes for an exposure, of a unit or the largest of a filter.
 
     Measured: 0.5 GB, and counts and flags of each group.
     """
     if config.exposures.kind == "rates":
         return 600_000_000
-    chosen = exposures_of(config, unit).values()
-    groups = max(math.prod(e.shape) * e.n_groups * e.n_integrations for e in chosen)
-    return 500_000_000 + int(3.3 * groups)
+    n_values = []
+    for exposure in exposures_of(config, unit).values():
+        groups = exposure.n_groups * exposure.n_integrations
+        n_values.append(math.prod(exposure.shape) * groups)
+    return 500_000_000 + int(3.3 * max(n_values))

@@ -37,7 +37,7 @@ from miricigale.workflow.truths import band_sets, reference, study_truths, truth
 
 
 class _Field:
-    """Truth, detections and the two matched: what error functions and samples are made of."""
+    """Truth, detections and the two matched, of which error functions and samples are made."""
 
     def __init__(self, context, name):
         config = context.config
@@ -48,25 +48,29 @@ class _Field:
         self.detections = joined_photometry(tables)
         self.matched = evaluation.match_truth(self.truth, self.detections, bands, radius=radius)
         self.association = evaluation.associate(self.truth, self.detections, radius=radius)
-        n, sky = len(self.truth), joined_sky([self.truth["sky"], self.detections["sky"]])
-        seen, inside = np.zeros((len(bands), len(sky))), np.zeros((len(bands), len(sky)), bool)
+        n = len(self.truth)
+        sky = joined_sky([self.truth["sky"], self.detections["sky"]])
+        # exposures at each source and detection, and whether it is in the field, by band
+        coverage = np.zeros((len(bands), len(sky)))
+        inside = np.zeros((len(bands), len(sky)), bool)
         patches = study_patches(config)
         for patch, rows in by_patch(config, sky):
             for k, band in enumerate(bands):
                 if band in patches[patch].bands:
                     path = of_patch(f"{name}/mosaic_{band}", patch)
                     mosaic, n_images = context.image(f"{path}.fits", "n_images")
-                    seen[k, rows] = mean_coverage(sky[rows], mosaic, n_images)
+                    coverage[k, rows] = mean_coverage(sky[rows], mosaic, n_images)
                     inside[k, rows] = in_field(sky[rows], [mosaic])
         for k, band in enumerate(bands):
             time = pointing_exposures(config, band)[0].exposure_time
-            self.matched[f"{band}_time"] = seen[k, :n] * time
+            self.matched[f"{band}_time"] = coverage[k, :n] * time
         inside = inside.all(axis=0)
-        self.inside, self.detections["in_field"] = inside[:n], inside[n:]
+        self.inside = inside[:n]
+        self.detections["in_field"] = inside[n:]
 
     def noise(self, config):
         """
-        Noise at each source by band, in units of that at the exposure time of one pointing.
+        Return the noise at each source by band, in units of that at the exposure time of one pointing.
 
         None where errors follow the flux alone. That of the sky and of a source's photons goes with the
         root of the time; what does not, as errors of templates, is small where noise counts.
@@ -93,11 +97,16 @@ class _Field:
 )
 def make_errors(context, _):
     """Stage 12: error function of every band, of the matched sources of the reference truth."""
-    config, field = context.config, _Field(context, context.plan)
-    options = {name: getattr(config.errors, name) for name in ("statistic", "bin_size")}
-    options["noise"] = field.noise(config)
-    bands = config.exposures.filters
-    errors = matched_errors(field.matched, field.inside, bands, **options)
+    config = context.config
+    field = _Field(context, context.plan)
+    errors = matched_errors(
+        field.matched,
+        field.inside,
+        config.exposures.filters,
+        noise=field.noise(config),
+        statistic=config.errors.statistic,
+        bin_size=config.errors.bin_size,
+    )
     context.save_result("errors.ecsv", errors)
 
 
@@ -118,23 +127,31 @@ _SAMPLE = ("fit.min_detected", "fit.axes", *(f"fit.{key}" for key in CUTS))
 )
 def match_sources(context, unit):
     """Stage 12: each truth matched, with the errors of the error function; sample of the fit."""
-    config, bands = context.config, context.config.exposures.filters
+    config = context.config
+    bands = config.exposures.filters
     field = _Field(context, unit)
-    matched, detections, association = field.matched, field.detections, field.association
+    matched = field.matched
+    detections = field.detections
+    association = field.association
     errors = photometry.ErrorModel.read(context.path("errors.ecsv"))
     for name in bands:
         matched[f"{name}_formal_err"] = matched[error_column(name)]
         matched[f"{name}_extrapolated"] = errors.extrapolated(matched[name], name)
     matched = errors.assign(matched, filters=bands, noise=field.noise(config))
     chi2 = FitPieces(context, "input_seds", len(field.truth)).of("reduced_chi2")
-    options = {"inside": field.inside, "min_detected": config.fit.min_detected}
-    options["redshifts"] = sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"]
-    options["cuts"] = cut_flags(config.fit, context.table("catalog.ecsv"), field.truth, chi2)
-    add_selection(matched, field.truth, bands, **options)
+    add_selection(
+        matched,
+        field.truth,
+        bands,
+        inside=field.inside,
+        min_detected=config.fit.min_detected,
+        redshifts=sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"],
+        cuts=cut_flags(config.fit, context.table("catalog.ecsv"), field.truth, chi2),
+    )
     add_conditions(matched, bands, suffix="_true")
     detections["association"] = np.zeros(len(detections), int)
-    here = association[np.asarray(association["second"]) >= 0]
-    detections["association"][here["second"]] = here["reasons"]
+    associated = association[np.asarray(association["second"]) >= 0]
+    detections["association"][associated["second"]] = associated["reasons"]
     add_conditions(detections, bands, detections=True)
     context.save_table(f"{unit}/association.ecsv", association)
     context.save_rows(f"{unit}/photometry", detections)
@@ -142,14 +159,14 @@ def match_sources(context, unit):
 
 
 def existing_errors(depths):
-    """Errors (`~miricigale.photometry.ErrorModel`) of existing bands of some depths, by band."""
+    """Return errors (`~miricigale.photometry.ErrorModel`) of existing bands of some depths, by band."""
     fractional = {name: fractional_error(name) for name in depths}
     return photometry.ErrorModel.from_depths(depths, fractional=fractional)
 
 
 def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     """
-    Photometry of the fitted sample (``selection`` 0): mock existing bands, measured MIRI bands.
+    Return photometry of the fitted sample (``selection`` 0): mock existing bands, measured MIRI bands.
 
     Existing bands without a depth have the errors that the truth has of the catalog, no flux where it has none.
     ``truth`` and ``matched`` have the same sources row by row; the noise of a source in a band depends
@@ -159,12 +176,15 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     limits = existing_bands(config)
     bands = list(limits)
     sample = np.asarray(matched["selection"]) == 0
-    name = "zero_point_existing"
-    light = Perturbation({name: zero_point}, seed).fluxes(name, truth[["id", *bands]], bands)
-    deep = {band: limit for band, limit in limits.items() if limit is not None}
-    table = existing_errors(deep).perturb(light[sample], seed=seed) if deep else light[sample]
-    for band in (band for band in bands if band not in deep):
-        add_noise(table, band, truth[error_column(band)][sample], seed)
+    effect = "zero_point_existing"
+    light = Perturbation({effect: zero_point}, seed).fluxes(effect, truth[["id", *bands]], bands)
+    table = light[sample]
+    depths = {band: depth for band, depth in limits.items() if depth is not None}
+    if depths:
+        table = existing_errors(depths).perturb(table, seed=seed)
+    for band in bands:
+        if band not in depths:
+            add_noise(table, band, truth[error_column(band)][sample], seed)
     for name in config.exposures.filters:
         for column in (name, error_column(name)):
             table[column] = matched[column][sample]
@@ -177,11 +197,13 @@ FIT_SECTIONS = (*_EXISTING, "fit.axes", "fit.model_error")
 
 
 def set_plan(config, unit):
-    """Axes and MIRI bands of a fit, and the zero points of its existing bands where they are others."""
-    truth, chosen, *_ = unit.split("/")
-    plan = {"axes": fit_plan(config, unit), "bands": band_sets(config)[chosen]}
+    """Return axes and MIRI bands of a fit, and the zero points of its existing bands where they are others."""
+    truth, name, *_ = unit.split("/")
+    plan = {"axes": fit_plan(config, unit), "bands": band_sets(config)[name]}
     size = dict(study_truths(config)[truth].perturbations).get("zero_point_existing")
-    return plan | ({"zero_point": size} if size else {})
+    if size:
+        plan["zero_point"] = size
+    return plan
 
 
 @stage(
@@ -196,29 +218,33 @@ def set_plan(config, unit):
 )
 def fit_photometry(context, unit):
     """Stage 13: fit the detected sources of a truth with a set of the MIRI bands."""
-    config, plan = context.config, context.plan
-    name, chosen, piece = parts_of(unit)
-    options = {"rows": piece_rows(piece), "zero_point": plan.get("zero_point", 0.0)}
-    _, matched, mock = fit_sample(context, name, **options)
-    results = fit_mock(context, mock, plan["bands"], axes=plan["axes"])
-    place = of_patch(f"{name}/fits_{chosen}", piece)
+    name, band_set, piece = parts_of(unit)
+    _, matched, mock = fit_sample(
+        context,
+        name,
+        rows=piece_rows(piece),
+        zero_point=context.plan.get("zero_point", 0.0),
+    )
+    results = fit_mock(context, mock, context.plan["bands"], axes=context.plan["axes"])
+    place = of_patch(f"{name}/fits_{band_set}", piece)
     context.save_result(f"{place}.fits", results)
     table = results.to_table()
-    conditions = any_condition(matched, config.exposures.filters)
+    conditions = any_condition(matched, context.config.exposures.filters)
     table["condition"] = conditions[np.asarray(matched["selection"]) == 0]
     table["condition"].info.description = ConditionFlags.describe()
     context.save_table(f"{place}.ecsv", table)
 
 
 def fit_sample(context, name, rows=slice(None), **options):
-    """Truth, matched sources and `mock_photometry` of a truth, or of these rows of it."""
-    truth, matched = (table[rows] for table in context.tables(name, ("truth", "matched")).values())
+    """Return truth, matched sources and `mock_photometry` of a truth, or of these rows of it."""
+    truth = context.table(f"{name}/truth.ecsv")[rows]
+    matched = context.table(f"{name}/matched.ecsv")[rows]
     mock = mock_photometry(context.config, truth, matched, seed=context.seed, **options)
     return truth, matched, mock
 
 
 def study_fitter(fit, bands, **options):
-    """`BayesFitter` in bands, with the model error of a section ``[fit]``."""
+    """Return a `BayesFitter` in bands, with the model error of a section ``[fit]``."""
     # galaxies of a study are models of the nodes
     settings = fitting.GridSettings(interpolate=0)
     options = {"model_error": fit.model_error, "settings": settings} | options
@@ -255,7 +281,7 @@ def fit_mock(context, mock, bands, *, redshift=None, **options):
 
 def true_ranks(results, sample, name, seed):
     """
-    Ranks of the true values of a parameter in their posteriors.
+    Return the ranks of the true values of a parameter in their posteriors.
 
     Ranks are randomized within cells of the grid, for injected fractions lie on its nodes.
     """

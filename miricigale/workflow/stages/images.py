@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 
 
 def reducer_of(config, n_threads=None):
-    """The reducer that a configuration describes."""
+    """Return the reducer that a configuration describes."""
     options = config.reduction
     return reduction.Reducer(
         backend=options.backend,
@@ -61,15 +61,17 @@ def reducer_of(config, n_threads=None):
 
 
 def background_of(config, exposure):
-    """The background of an exposure, which those of a pointing share: it moves with the telescope."""
-    options, level = config.scene, study_background(config, exposure.filter)
-    slope = {"gradient": options.background_gradient / u.arcmin}
-    slope |= {"position_angle": options.gradient_angle * u.deg}
-    return scene.Background(level, center=pointing_of(config, exposure), **slope)
+    """Return the background of an exposure, which those of a pointing share: it moves with the telescope."""
+    return scene.Background(
+        study_background(config, exposure.filter),
+        center=pointing_of(config, exposure),
+        gradient=config.scene.background_gradient / u.arcmin,
+        position_angle=config.scene.gradient_angle * u.deg,
+    )
 
 
 def imager_of(config, properties=None):
-    """The detector that a configuration describes."""
+    """Return the detector that a configuration describes."""
     imager = detector.Detector.miri_imager(properties=properties)
     if config.detector.residual:
         imager = imager.replace(detector.Residual(config.detector.residual))
@@ -108,20 +110,26 @@ def expose_and_reduce(
     rate, cal : `~astropy.nddata.CCDData`
         In DN/s and in MJy/sr, background subtracted unless that of dithers will be (`mosaics_of`).
     """
-    differ = perturbation or Perturbation({}, seed)
-    catalog, band = differ.catalog(catalog, exposure.filter), exposure.filter
-    options = {"psf": differ.psf(band), "cutouts": differ.stamps, "agn": differ.point_column(band)}
-    options |= {"background": background_of(config, exposure), "n_threads": n_threads}
-    sky = scene.Scene(catalog, exposure=exposure, **options)
-    imager = imager_of(config, differ.detector)
-    image = differ.with_flat(sky.render(), exposure)
+    perturbation = perturbation or Perturbation({}, seed)
+    band = exposure.filter
+    sky = scene.Scene(
+        perturbation.catalog(catalog, band),
+        exposure=exposure,
+        psf=perturbation.psf(band),
+        cutouts=perturbation.stamps,
+        agn=perturbation.point_column(band),
+        background=background_of(config, exposure),
+        n_threads=n_threads,
+    )
+    imager = imager_of(config, perturbation.detector)
+    image = perturbation.with_flat(sky.render(), exposure)
     if tell is not None:
         tell(imager.forecast(image, exposure, sources=sky.truth))
     return expose_image(config, imager, image, exposure, seed=seed, n_threads=n_threads, keep=keep)
 
 
 def expose_image(config, imager, image, exposure, *, seed, n_threads=None, keep=None):
-    """Rate and calibrated image, as of `expose_and_reduce`, of a noiseless image on a detector."""
+    """Return rate and calibrated image, as of `expose_and_reduce`, of a noiseless image on a detector."""
     collect = imager.expose if config.exposures.kind == "ramps" else imager.collect
     ramp = collect(image, exposure, seed=seed, n_threads=n_threads)
     if keep is not None:
@@ -136,11 +144,13 @@ def expose_image(config, imager, image, exposure, *, seed, n_threads=None, keep=
 
 
 def _sky_plan(config, unit):
-    """The plan of an exposure, the perturbations of its truth, and whether that is the reference."""
+    """Return the plan of an exposure, the perturbations of its truth, and whether that is the reference."""
     name = unit.partition("/")[0]
-    plan = exposure_plan(config, unit) | {"is_reference": name == reference(config)}
-    effects = dict(study_truths(config)[name].perturbations)
-    return plan | ({"perturbations": effects} if effects else {})
+    plan = exposure_plan(config, unit)
+    plan["is_reference"] = name == reference(config)
+    if effects := dict(study_truths(config)[name].perturbations):
+        plan["perturbations"] = effects
+    return plan
 
 
 @stage(
@@ -170,12 +180,19 @@ def make_exposure(context, unit):
         context.save_result(f"{truth}/level1b/{filename}", ramp, filename=filename)
 
     effects = context.plan.get("perturbations", {})
-    stamps = read_stamps(context.path(f"{truth}/stamps.fits")) if CUTOUTS in effects else {}
-    options = {"seed": context.seed, "n_threads": context.n_threads, "tell": tell}
-    options["perturbation"] = Perturbation(effects, context.seed, stamps)
-    options["keep"] = keep if config.run.keep_level1b else None
-    catalog = context.table(f"{truth}/truth.ecsv")
-    rate, cal = expose_and_reduce(config, exposure, catalog, **options)
+    stamps = {}
+    if CUTOUTS in effects:
+        stamps = read_stamps(context.path(f"{truth}/stamps.fits"))
+    rate, cal = expose_and_reduce(
+        config,
+        exposure,
+        context.table(f"{truth}/truth.ecsv"),
+        seed=context.seed,
+        perturbation=Perturbation(effects, context.seed, stamps),
+        n_threads=context.n_threads,
+        tell=tell,
+        keep=keep if config.run.keep_level1b else None,
+    )
     context.save_image(f"{truth}/exposures/{name}_cal.fits", cal, dq=cal.flags)
     # the report shows what the subtraction of the background did to one exposure of a band
     if config.run.keep_level1b or (context.plan["is_reference"] and exposure.dither == 0):
@@ -206,21 +223,25 @@ def make_mosaic(context, unit):
 
 def mosaics_of(config, images, patch=""):
     """
-    Mosaics of a band, on its own grid (``""``) and on the prior's (``"_fine"``), with further planes.
+    Make mosaics of a band, on its own grid (``""``) and on the prior's (``"_fine"``), with further planes.
 
     Those of a patch are on the first alone: the second is for whole fields, as Yang et al. 2021 measure them.
     """
     reducer = reducer_of(config)
     if reducer.background.method == "dithers":
         images, _ = reducer.subtract_dithers(images)
-    grids = {"": config.reduction.pixel_scale, "_fine": config.highres.pixel_scale}
-    for label, scale in list(grids.items())[: 1 if patch else 2]:
+    scales = {"": config.reduction.pixel_scale}
+    if not patch:
+        scales["_fine"] = config.highres.pixel_scale
+    for label, scale in scales.items():
         # outliers are found in the first pass, which returns the images with them masked
         drizzled, images = reducer.drizzle(images, grid_of(config, scale, patch))
         # second pass: background that remained after subtraction from single dithers
         mosaic, _ = reducer.subtract_background(drizzled.image)
-        # how many exposures each pixel has: what errors follow
-        planes = {} if label else {"n_images": drizzled.n_images}
+        planes = {}
+        if label == "":
+            # how many exposures each pixel has: what errors follow
+            planes["n_images"] = drizzled.n_images
         yield label, mosaic, planes
 
 
@@ -246,8 +267,7 @@ def make_highres(context, patch):
     truth = context.table(f"{context.plan['truth']}/truth.ecsv")
     wcs = grid_of(config, config.highres.pixel_scale, patch)
     noise = patch_noise(config, patch, context.seed) if patch else None
-    own = {"seed": context.seed, "noise": noise}
-    image, segmentation, detected = prior_image(config, truth, wcs, **own)
+    image, segmentation, detected = prior_image(config, truth, wcs, seed=context.seed, noise=noise)
     context.save_image(f"{of_patch('f160w', patch)}.fits", image)
     segmentation = np.asarray(segmentation.data, np.int32)
     context.save_image(f"{of_patch('segm', patch)}.fits", image, segmentation=segmentation)
@@ -255,36 +275,51 @@ def make_highres(context, patch):
 
 
 def patch_noise(config, patch, seed):
-    """Standard normal numbers of a patch: a part of each row of the field, the same where patches overlap."""
+    """Draw standard normal numbers of a patch: a part of each row of the field, the same where patches overlap."""
     rows, columns = study_patches(config)[patch].box
-    streams = (stream(seed, "highres", str(y)) for y in range(rows.start, rows.stop))
-    return np.stack([one.standard_normal(columns.stop)[columns] for one in streams])
+    noise = []
+    for y in range(rows.start, rows.stop):
+        rng = stream(seed, "highres", str(y))
+        noise.append(rng.standard_normal(columns.stop)[columns])
+    return np.stack(noise)
 
 
 def prior_psf(config):
-    """The PSF of the high-resolution image."""
+    """Return the PSF of the high-resolution image."""
     options = config.highres
     return psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec)
 
 
 def prior_image(config, catalog, wcs, *, seed, noise=None):
-    """High-resolution image of a catalog, its segmentation and the detected sources."""
-    filter, depth = config.highres.filter, config.highres.depth * u.ABmag
-    sky = {"filter": filter, "wcs": wcs, "psf": prior_psf(config), "depth": depth}
-    image = scene.highres_image(catalog, **sky, seed=seed, noise=noise)
-    limits = {name: getattr(config.photometry, name) for name in ("threshold", "n_pixels")}
-    return image, *photometry.detect_sources(image, **limits)
+    """Make the high-resolution image of a catalog, its segmentation and the table of detected sources."""
+    image = scene.highres_image(
+        catalog,
+        filter=config.highres.filter,
+        wcs=wcs,
+        psf=prior_psf(config),
+        depth=config.highres.depth * u.ABmag,
+        seed=seed,
+        noise=noise,
+    )
+    segmentation, detected = photometry.detect_sources(
+        image,
+        threshold=config.photometry.threshold,
+        n_pixels=config.photometry.n_pixels,
+    )
+    return image, segmentation, detected
 
 
 def mosaic_psf(config, name, scale, patch=""):
-    """The PSF of the mosaic of one band on pixels of ``scale`` arcsec."""
-    angles = u.Quantity([e.pa_aper for e in patch_exposures(config, name, patch).values()])
-    options = {"pixfrac": config.reduction.pixfrac}
-    return psf.psf_mosaic(psf.miri_psf(name), scale * u.arcsec, angles, **options)
+    """Return the PSF of the mosaic of one band on pixels of ``scale`` arcsec."""
+    exposures = patch_exposures(config, name, patch).values()
+    angles = u.Quantity([exposure.pa_aper for exposure in exposures])
+    pixfrac = config.reduction.pixfrac
+    return psf.psf_mosaic(psf.miri_psf(name), scale * u.arcsec, angles, pixfrac=pixfrac)
 
 
 def measured_mosaic(config):
-    """Suffix and pixel scale (arcsec) of the mosaics that are measured: 'yang2021' takes the prior's grid."""
+    """Return suffix and pixel scale (arcsec) of the mosaics that are measured."""
+    # the steps of the paper take the prior's grid
     if config.photometry.method == "yang2021":
         return "_fine", config.highres.pixel_scale
     return "", config.reduction.pixel_scale
@@ -301,9 +336,12 @@ def measured_mosaic(config):
 )
 def make_kernel(context, unit):
     """Stage 10: the kernel from the high-resolution image to the mosaic of one band."""
-    config, (_, name, patch) = context.config, parts_of(f"/{unit}")
-    pair = prior_psf(config), mosaic_psf(config, name, config.reduction.pixel_scale, patch)
-    options = {"regularization": config.photometry.regularization}
-    scale = config.highres.pixel_scale * u.arcsec
-    kernel = psf.MatchingKernel.from_psfs(*pair, pixel_scale=scale, **options)
+    config = context.config
+    _, name, patch = parts_of(f"/{unit}")
+    kernel = psf.MatchingKernel.from_psfs(
+        prior_psf(config),
+        mosaic_psf(config, name, config.reduction.pixel_scale, patch),
+        pixel_scale=config.highres.pixel_scale * u.arcsec,
+        regularization=config.photometry.regularization,
+    )
     context.save_result(f"{of_patch(f'kernel_{name}', patch)}.fits", kernel)

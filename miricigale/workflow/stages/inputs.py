@@ -30,55 +30,61 @@ DUST_SHOWS = 5.0
 
 def input_axes(kind, *, dust=False):
     """
-    Axes of the fit of the input SEDs but redshift, of the grid ``"galaxy"`` or ``"quick"``.
+    Return the axes of the fit of the input SEDs but redshift, of the grid ``"galaxy"`` or ``"quick"``.
 
     Those of Yang et al. 2021, but one value of the dust's alpha unless ``dust``: bands shorter than 5 um
     do not constrain it, and a fit would run to the edge of the grid (see `make_truth`).
     """
-    axes = sed.SEDModel.yang2021_axes(kind)
-    fitted = {name: axes[name] for name in ("tau", "age", "ebv", "alpha")}
-    return fitted if dust else fitted | {"alpha": np.array([2.0])}
+    preset = sed.SEDModel.yang2021_axes(kind)
+    axes = {name: preset[name] for name in ("tau", "age", "ebv", "alpha")}
+    if not dust:
+        axes["alpha"] = np.array([2.0])
+    return axes
 
 
 def plain_axes(axes):
-    """Plain values of a grid's axes, for hashing."""
+    """Return plain values of a grid's axes, for hashing."""
     return {name: list(values) for name, values in axes.items()}
 
 
 def fit_plan(config, _):
-    """The axes of the final fit."""
-    free = {"dust_excess": config.fit.dust_excess} if config.fit.dust_excess else {}
-    return plain_axes(sed.SEDModel.yang2021_axes(config.fit.axes) | free)
+    """Return the axes of the final fit."""
+    axes = sed.SEDModel.yang2021_axes(config.fit.axes)
+    if config.fit.dust_excess:
+        axes["dust_excess"] = config.fit.dust_excess
+    return plain_axes(axes)
 
 
 def sed_resources():
-    """Reference data of the models: the preset takes the best libraries that there are."""
+    """Return the reference data of the models: the preset takes the best libraries that there are."""
     return (*sed.SEDModel.yang2021().resources, "filters.sedpy")
 
 
 def catalog_bands(catalog):
-    """Names of the flux columns of a catalog: those with a dot in the name."""
+    """Return the names of the flux columns of a catalog: those with a dot in the name."""
     return [name for name in catalog.colnames if "." in name and not name.endswith("_err")]
 
 
 def input_bands(catalog, max_wavelength):
     """
-    Bands of a catalog that its SEDs are fitted to, and their longest pivot wavelength in um.
+    Return the bands of a catalog that its SEDs are fitted to, and their longest pivot wavelength in um.
 
     A dict of band to whether it has a column of errors; those without end at ``max_wavelength`` (um).
     The wavelength is 0 without bands.
     """
-    bands, longest = {}, 0.0
+    bands = {}
+    longest = 0.0
     for name in catalog_bands(catalog):
         pivot = Filter.from_name(name).pivot.value
-        own = error_column(name) in catalog.colnames
-        if own or pivot <= max_wavelength:
-            bands[name], longest = own, max(longest, pivot)
+        has_errors = error_column(name) in catalog.colnames
+        if has_errors or pivot <= max_wavelength:
+            bands[name] = has_errors
+            longest = max(longest, pivot)
     return bands, longest
 
 
 def measured_error(catalog, name, catalog_error):
-    """Errors of a catalog's band: its own, NaN where not positive, or without any a part of the flux."""
+    """Return errors of a catalog's band: its own, NaN where not positive, or without any a part of the flux."""
     if error_column(name) not in catalog.colnames:
         return np.abs(catalog[name]) * catalog_error
     error = catalog[error_column(name)]
@@ -88,21 +94,24 @@ def measured_error(catalog, name, catalog_error):
 
 def existing_bands(config):
     """
-    Bands that are fitted beside those that are simulated: dict of name to 5-sigma AB depth.
+    Return the bands that are fitted with those that are simulated: dict of name to 5-sigma AB depth.
 
     The depth is None where each source has the error of the catalog.
     """
-    fit, catalog = config.fit, config.catalog
+    fit = config.fit
+    catalog = config.catalog
     if fit.bands:
         return dict.fromkeys(fit.bands) | dict(zip(fit.bands, fit.depths, strict=False))
     if catalog.source in resources():
         return dict(YANG2021_DEPTHS)
-    new = config.exposures.filters
-    return dict.fromkeys(b for b in catalog_bands(study_catalog(catalog)) if b not in new)
+    bands = dict.fromkeys(catalog_bands(study_catalog(catalog)))
+    for name in config.exposures.filters:
+        bands.pop(name, None)
+    return bands
 
 
 def shows_dust(catalog, options):
-    """Whether each source has a flux beyond `DUST_SHOWS` in a band that its SED is fitted to, shape (n,)."""
+    """Tell whether each source has a flux beyond `DUST_SHOWS` in a band that its SED is fitted to, shape (n,)."""
     shown = np.zeros(len(catalog), bool)
     for name in input_bands(catalog, options.max_wavelength)[0]:
         if Filter.from_name(name).pivot.value > DUST_SHOWS:
@@ -112,26 +121,33 @@ def shows_dust(catalog, options):
 
 
 def study_catalog(options):
-    """The catalog of the section ``catalog`` of a configuration."""
+    """Return the catalog of the section ``catalog`` of a configuration."""
     path = Path(options.source).expanduser()
-    state = path.stat() if path.is_file() else None
-    return _catalog(options, state and (state.st_mtime_ns, state.st_size))
+    state = None
+    if path.is_file():
+        stat = path.stat()
+        state = (stat.st_mtime_ns, stat.st_size)
+    return _catalog(options, state)
 
 
 @cached(maxsize=2, copies=True)
 def _catalog(options, state):
-    """The catalog, read and warned of once; ``state`` changes with a file."""
-    pairs = {"columns": options.columns, "units": options.units}
-    known = {key: dict(pair.split("=") for pair in texts) for key, texts in pairs.items()}
-    known |= {"survey": options.survey or None, "factor": options.factor or None}
-    catalog = read_catalog(options.source, missing=options.missing, **known)
-    known = np.count_nonzero(catalog["redshift"] > 0)
-    require(known, "catalog", "source", "must have a column 'redshift'", catalog.colnames)
+    """Return the catalog, read and warned of once; ``state`` changes with a file."""
+    catalog = read_catalog(
+        options.source,
+        columns=dict(pair.split("=") for pair in options.columns),
+        units=dict(pair.split("=") for pair in options.units),
+        survey=options.survey or None,
+        missing=options.missing,
+        factor=options.factor or None,
+    )
+    has_redshifts = np.any(catalog["redshift"] > 0)
+    require(has_redshifts, "catalog", "source", "must have a column 'redshift'", catalog.colnames)
     return catalog
 
 
 def _input_plan(config, _):
-    """Axes of the input fit, and the bands whose errors a user's catalog has, for hashing."""
+    """Return axes of the input fit, and the bands whose errors a user's catalog has, for hashing."""
     plan = plain_axes(input_axes(config.sed.axes))
     if config.catalog.source not in resources():
         bands, _ = input_bands(study_catalog(config.catalog), config.sed.max_wavelength)
@@ -140,8 +156,10 @@ def _input_plan(config, _):
 
 
 def _content(source):
-    """Checksum of a catalog: the content of a user's file may change."""
-    return fingerprint(source) if source in resources() else file_sha256(Path(source).expanduser())
+    """Return the checksum of a catalog: the content of a user's file may change."""
+    if source in resources():
+        return fingerprint(source)
+    return file_sha256(Path(source).expanduser())
 
 
 @stage(
@@ -152,46 +170,49 @@ def _content(source):
 )
 def make_catalog(context, _):
     """Stage 1: read the catalog and cut it at the faint limit."""
-    options, prior = context.config.catalog, context.config.highres.filter
+    options = context.config.catalog
     catalog = study_catalog(options)
-    chosen = bright_sources(catalog, options, prior)
-    chosen.meta["n_sources"] = len(catalog)
-    context.save_rows("catalog", chosen)
+    sample = bright_sources(catalog, options, context.config.highres.filter)
+    sample.meta["n_sources"] = len(catalog)
+    context.save_rows("catalog", sample)
 
 
 def bright_sources(catalog, options, prior):
-    """Sources up to ``mag_limit`` in the column ``mag_column`` of the options, or in the flux of ``prior``."""
+    """Return sources up to ``mag_limit`` in the column ``mag_column`` of the options, or in the band ``prior``."""
     column = options.mag_column
     if column in catalog.colnames:
         magnitudes = catalog[column]
         magnitudes = np.asarray(getattr(magnitudes, "value", magnitudes), float)
     elif prior in catalog.colnames:
-        column, magnitudes = prior, ab_magnitude(catalog[prior])
+        column = prior
+        magnitudes = ab_magnitude(catalog[prior])
     else:
         wanted = f"one of {catalog.colnames}, or the catalog must have fluxes in {prior}"
         raise argument_error("mag_column", wanted, repr(column))
     # a source without a magnitude is kept; the report says why it is not fitted
-    chosen = catalog[~(magnitudes > options.mag_limit)]
+    sample = catalog[~(magnitudes > options.mag_limit)]
     good = np.any(magnitudes <= options.mag_limit)
     wanted = f"leaves none of the {len(catalog)} sources, {column} of {np.nanmin(magnitudes):.2f} and more"
     require(good, "catalog", "mag_limit", wanted, options.mag_limit)
-    return chosen
+    return sample
 
 
 def pieces(n):
-    """Names of the pieces that n sources are fitted in; a single empty one if these are few."""
-    return [f"{k:04d}" for k in range(math.ceil(n / LONG))] if n > LONG else [""]
+    """Return the names of the pieces that n sources are fitted in; a single empty one if these are few."""
+    if n <= LONG:
+        return [""]
+    return [f"{k:04d}" for k in range(math.ceil(n / LONG))]
 
 
 def catalog_pieces(config):
-    """Names of the pieces that the sources of the study's catalog are fitted in."""
+    """Return the names of the pieces that the sources of the study's catalog are fitted in."""
     catalog = study_catalog(config.catalog)
     return pieces(len(bright_sources(catalog, config.catalog, config.highres.filter)))
 
 
 def sources_memory(config, _):
     """
-    About how many bytes a process takes that has the tables of all sources.
+    Estimate how many bytes a process takes that has the tables of all sources.
 
     Measured: 1.2 GB at most of a field of one pointing, and from 12,000 to 100,000 sources 3.6 kB for each.
     """
@@ -199,8 +220,10 @@ def sources_memory(config, _):
 
 
 def piece_rows(piece):
-    """Rows of a piece, a slice."""
-    return slice(LONG * int(piece), LONG * (int(piece) + 1)) if piece else slice(None)
+    """Return the rows of a piece, a slice."""
+    if not piece:
+        return slice(None)
+    return slice(LONG * int(piece), LONG * (int(piece) + 1))
 
 
 @stage(
@@ -215,9 +238,14 @@ def piece_rows(piece):
 )
 def fit_inputs(context, piece):
     """Stage 2: fit a galaxy grid to the catalog's fluxes at the known redshifts."""
-    config, catalog = context.config, context.table("catalog.ecsv")[piece_rows(piece)]
-    options = {"model_error": config.fit.model_error, "progress_bar": context.progress_bar}
-    results = fit_seds(catalog, config.sed, **options)
+    config = context.config
+    catalog = context.table("catalog.ecsv")[piece_rows(piece)]
+    results = fit_seds(
+        catalog,
+        config.sed,
+        model_error=config.fit.model_error,
+        progress_bar=context.progress_bar,
+    )
     context.save_result(f"{of_patch('input_seds', piece)}.fits", results)
 
 
@@ -251,9 +279,12 @@ class FitPieces:
 
     def cdf(self, name):
         """As of `~miricigale.fitting.FitResults`, of all sources."""
-        both = zip(*(self._read(path).cdf(name) for path in self._paths), strict=True)
+        parts = [self._read(path).cdf(name) for path in self._paths]
         # edges of cells, or levels of quantiles, are those of all
-        return tuple(one[0] if one[0].ndim == 1 else np.concatenate(one) for one in both)
+        return tuple(
+            arrays[0] if arrays[0].ndim == 1 else np.concatenate(arrays)
+            for arrays in zip(*parts, strict=True)
+        )
 
     def to_table(self):
         """As of `~miricigale.fitting.FitResults`, of all sources."""
@@ -265,10 +296,15 @@ class FitPieces:
 
     @functools.cached_property
     def _path_of(self):
-        return {key: path for path in self._paths for key in self._read(path).ids.tolist()}
+        paths = {}
+        for path in self._paths:
+            paths |= dict.fromkeys(self._read(path).ids.tolist(), path)
+        return paths
 
     def __getitem__(self, key):
-        return self._read(self._path_of[getattr(key, "item", lambda: key)()]).loc[key]
+        # ids are Python's numbers and texts
+        key = getattr(key, "item", lambda: key)()
+        return self._read(self._path_of[key]).loc[key]
 
 
 def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False):
@@ -289,8 +325,13 @@ def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False
     nodes = np.unique(np.round(photometry["redshift"] / REDSHIFT_STEP) * REDSHIFT_STEP)
     axes = input_axes(options.axes, dust=longest > DUST_SHOWS)
     settings = fitting.GridSettings(redshift_tolerance=REDSHIFT_STEP, interpolate=0)
-    # a single band is enough for a flux
-    options = {"model_error": model_error, "settings": settings, "n_bands_min": 1}
-    options["axes"] = axes | {"redshift": nodes[nodes > 0]}
-    fitter = fitting.BayesFitter(sed.SEDModel.yang2021(agn=False), list(bands), **options)
+    fitter = fitting.BayesFitter(
+        sed.SEDModel.yang2021(agn=False),
+        list(bands),
+        axes=axes | {"redshift": nodes[nodes > 0]},
+        model_error=model_error,
+        settings=settings,
+        # a single band is enough for a flux
+        n_bands_min=1,
+    )
     return fitter.fit(photometry, redshift="redshift", executor=executor, progress_bar=progress_bar)

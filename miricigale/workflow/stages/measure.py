@@ -35,8 +35,9 @@ from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf, prior
 )
 def make_templates(context, patch):
     """Stage 11, once for all bands: what the detected sources look like on the prior."""
+    image, labels, sources = _detections(context, patch)
     templates = photometry.SourceTemplates.from_images(
-        *_detections(context, patch), psf=prior_psf(context.config), n_threads=context.n_threads
+        image, labels, sources, psf=prior_psf(context.config), n_threads=context.n_threads
     )
     context.save_result(f"{of_patch('templates', patch)}.fits", templates)
 
@@ -73,12 +74,15 @@ def measure_photometry(context, unit):
 )
 def join_detections(context, _):
     """Stage 9, of patches: each detection once, with its patch and its label there."""
-    config, tables = context.config, []
-    grid, wcs = patch_grid(config), grid_of(config, config.highres.pixel_scale)
+    config = context.config
+    grid = patch_grid(config)
+    wcs = grid_of(config, config.highres.pixel_scale)
+    tables = []
     for name in study_patches(config):
         table = context.table(f"detections_{name}.ecsv")
         xy = np.transpose(wcs.world_to_pixel(table["sky"]))
-        table["patch"], table["label"] = name, table["id"]
+        table["patch"] = name
+        table["label"] = table["id"]
         tables.append(table[grid.near(grid.names.index(name), xy, RIM)])
     joined = vstack(tables, metadata_conflicts="silent")
     numbers = np.array([grid.names.index(name) for name in joined["patch"]])
@@ -98,17 +102,22 @@ def join_detections(context, _):
 def join_photometry(context, unit):
     """Stage 11, of patches: the photometry of a band at all detections."""
     truth, band = unit.split("/")
-    every = context.table("detections.ecsv")
-    tables, rows, n = [], np.full(len(every), -1), 0
+    detections = context.table("detections.ecsv")
+    # row of each detection in the stacked tables, -1 where the band has no data
+    rows = np.full(len(detections), -1)
+    n_rows = 0
+    tables = []
     for name, patch in study_patches(context.config).items():
         if band in patch.bands:
             table = context.table(f"{truth}/photometry/{band}_{name}.ecsv")
-            own, order = np.asarray(every["patch"]) == name, np.argsort(table["id"])
-            rows[own] = n + order[np.searchsorted(table["id"], every["label"][own], sorter=order)]
+            inside = np.asarray(detections["patch"]) == name
+            order = np.argsort(table["id"])
+            place = np.searchsorted(table["id"], detections["label"][inside], sorter=order)
+            rows[inside] = n_rows + order[place]
+            n_rows += len(table)
             tables.append(table)
-            n += len(table)
     stacked = vstack(tables, metadata_conflicts="silent")
-    joined = every["id", "sky"]
+    joined = detections["id", "sky"]
     for name in stacked.colnames[2:]:
         if name in ("x", "y"):
             # of the mosaic of a patch, which has a grid of its own
@@ -118,33 +127,34 @@ def join_photometry(context, unit):
 
 
 def photometer_of(context, name, method, patch=""):
-    """Photometer of one band: of the package, or by the steps of Yang et al. 2021 (images not scaled)."""
+    """Return the photometer of one band: of the package, or by the steps of Yang et al. 2021."""
     config = context.config
     if method == "yang2021":
         blur = mosaic_psf(config, name, config.highres.pixel_scale, patch)
         return photometry.Yang2021Photometer(prior_psf(config), blur, n_threads=context.n_threads)
-    # the constant absorbs the light of faint sources and of wings in the background
-    options = {"background_order": 0, "n_threads": context.n_threads}
     kernel = psf.MatchingKernel.read(context.path(f"{of_patch(f'kernel_{name}', patch)}.fits"))
-    return photometry.ForcedPhotometer(kernel, **options)
+    # the constant absorbs the light of faint sources and of wings in the background
+    return photometry.ForcedPhotometer(kernel, background_order=0, n_threads=context.n_threads)
 
 
 def measure_band(context, mosaic, name, method, patch=""):
-    """Result of the forced photometry of a mosaic of one band, ``"package"`` or ``"yang2021"``."""
+    """Measure a mosaic of one band by forced photometry, ``"package"`` or ``"yang2021"``."""
     photometer = photometer_of(context, name, method, patch)
     if method == "yang2021":
         # on the grid of the prior
-        return photometer.measure(mosaic, *_detections(context, patch))
+        image, labels, sources = _detections(context, patch)
+        return photometer.measure(mosaic, image, labels, sources)
     path = context.path(f"{of_patch('templates', patch)}.fits")
     templates = photometry.SourceTemplates.read(path)
     return photometer.measure(mosaic, templates=templates)
 
 
 def _detections(context, patch):
-    """The high-resolution image, the labels of its segments, and the detected sources."""
-    image, segm, found = (of_patch(name, patch) for name in ("f160w", "segm", "detections"))
-    _, labels = context.image(f"{segm}.fits", "segmentation")
-    return context.image(f"{image}.fits"), labels.astype(np.int32), context.table(f"{found}.ecsv")
+    """Return the high-resolution image, the labels of its segments, and the detected sources."""
+    _, labels = context.image(f"{of_patch('segm', patch)}.fits", "segmentation")
+    image = context.image(f"{of_patch('f160w', patch)}.fits")
+    sources = context.table(f"{of_patch('detections', patch)}.ecsv")
+    return image, labels.astype(np.int32), sources
 
 
 def joined_photometry(tables):

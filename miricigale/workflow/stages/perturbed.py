@@ -5,57 +5,60 @@ from astropy.table import Table
 
 from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, outlier_share, scatter
-from miricigale.workflow.labels import by_wavelength, texts_of
+from miricigale.workflow.labels import by_wavelength
 from miricigale.workflow.stages.conditions import bright_isolated
 
 #: Name of what no effect has changed.
 NONE = "none"
-EFFECT_LABELS = texts_of("perturbations")["labels"]
 
 
 def _quantities(bands):
-    """Columns of the table: name to the kind of the values, the band, and their statistic."""
-    order, found = by_wavelength(bands), {}
+    """Return the quantities of the table: kind of the values, band and statistic by name."""
+    quantities = {}
+    order = by_wavelength(bands)
     for band in (order[0], order[-1]):
-        found[f"{band} offset"] = ("flux", band, median)
-        found[f"{band} scatter"] = ("flux", band, scatter)
-    return found | {
-        "photo-z sigma_MAD": ("redshift", None, scatter),
-        "photo-z outliers": ("redshift", None, outlier_share),
-        "fracAGN offset": ("frac_agn", None, median),
-        "fracAGN scatter": ("frac_agn", None, scatter),
-    }
+        quantities[f"{band} offset"] = ("flux", band, median)
+        quantities[f"{band} scatter"] = ("flux", band, scatter)
+    quantities["photo-z sigma_MAD"] = ("redshift", None, scatter)
+    quantities["photo-z outliers"] = ("redshift", None, outlier_share)
+    quantities["fracAGN offset"] = ("frac_agn", None, median)
+    quantities["fracAGN scatter"] = ("frac_agn", None, scatter)
+    return quantities
 
 
 def _errors(tables, kind, band):
     """
-    Ids of sources, and measured minus true values; ``tables`` are ``StudyTables`` of a truth.
+    Return ids of sources, and measured minus true values; ``tables`` are ``StudyTables`` of a truth.
 
     Relative to the true ones for the fluxes, of bright isolated sources; of redshifts relative to
     1 + z.
     """
+    scale = 1.0
     if kind == "flux":
         table = tables.matched[bright_isolated(tables.matched, band)]
-        true, found = table[f"{band}_true"].value, table[band].value
+        true = table[f"{band}_true"].value
+        measured = table[band].value
         scale = true
     else:
-        table, results = tables.sample, tables.fits["all"]
-        true, found = np.asarray(table[kind]), np.asarray(results[f"{kind}_mean"])
-        scale = 1 + true if kind == "redshift" else 1.0
-    errors = (found - true) / scale
+        table = tables.sample
+        true = np.asarray(table[kind])
+        measured = np.asarray(tables.fits["all"][f"{kind}_mean"])
+    if kind == "redshift":
+        scale = 1 + true
+    errors = (measured - true) / scale
     good = np.isfinite(errors)
     return np.asarray(table["id"])[good], errors[good]
 
 
-def perturbation_costs(truths, every, bands, *, seed):
+def perturbation_costs(truths, tables, bands, *, seed):
     """
-    Accuracy of perturbed truths, and its change against those without perturbations.
+    Measure the accuracy of perturbed truths, and its change against those without perturbations.
 
     Parameters
     ----------
     truths : dict of str to `~miricigale.workflow.truths.Truth`
         All truths.
-    every : dict of str to `~miricigale.workflow.page.numbers.StudyTables`
+    tables : dict of str to `~miricigale.workflow.page.numbers.StudyTables`
         Their tables.
     bands : iterable of str
         MIRI bands; fluxes are those of the shortest and the longest.
@@ -71,20 +74,29 @@ def perturbation_costs(truths, every, bands, *, seed):
         draws of these sources, so that what both skies share does not count.
     """
     rows = []
+
+    def add(base, label, name, value, change=None):
+        row = {"truth": base, "perturbation": label, "quantity": name}
+        row |= {"n": value.n, "value": value.value, "value_err": value.error}
+        row["change"] = np.nan if change is None else change.value
+        row["change_err"] = np.nan if change is None else change.error
+        rows.append(row)
+
     perturbed = [truth for truth in truths.values() if truth.perturbations]
     for base in dict.fromkeys(truth.base for truth in perturbed):
         skies = {t.name.removeprefix(f"{base}+"): t.name for t in perturbed if t.base == base}
         for name, (kind, band, statistic) in _quantities(bands).items():
-            ids, known = _errors(every[base], kind, band)
-            plain = bootstrap(statistic, known, seed=seed)
-            rows.append((base, NONE, name, plain.n, plain.value, plain.error, np.nan, np.nan))
-            for which, sky in skies.items():
-                own_ids, own = _errors(every[sky], kind, band)
-                _, first, second = np.intersect1d(ids, own_ids, return_indices=True)
-                pair = known[first], own[second]
-                value = bootstrap(statistic, pair[1], seed=seed)
-                change = bootstrap(lambda a, b, of=statistic: of(b) - of(a), *pair, seed=seed)
-                cost = value.n, value.value, value.error, change.value, change.error
-                rows.append((base, which, name, *cost))
-    names = ["truth", "perturbation", "quantity", "n", "value", "value_err", "change", "change_err"]
-    return Table(rows=rows, names=names) if rows else Table(names=names)
+            ids, errors = _errors(tables[base], kind, band)
+            value = bootstrap(statistic, errors, seed=seed)
+            add(base, NONE, name, value)
+            for label, sky in skies.items():
+                ids_perturbed, errors_perturbed = _errors(tables[sky], kind, band)
+                _, first, second = np.intersect1d(ids, ids_perturbed, return_indices=True)
+                before = errors[first]
+                after = errors_perturbed[second]
+                value = bootstrap(statistic, after, seed=seed)
+                change = bootstrap(
+                    lambda a, b, of=statistic: of(b) - of(a), before, after, seed=seed
+                )
+                add(base, label, name, value, change)
+    return Table(rows)

@@ -39,23 +39,28 @@ PRIOR_FLUX = 30 * u.uJy
 
 def point_catalog(exposure, band_flux, prior, *, spacing, seed):
     """
-    Point sources on a grid over the field of an exposure, as `~miricigale.scene.Scene` takes them.
+    Put point sources on a grid over the field of an exposure, as `~miricigale.scene.Scene` takes them.
 
     ``band_flux`` is their flux in its filter, ``prior`` the filter of the high-resolution image and
     ``spacing`` in arcsec; each is moved by a random part of a pixel.
     """
     rng = np.random.default_rng(seed)
     steps = np.arange(-70, 70.1, spacing)
-    x, y = (v.ravel() + rng.uniform(-0.1, 0.1, v.size) for v in np.meshgrid(steps, steps))
-    positions = [
-        tangent_offset(exposure.pointing, dx * u.arcsec, dy * u.arcsec, exposure.pa_aper)
-        for dx, dy in zip(x, y, strict=True)
-    ]
+    x, y = np.meshgrid(steps, steps)
+    x = x.ravel() + rng.uniform(-0.1, 0.1, x.size)
+    y = y.ravel() + rng.uniform(-0.1, 0.1, y.size)
+    positions = []
+    for offset in zip(x * u.arcsec, y * u.arcsec, strict=True):
+        positions.append(tangent_offset(exposure.pointing, *offset, exposure.pa_aper))
     catalog = QTable({"id": np.arange(1, len(positions) + 1), "sky": SkyCoord(positions)})
-    catalog["redshift"], catalog["profile"] = np.nan, "point"
-    catalog["half_light_radius"], catalog["position_angle"] = 0.0 * u.arcsec, 0.0 * u.deg
-    catalog["sersic_index"] = catalog["axis_ratio"] = 1.0
-    catalog[exposure.filter], catalog[prior] = band_flux.to(u.uJy), PRIOR_FLUX
+    catalog["redshift"] = np.nan
+    catalog["profile"] = "point"
+    catalog["half_light_radius"] = 0.0 * u.arcsec
+    catalog["position_angle"] = 0.0 * u.deg
+    catalog["sersic_index"] = 1.0
+    catalog["axis_ratio"] = 1.0
+    catalog[exposure.filter] = band_flux.to(u.uJy)
+    catalog[prior] = PRIOR_FLUX
     return catalog
 
 
@@ -73,7 +78,8 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
 def measure_point_sources(context, name):
     """Simulate, reduce and measure bright point sources in one band, as the study does."""
     config = context.config
-    options, prior = config.point_sources, config.highres.filter
+    options = config.point_sources
+    prior = config.highres.filter
     exposure = band_exposures(config, name)[0]
     flux = options.signal_to_noise * depth.scaled_limit(name, exposure.exposure_time, n_sigma=1.0)
     # random streams other than those of the exposures of the study
@@ -95,18 +101,21 @@ def measure_point_sources(context, name):
     table["flux_true"] = catalog[name]
     index, _ = match_sky(detected["sky"], catalog["sky"], radius=0.3 * u.arcsec)
     measured = result.to_table()
+    matched = index >= 0
     for column in ("flux", error_column("flux")):
-        table[column] = np.where(index >= 0, measured[column][index].value, np.nan) * u.uJy
-    table["flags"] = np.where(index >= 0, np.asarray(measured["flags"])[index], 0)
+        table[column] = np.where(matched, measured[column][index].value, np.nan) * u.uJy
+    table["flags"] = np.where(matched, np.asarray(measured["flags"])[index], 0)
     table["in_field"] = in_field(table["sky"], [mosaic])
     # the two factors of Yang et al. 2021; they are reported and not applied
-    blur, inside = mosaic_psf(config, name, scale), np.asarray(table["in_field"])
-    factors = {"f_aper": photometry.aperture_correction(blur, STAMP_RADIUS)}
+    blur = mosaic_psf(config, name, scale)
+    inside = np.asarray(table["in_field"])
+    table.meta["f_aper"] = photometry.aperture_correction(blur, STAMP_RADIUS)
     if np.any(inside):
-        factors["f_scaling"], factors["f_scaling_err"] = photometry.flux_scaling(
+        factor, error = photometry.flux_scaling(
             mosaic, table["sky"][inside], table["flux_true"][inside], blur
         )
-    table.meta.update(factors)
+        table.meta["f_scaling"] = factor
+        table.meta["f_scaling_err"] = error
     context.save_table(f"points/{name}.ecsv", table)
     if name in end_bands(config.exposures.filters):
         context.save_image(f"points/{name}_mosaic.fits", mosaic)

@@ -42,32 +42,43 @@ SIZE_RANGES = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.8), (0.8, np.inf))
 )
 def measure_rivals(context, name):
     """Measure a band of the reference truth by the other method and as Source Extractor does."""
-    config, of_truth = context.config, context.plan["truth"]
+    config = context.config
+    truth_name = context.plan["truth"]
     radius = config.photometry.match_radius * u.arcsec
-    truth, matched = context.tables(of_truth, ("truth", "matched")).values()
-    own = config.photometry.method
-    other = "package" if own == "yang2021" else "yang2021"
-    mosaic = context.image(f"{of_truth}/mosaic_{name}_fine.fits")
-    measured = mosaic if other == "yang2021" else context.image(f"{of_truth}/mosaic_{name}.fits")
-    forced = measure_band(context, measured, name, other).to_table()
+    truth, matched = context.tables(truth_name, ("truth", "matched")).values()
+    mosaic = context.image(f"{truth_name}/mosaic_{name}_fine.fits")
+    own_method = config.photometry.method
+    if own_method == "yang2021":
+        other_method = "package"
+        forced_mosaic = context.image(f"{truth_name}/mosaic_{name}.fits")
+    else:
+        other_method = "yang2021"
+        forced_mosaic = mosaic
+    forced = measure_band(context, forced_mosaic, name, other_method).to_table()
     # as the paper's, without a map of weights
     blind = photometry.source_extractor_photometry(mosaic, weighted=False)
-    n_blind = np.count_nonzero(in_field(blind["sky"], [mosaic])) if len(blind) else 0
-    table = rival_table(truth, matched, name, own=own, inside=in_field(truth["sky"], [mosaic]))
-    found = {other: (forced, "flux"), "source_extractor": (blind, "flux_best")}
-    for method, (measured, column) in found.items():
+    n_blind = 0
+    if len(blind):
+        n_blind = np.count_nonzero(in_field(blind["sky"], [mosaic]))
+    inside = in_field(truth["sky"], [mosaic])
+    table = rival_table(truth, matched, name, method=own_method, inside=inside)
+    rivals = ((other_method, forced, "flux"), ("source_extractor", blind, "flux_best"))
+    for method, measured, column in rivals:
         rows = QTable({"id": np.arange(len(measured)), "sky": measured["sky"]})
-        rows[name], rows[error_column(name)] = measured[column], measured[error_column(column)]
+        rows[name] = measured[column]
+        rows[error_column(name)] = measured[error_column(column)]
         rows["flags"] = np.zeros(len(rows), int)
-        near = match_truth(truth, rows, [name], radius=radius)
-        table[method], table[error_column(method)] = near[name], near[error_column(name)]
-    table.meta.update(method=own, n_source_extractor=int(n_blind))
+        nearest = match_truth(truth, rows, [name], radius=radius)
+        table[method] = nearest[name]
+        table[error_column(method)] = nearest[error_column(name)]
+    table.meta.update(method=own_method, n_source_extractor=int(n_blind))
+    context.save_table(f"rivals/{name}.ecsv", table)
     context.save_table(f"rivals/{name}.ecsv", table)
 
 
-def rival_table(truth, matched, name, *, own, inside):
+def rival_table(truth, matched, name, *, method, inside):
     """
-    The sources of a truth in a band, with the fluxes of the study's ``own`` method.
+    Return the sources of a truth in a band, with the fluxes of the study's ``method``.
 
     ``shape`` is ``"point"``, ``"n < 2"`` or ``"n >= 2"``, ``half_light_radius`` that of the truth; ``snr`` the
     true flux over the study's formal error; ``field`` marks the sources that were exposed (``inside``) and have
@@ -81,25 +92,30 @@ def rival_table(truth, matched, name, *, own, inside):
     shapes = np.where(index < 2, "n < 2", "n >= 2")
     table["shape"] = np.where(np.asarray(truth["profile"]) == "point", "point", shapes)
     table["half_light_radius"] = truth["half_light_radius"].to(u.arcsec)
-    for column, flag in (("crowded", ConditionFlags.CROWDED), ("edge", ConditionFlags.EDGE)):
-        table[column] = (np.asarray(matched[f"{name}_condition"]) & flag) > 0
+    condition = np.asarray(matched[f"{name}_condition"])
+    table["crowded"] = (condition & ConditionFlags.CROWDED) > 0
+    table["edge"] = (condition & ConditionFlags.EDGE) > 0
     modeled = (np.asarray(matched["selection"]) & SampleFlags.NO_MODEL) == 0
     table["field"] = inside & modeled
-    table[own], table[error_column(own)] = matched[name], formal
+    table[method] = matched[name]
+    table[error_column(method)] = formal
     return table
 
 
 def read_rivals(context):
     """Read the tables of the stage by band; empty where the stage is switched off."""
-    config = context.config
-    return context.tables("rivals", band_names(config) if config.photometry.rivals else ())
+    if not context.config.photometry.rivals:
+        return {}
+    return context.tables("rivals", band_names(context.config))
 
 
 def _groups(table):
-    """Rows of a table of a band by group: kind and name of the group, and which rows."""
+    """Yield kind and name of each group of sources in a table of a band, and which rows these are."""
     usable = np.asarray(table["field"]) & ~np.asarray(table["edge"])
-    snr, crowded = np.asarray(table["snr"], float), np.asarray(table["crowded"])
-    size, shape = table["half_light_radius"].value, np.asarray(table["shape"])
+    snr = np.asarray(table["snr"], float)
+    crowded = np.asarray(table["crowded"])
+    size = table["half_light_radius"].value
+    shape = np.asarray(table["shape"])
     bright = usable & (snr > 5)
     yield "all", "above 5 sigma", bright
     for low, high in SNR_RANGES:
@@ -119,7 +135,7 @@ def _range_name(low, high):
 
 def rival_numbers(tables):
     """
-    Fluxes of each method against the truth, by signal-to-noise, shape and crowding.
+    Compare the fluxes of each method with the truth, by signal-to-noise, shape and crowding.
 
     Parameters
     ----------
@@ -133,32 +149,32 @@ def rival_numbers(tables):
         which ``n`` have a flux; ``median`` and ``scatter`` of measured over true flux minus one, and of
         the differences in units of the error (``pull_median``, ``pull_scatter``).
     """
-    every = vstack(list(tables.values()), metadata_conflicts="silent")
-    found = []
-    for band, table in (*tables.items(), ("all", every)):
+    together = vstack(list(tables.values()), metadata_conflicts="silent")
+    numbers = []
+    for band, table in (tables | {"all": together}).items():
         for kind, group, rows in _groups(table):
             true = table["flux_true"].value[rows]
             for method in RIVALS:
-                flux, error = (table[name].value[rows] for name in (method, error_column(method)))
+                flux = table[method].value[rows]
+                error = table[error_column(method)].value[rows]
                 ratio = recovery_metrics(true, flux, relative=True)
                 with np.errstate(invalid="ignore", divide="ignore"):
                     pulls = recovery_metrics(np.zeros(true.size), (flux - true) / error)
-                found.append(
-                    {
-                        "band": band,
-                        "kind": kind,
-                        "group": group,
-                        "method": method,
-                        "n_group": true.size,
-                        "n": ratio.n,
-                        "median": ratio.median,
-                        "median_err": ratio.median_err,
-                        "scatter": ratio.sigma_mad,
-                        "pull_median": pulls.median,
-                        "pull_scatter": pulls.sigma_mad,
-                    }
-                )
-    return described_rows(found, texts_of("rivals")["numbers"])
+                row = {
+                    "band": band,
+                    "kind": kind,
+                    "group": group,
+                    "method": method,
+                    "n_group": true.size,
+                    "n": ratio.n,
+                    "median": ratio.median,
+                    "median_err": ratio.median_err,
+                    "scatter": ratio.sigma_mad,
+                    "pull_median": pulls.median,
+                    "pull_scatter": pulls.sigma_mad,
+                }
+                numbers.append(row)
+    return described_rows(numbers, texts_of("rivals")["numbers"])
 
 
 def rival_counts(table):
@@ -171,7 +187,8 @@ def rival_counts(table):
     field = np.asarray(table["field"])
     forced = field & np.isfinite(table[table.meta["method"]].value)
     blind = np.isfinite(table["source_extractor"].value)
-    matched, missed = (int(np.count_nonzero(of)) for of in (field & blind, forced & ~blind))
+    matched = int(np.count_nonzero(field & blind))
+    missed = int(np.count_nonzero(forced & ~blind))
     return {
         "detected": Estimate.of_count(int(table.meta["n_source_extractor"])),
         "matched": Estimate.of_count(matched),
@@ -180,8 +197,9 @@ def rival_counts(table):
 
 
 def blind_offset(table, seed):
-    """Source Extractor minus template fit (mag) of sources above 5 sigma: an `Estimate`."""
-    blind, forced = table["source_extractor"].value, table["yang2021"].value
+    """Estimate Source Extractor minus template fit (mag) of sources above 5 sigma: an `Estimate`."""
+    blind = table["source_extractor"].value
+    forced = table["yang2021"].value
     good = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
     good &= (blind > 0) & (forced > 0)
     delta = -2.5 * np.log10(blind[good] / forced[good])
@@ -190,7 +208,7 @@ def blind_offset(table, seed):
 
 def source_extractor_numbers(tables, seed):
     """
-    Numbers of the comparison of Yang et al. 2021 with Source Extractor, in F1500W.
+    Estimate the numbers of the comparison of Yang et al. 2021 with Source Extractor, in F1500W.
 
     Parameters
     ----------
@@ -208,11 +226,13 @@ def source_extractor_numbers(tables, seed):
     if SE_BAND not in tables:
         return {}
     table = tables[SE_BAND]
-    numbers = rival_counts(table) | {"offset": blind_offset(table, seed)}
+    numbers = {f"source_extractor.{key}": number for key, number in rival_counts(table).items()}
+    numbers["source_extractor.offset"] = blind_offset(table, seed)
     # errors of white noise in the paper's steps, as T-PHOT has them
-    flux, error = (table[name].value for name in ("yang2021", error_column("yang2021")))
+    flux = table["yang2021"].value
+    error = table[error_column("yang2021")].value
     bright = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
     pulls = np.abs((flux - table["flux_true"].value) / error)[bright]
     white = bootstrap(lambda values: np.percentile(values, 99, axis=-1), pulls, seed=seed)
-    numbers = {f"source_extractor.{name}": number for name, number in numbers.items()}
-    return numbers | {"errors.white": white}
+    numbers["errors.white"] = white
+    return numbers

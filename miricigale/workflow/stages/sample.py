@@ -40,19 +40,19 @@ _COMPARE = {"<=": le, ">=": ge, "<": lt, ">": gt, "=": eq}
 
 
 def values_at(sky, wcs, plane):
-    """Values of a plane with a WCS at the pixels of positions, shape (n,); 0 outside of it."""
+    """Return values of a plane with a WCS at the pixels of positions, shape (n,); 0 outside of it."""
     return nearest_values(plane, np.stack(wcs.world_to_pixel(sky), axis=-1))[0]
 
 
 def in_field(sky, images):
-    """Whether positions, shape (n,), fall on a usable pixel of every image (with WCS and mask)."""
-    usable = ((image.wcs, ~np.asarray(image.mask, bool)) for image in images)
-    return np.all([values_at(sky, *pair) for pair in usable], axis=0)
+    """Tell whether positions, shape (n,), fall on a usable pixel of every image (with WCS and mask)."""
+    usable = [values_at(sky, image.wcs, ~np.asarray(image.mask, bool)) for image in images]
+    return np.all(usable, axis=0)
 
 
 def mean_coverage(sky, image, n_images):
     """
-    Number of exposures about each position, shape (n,), of the image (with WCS) that they were drizzled to.
+    Return the number of exposures about each position, shape (n,), of the image that they were drizzled to.
 
     It is the mean of the plane ``n_images`` over 1 arcsec, for bad pixels and cosmic rays leave
     single pixels with fewer; 0 off the image.
@@ -64,67 +64,73 @@ def mean_coverage(sky, image, n_images):
 
 def matched_errors(matched, inside, bands, *, noise=None, **options):
     """
-    Error functions (`~miricigale.photometry.ErrorModel`) of bands, of matched sources.
+    Measure error functions (`~miricigale.photometry.ErrorModel`) of bands, of matched sources.
 
     ``matched`` is of `~miricigale.evaluation.match_truth`; ``inside`` says which rows are in the field,
     and ``noise`` is that of `~miricigale.photometry.ErrorModel.from_tables` for all rows, which has the
     ``options`` ``statistic`` and ``bin_size`` too.
     """
-    truth = QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})
-    own = None if noise is None else {name: values[inside] for name, values in noise.items()}
-    pair = truth[inside], matched[inside]
-    return ErrorModel.from_tables(*pair, filters=bands, noise=own, **options)
+    truth = QTable({"id": matched["id"]})
+    for name in bands:
+        truth[name] = matched[f"{name}_true"]
+    if noise is not None:
+        noise = {name: values[inside] for name, values in noise.items()}
+    return ErrorModel.from_tables(
+        truth[inside], matched[inside], filters=bands, noise=noise, **options
+    )
 
 
-def footprint_area(images, among=True):
-    """Solid angle of the pixels that are usable in every image on one grid: the field of `in_field`."""
+def footprint_area(images, within=True):
+    """Return the solid angle of the pixels that are usable in every image on one grid, as for `in_field`."""
     images = list(images)
-    if len({image.shape for image in images}) != 1:
-        raise argument_error("images", "on one grid", [image.shape for image in images])
-    usable = ~np.any([image.mask for image in images], axis=0) & among
+    shapes = [image.shape for image in images]
+    if len(set(shapes)) != 1:
+        raise argument_error("images", "on one grid", shapes)
+    usable = ~np.any([image.mask for image in images], axis=0) & within
     pixel = proj_plane_pixel_area(images[0].wcs) * u.deg**2
     return (np.count_nonzero(usable) * pixel).to(u.arcmin**2)
 
 
 def detected_bands(table, bands):
-    """Number of bands in which each source is above five times its error."""
+    """Count the bands in which each source is above five times its error."""
     return sum((table[name] > 5 * table[error_column(name)]).astype(int) for name in bands)
 
 
 def good_redshifts(catalog, rules):
     """
-    Which rows of a catalog fulfill all rules such as ``"redshift_source=spec"`` or ``"q_z<=3"``, shape (n,).
+    Tell which rows of a catalog fulfill all rules such as ``"redshift_source=spec"`` or ``"q_z<=3"``, shape (n,).
 
     A value that is missing fulfills none; a `ConfigError` where there is no such column or number.
     """
     good = np.ones(len(catalog), bool)
+    wanted = "must be as 'column=value', '<=', '<', '>=' or '>', of a column of the catalog"
     for rule in rules:
-        parts = re.split(r"\s*(<=|>=|<|>|=)\s*", rule.strip(), maxsplit=1)
-        column, sign, wanted = parts if len(parts) == 3 else (*parts, "", "")
-        known = wanted and column in catalog.colnames
-        text = "must be as 'column=value', '<=', '<', '>=' or '>', of a column of the catalog"
-        require(known, "fit", "redshift_quality", text, f"{rule!r}; {catalog.colnames}")
+        column, *rest = re.split(r"\s*(<=|>=|<|>|=)\s*", rule.strip(), maxsplit=1)
+        sign, limit = rest or ("", "")
+        usable = limit and column in catalog.colnames
+        require(usable, "fit", "redshift_quality", wanted, f"{rule!r}; {catalog.colnames}")
         values = np.ma.asarray(getattr(catalog[column], "value", catalog[column]))
-        kind = str if sign == "=" and values.dtype.kind not in "iuf" else float
+        is_text = sign == "=" and values.dtype.kind not in "iuf"
+        kind = str if is_text else float
         with of_option(f"[fit] redshift_quality, {rule!r}:", ValueError):
             values = np.ma.filled(values.astype(kind), kind("nan"))
-            good &= _COMPARE[sign](values, kind(wanted))
+            good &= _COMPARE[sign](values, kind(limit))
     return good
 
 
 def cut_flags(options, catalog, truth, chi2):
     """
-    `SampleFlags` of the galaxies that the cuts of the section ``fit`` (``options``) leave out, shape (n,).
+    Return `SampleFlags` of the galaxies that the cuts of the section ``fit`` (``options``) leave out, shape (n,).
 
     ``catalog`` and ``truth`` have the same sources row by row, and ``chi2`` is that of their input fits.
     """
-    out = (
-        truth["redshift"] < options.min_redshift,
-        truth["stellar_mass"] < options.min_mass * u.Msun,
-        (chi2 > options.max_chi2) & (options.max_chi2 > 0),
-        ~good_redshifts(catalog, options.redshift_quality),
-    )
-    flags = sum(SampleFlags[k.upper()] * np.asarray(o) for k, o in zip(CUTS, out, strict=True))
+    cuts = {
+        SampleFlags.MIN_REDSHIFT: truth["redshift"] < options.min_redshift,
+        SampleFlags.MIN_MASS: truth["stellar_mass"] < options.min_mass * u.Msun,
+        SampleFlags.MAX_CHI2: (chi2 > options.max_chi2) & (options.max_chi2 > 0),
+        SampleFlags.REDSHIFT_QUALITY: ~good_redshifts(catalog, options.redshift_quality),
+    }
+    flags = sum(flag * np.asarray(rows) for flag, rows in cuts.items())
     return np.where(np.asarray(truth["star"], bool), 0, flags)
 
 
@@ -138,11 +144,12 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts, cut
     """
     flags = np.zeros(len(matched), int) + cuts
     matched["n_detected"] = detected_bands(matched, bands)
-    known = np.all([np.isfinite(matched[f"{name}_true"].value) for name in bands], axis=0)
-    redshift, star = np.asarray(truth["redshift"], float), np.asarray(truth["star"], bool)
+    has_model = np.all([np.isfinite(matched[f"{name}_true"].value) for name in bands], axis=0)
+    redshift = np.asarray(truth["redshift"], float)
+    star = np.asarray(truth["star"], bool)
     flags[~np.asarray(inside)] |= SampleFlags.OUTSIDE_FIELD
     flags[star] |= SampleFlags.STAR
-    flags[~known] |= SampleFlags.NO_MODEL
+    flags[~has_model] |= SampleFlags.NO_MODEL
     flags[~matched["matched"]] |= SampleFlags.NOT_MATCHED
     flags[matched["n_detected"] < min_detected] |= SampleFlags.FEW_BANDS
     outside = (redshift < redshifts[0]) | (redshift > redshifts[-1])
@@ -153,14 +160,14 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts, cut
 
 def typical_source(sample, fitted, band):
     """
-    Id of a source to be shown: a bright one among those nearest to redshift 1.2.
+    Return the id of a source to be shown: a bright one among those nearest to redshift 1.2.
 
     ``fitted`` says which rows of ``sample`` have a fit; None without any.
     """
     sample = sample[np.asarray(fitted, bool)]
     if len(sample) == 0:
         return None
-    near = np.abs(np.asarray(sample["redshift"]) - 1.2)
-    chosen = sample[np.argsort(near, kind="stable")[: max(1, len(sample) // 5)]]
+    distance = np.abs(np.asarray(sample["redshift"]) - 1.2)
+    chosen = sample[np.argsort(distance, kind="stable")[: max(1, len(sample) // 5)]]
     order = np.argsort(chosen[band].value, kind="stable")
     return chosen["id"][order[int(0.7 * (len(chosen) - 1))]]

@@ -40,8 +40,10 @@ from miricigale.workflow.truths import CATALOG, CUTOUTS, FIELD, study_truths, tr
 #: What the models of the galaxies depend on beside their fits.
 MODELS = ("sed.alpha", "sed.alpha_draw", "sed.infrared", "sed.max_wavelength", "sed.catalog_error")
 GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
-#: Inclinations (deg) of AGN seen through the torus, after Yang et al. 2021, and of the others.
-EDGE_ON, FACE_ON = (60.0, 70.0, 80.0, 90.0), (0.0, 10.0, 20.0, 30.0, 40.0)
+#: Inclinations (deg) of AGN seen through the torus, after Yang et al. 2021.
+EDGE_ON = (60.0, 70.0, 80.0, 90.0)
+#: Inclinations (deg) of the other AGN.
+FACE_ON = (0.0, 10.0, 20.0, 30.0, 40.0)
 #: Parameters of the injected tori, in the order of their draws: values (a list) or a uniform range (a tuple).
 TORUS = {
     "tau97": [3.0, 5.0, 7.0, 9.0, 11.0],
@@ -56,7 +58,7 @@ TORUS = {
 
 def galaxy_parameters(config, catalog, best, *, seed):
     """
-    Parameters of the galaxies: best fits, scaled to the measured flux in the prior's band.
+    Return the parameters of the galaxies: best fits, scaled to the measured flux in the prior's band.
 
     ``best`` is the table of the fits of the input SEDs, row by row; ``config`` has
     ``sed.alpha``, ``sed.infrared`` and ``highres.filter``. ``prior_ratio`` is the factor of the scaling, NaN
@@ -67,38 +69,50 @@ def galaxy_parameters(config, catalog, best, *, seed):
     for name in (*GALAXY_PARAMETERS, "mass"):
         if f"{name}_best" in best.colnames:
             table[name] = best[f"{name}_best"]
+    # sources of which a band of the fit shows the dust
     shown = np.zeros(len(table), bool)
     if "alpha" in table.colnames:
         shown = shows_dust(catalog, config.sed)
     if not shown.all():
-        # the bands of the fit do not show it
-        values = low, high = config.sed.alpha
-        if config.sed.alpha_draw == "nodes":
-            nodes = sed.SEDModel.yang2021_axes("fit")["alpha"]
-            values = list(nodes[(nodes >= low) & (nodes <= high)])
-            wanted = "must hold a node of the fit's grid with alpha_draw = 'nodes'"
-            require(values, "sed", "alpha", wanted, [low, high])
-        streams = (stream(seed, "truth", "alpha", str(key)) for key in table["id"])
-        drawn = np.array([_draw(rng, values) for rng in streams], float)
+        drawn = _drawn_alpha(config.sed, table["id"], seed)
         table["alpha"] = np.where(shown, table["alpha"], drawn) if shown.any() else drawn
-    model, prior = sed.SEDModel.yang2021(agn=False), config.highres.filter
+    model = sed.SEDModel.yang2021(agn=False)
+    prior = config.highres.filter
     if prior in catalog.colnames:
-        fitted, measured = model.fluxes(table, [prior])[prior], catalog[prior]
+        fitted = model.fluxes(table, [prior])[prior]
+        measured = catalog[prior]
         usable = np.isfinite(fitted) & (fitted > 0) & np.isfinite(measured) & (measured > 0)
-        ratio = np.where(usable, (measured / np.where(usable, fitted, 1 * fitted.unit)).value, 1.0)
-        table["mass"] = table["mass"] * ratio
+        ratio = (measured / np.where(usable, fitted, 1 * fitted.unit)).value
+        table["mass"] = table["mass"] * np.where(usable, ratio, 1.0)
         table["prior_ratio"] = np.where(usable, ratio, np.nan)
     if config.sed.infrared != "fit":
-        light, kind = model.fluxes(table, [prior]), model.component("dust").name
-        light["redshift"] = table["redshift"]
-        if config.sed.infrared == "ceers":
-            excess = np.where(shown, 1.0, ceers_dust(light, kind, seed=seed)["dust_excess"])
-            if "pah_33" in model.parameters:
-                table["pah_33"] = np.where(shown, 1.0, CEERS_DUST[kind][6])
-        else:
-            excess = main_sequence_dust(light, seed=seed)["dust_excess"]
-        table["dust_excess"] = excess
+        _add_dust_excess(table, config.sed.infrared, model, prior, shown=shown, seed=seed)
     return table
+
+
+def _drawn_alpha(options, ids, seed):
+    """Draw the dust's alpha of sources from the range that the section ``sed`` (``options``) has."""
+    low, high = options.alpha
+    values = (low, high)
+    if options.alpha_draw == "nodes":
+        nodes = sed.SEDModel.yang2021_axes("fit")["alpha"]
+        values = list(nodes[(nodes >= low) & (nodes <= high)])
+        wanted = "must hold a node of the fit's grid with alpha_draw = 'nodes'"
+        require(values, "sed", "alpha", wanted, [low, high])
+    return np.array([_draw(stream(seed, "truth", "alpha", str(key)), values) for key in ids], float)
+
+
+def _add_dust_excess(table, infrared, model, prior, *, shown, seed):
+    """Add ``dust_excess``, and the strength of PAH, where no band of the fit shows the dust."""
+    light = model.fluxes(table, [prior])
+    light["redshift"] = table["redshift"]
+    if infrared == "main-sequence":
+        table["dust_excess"] = main_sequence_dust(light, seed=seed)["dust_excess"]
+        return
+    kind = model.component("dust").name
+    if "pah_33" in model.parameters:
+        table["pah_33"] = np.where(shown, 1.0, CEERS_DUST[kind][6])
+    table["dust_excess"] = np.where(shown, 1.0, ceers_dust(light, kind, seed=seed)["dust_excess"])
 
 
 def add_agn(table, frac_agn, seed):
@@ -112,18 +126,19 @@ def add_agn(table, frac_agn, seed):
     table["frac_agn"] = np.broadcast_to(np.asarray(frac_agn, float), len(table)).copy()
     streams = [stream(seed, "truth", str(key)) for key in table["id"]]
     for name, values in TORUS.items():
-        table[name] = np.array([_draw(one, values) for one in streams], dtype=float)
+        table[name] = np.array([_draw(rng, values) for rng in streams], dtype=float)
 
 
 def _draw(rng, values):
+    """Draw out of a list of values, or from a uniform range (a tuple)."""
     return rng.uniform(*values) if isinstance(values, tuple) else rng.choice(values)
 
 
 def catalog_fractions(catalog):
-    """The column ``frac_agn`` of a catalog, or a `ConfigError` that says what is wrong with it."""
-    known = "frac_agn" in catalog.colnames
+    """Return the column ``frac_agn`` of a catalog, or a `ConfigError` that says what is wrong with it."""
+    has_column = "frac_agn" in catalog.colnames
     wanted = "'catalog' needs a column frac_agn in the catalog"
-    require(known, "sed", "frac_agn", wanted, catalog.colnames)
+    require(has_column, "sed", "frac_agn", wanted, catalog.colnames)
     values = np.asarray(catalog["frac_agn"], float)
     bad = values[~((values >= 0) & (values <= 0.99))]
     wanted = "'catalog' needs a column frac_agn of values between 0 and 0.99"
@@ -153,34 +168,40 @@ def add_field_agn(table, model, band, seed):
         table[name] = drawn[name]
 
 
-def other_skies(galaxies, model, band, n_skies, *, least, seed, whole=0):
+def other_skies(galaxies, model, band, n_skies, *, min_frac_agn, seed, n_complete=0):
     """
-    AGN from a fracAGN of ``least`` on that galaxies have in other skies, as by `add_field_agn`.
+    Draw AGN from a fracAGN of ``min_frac_agn`` on that galaxies have in other skies, as by `add_field_agn`.
 
-    Of the first ``whole`` skies all galaxies are kept, with the AGN that they have or none. ``galaxies`` has the
-    parameters of ``model``. Returns the table, with ``sky`` from 1 on and ids of its own, and the row of the
+    Of the first ``n_complete`` skies all galaxies are kept, with the AGN that they have or none. ``galaxies`` has
+    the parameters of ``model``. Returns the table, with ``sky`` from 1 on and ids of its own, and the row of the
     galaxy of each.
     """
-    n, ids = len(galaxies), galaxies["id"]
-    rows = np.arange(n * n_skies) % n
-    others = galaxies[rows]
-    others["sky"] = 1 + np.arange(n * n_skies) // n
-    keys = [f"{key}-{sky}" for key, sky in zip(others["id"], others["sky"], strict=True)]
-    numbers = np.asarray(ids).dtype.kind in "iu"
-    others["id"] = np.max(ids) + 1 + np.arange(n * n_skies) if numbers else keys
-    light = QTable(others["id", "redshift"])
+    n = len(galaxies)
+    ids = galaxies["id"]
+    numbers = np.arange(n * n_skies)
+    rows = numbers % n
+    skies = galaxies[rows]
+    skies["sky"] = 1 + numbers // n
+    if np.asarray(ids).dtype.kind in "iu":
+        skies["id"] = np.max(ids) + 1 + numbers
+    else:
+        pairs = zip(skies["id"], skies["sky"], strict=True)
+        skies["id"] = [f"{key}-{sky}" for key, sky in pairs]
+    light = QTable(skies["id", "redshift"])
     light["stellar_mass"] = model.fluxes(galaxies, [band])["stellar_mass"][rows]
     # each id has draws of its own, so that these are the AGN that are added
-    keep = AGNPopulation().draw(light, seed=seed)["has_agn"] | (others["sky"] <= whole)
-    others, rows = others[keep], rows[keep]
-    if len(others):
-        add_field_agn(others, model, band, seed)
-    keep = (others["frac_agn"] >= least) | (others["sky"] <= whole)
-    return others[keep], rows[keep]
+    has_agn = AGNPopulation().draw(light, seed=seed)["has_agn"]
+    keep = has_agn | (skies["sky"] <= n_complete)
+    skies = skies[keep]
+    rows = rows[keep]
+    if len(skies):
+        add_field_agn(skies, model, band, seed)
+    keep = (skies["frac_agn"] >= min_frac_agn) | (skies["sky"] <= n_complete)
+    return skies[keep], rows[keep]
 
 
 def library_fluxes(model, parameters, bands):
-    """Fluxes of models; a `DataError` if the registered libraries lack parameters of some."""
+    """Return fluxes of models; a `DataError` if the registered libraries lack parameters of some."""
     light = model.fluxes(parameters, bands)
     lacking = np.count_nonzero(light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY))
     if lacking:
@@ -193,13 +214,15 @@ def library_fluxes(model, parameters, bands):
 
 
 def _truth_plan(config, unit):
-    """The truth; libraries of its models where they are others than those of the fits; content of its files."""
+    """Return the truth; libraries of its models where they differ from those of the fits; content of its files."""
     values = study_truths(config)[unit].values()
     effects = values.get("perturbations", {})
     if CUTOUTS in effects:
-        files = effects[CUTOUTS]
-        paths = [file_place(files[key])[0] for key in ("image", "psf") if files[key]]
-        values["files"] = [file_sha256(Path(path).expanduser()) for path in paths]
+        values["files"] = []
+        for key in ("image", "psf"):
+            if name := effects[CUTOUTS][key]:
+                path = Path(file_place(name)[0]).expanduser()
+                values["files"].append(file_sha256(path))
     if model := perturbed_model(effects, agn=values["frac_agn"] != 0):
         values["libraries"] = {name: fingerprint(name) for name in model.resources}
     return values
@@ -219,7 +242,8 @@ def _truth_plan(config, unit):
 )
 def make_truth(context, name):
     """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
-    config, frac_agn = context.config, context.plan["frac_agn"]
+    config = context.config
+    frac_agn = context.plan["frac_agn"]
     effects = context.plan.get("perturbations", {})
     catalog = context.table("catalog.ecsv")
     best = FitPieces(context, "input_seds", len(catalog)).to_table()
@@ -233,10 +257,10 @@ def make_truth(context, name):
     elif model.has_agn:
         shares = catalog_fractions(catalog) if frac_agn == CATALOG else frac_agn
         add_agn(parameters, shares, context.seed)
-    if other := perturbed_model(effects, agn=model.has_agn):
-        models = model, other
+    if perturbed := perturbed_model(effects, agn=model.has_agn):
+        models = (model, perturbed)
         parameters = perturbed_parameters(effects, parameters, models, prior, seed=context.seed)
-        model = other
+        model = perturbed
     light = library_fluxes(model, parameters, bands)
     light.rename_column("flags", "sed_flags")
     star = np.asarray(catalog["star"], bool)
@@ -244,14 +268,17 @@ def make_truth(context, name):
         stars = star_fluxes(catalog[star], catalog_bands(catalog), bands)
         for band in bands:
             light[band][star] = stars[band]
-    for band in (name for name, limit in existing.items() if limit is None):
-        error = measured_error(catalog, band, config.sed.catalog_error)
-        light[error_column(band)] = np.where(np.isfinite(catalog[band]), error, np.nan * error.unit)
+    for band, depth in existing.items():
+        if depth is None:
+            error = measured_error(catalog, band, config.sed.catalog_error)
+            has_flux = np.isfinite(catalog[band])
+            light[error_column(band)] = np.where(has_flux, error, np.nan * error.unit)
     # what a column frac_agn of the catalog says is of the truth of that name only
-    own = {"frac_agn", *light.colnames, *parameters.colnames}
-    known = catalog[[c for c in catalog.colnames if c not in own and "." not in c]]
-    light = light[[c for c in light.colnames if c not in parameters.colnames]]
-    truth = hstack([parameters, known, light], metadata_conflicts="silent")
+    computed = {"frac_agn", *light.colnames, *parameters.colnames}
+    facts = [c for c in catalog.colnames if c not in computed and "." not in c]
+    columns = [c for c in light.colnames if c not in parameters.colnames]
+    tables = [parameters, catalog[facts], light[columns]]
+    truth = hstack(tables, metadata_conflicts="silent")
     if "point_agn" in effects:
         for column, share in point_columns(model, parameters, config.exposures.filters).items():
             # the light of a star is not that of the model

@@ -5,13 +5,13 @@ import numpy as np
 from astropy.stats import biweight_scale
 
 from miricigale import psf, scene
-from miricigale.evaluation import PUBLISHED, Estimate, match_truth
+from miricigale.evaluation import Estimate, match_truth
 from miricigale.photometry.errors.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import changed_config
 from miricigale.workflow.engine.stage import stage
-from miricigale.workflow.labels import band_label, texts_of
+from miricigale.workflow.labels import texts_of
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,
@@ -32,10 +32,9 @@ from miricigale.workflow.truths import reference, variant_changes
 
 #: Draws of the sources for the errors of limits.
 N_DRAWS = 100
-#: What images are called: where the key is on, and where it is off.
-_LABELS = texts_of("variants")["labels"]
-STUDY, RATES = "study", "rates"
-_OUT = SampleFlags.OUTSIDE_FIELD | NOT_COUNTED
+#: Names of the study's images, and of the same by rates, with the variants.
+STUDY = "study"
+RATES = "rates"
 
 
 @stage(
@@ -55,29 +54,43 @@ _OUT = SampleFlags.OUTSIDE_FIELD | NOT_COUNTED
 )
 def measure_variants(context, band):
     """Expose, reduce and measure a band of the reference truth with one setting changed at a time."""
-    config, plan = context.config, context.plan
+    config = context.config
+    plan = context.plan
     truth = context.table(f"{plan['truth']}/truth.ecsv")
     exposures = band_exposures(config, band)
     # the sources on the sky are the same in all of them
-    options = {"filter": band, "psf": psf.miri_psf(band), "n_threads": context.n_threads}
-    lights = [scene.Scene(truth, wcs=e.wcs, **options).render() for e in exposures]
+    blur = psf.miri_psf(band)
+    lights = []
+    for exposure in exposures:
+        sky = scene.Scene(
+            truth, wcs=exposure.wcs, filter=band, psf=blur, n_threads=context.n_threads
+        )
+        lights.append(sky.render())
     suffix, _ = measured_mosaic(config)
-    common = {"seed": context.seed, "n_threads": context.n_threads}
+    radius = config.photometry.match_radius * u.arcsec
     for name, changes in plan["changes"].items():
         # all by rates, also where the study simulates ramps
-        changes = {**changes, "exposures": {"kind": "rates"}}
-        own = changed_config(config, (*IMAGES, "highres"), changes)
+        changes = changes | {"exposures": {"kind": "rates"}}
+        changed = changed_config(config, (*IMAGES, "highres"), changes)
         images = []
         for exposure, light in zip(exposures, lights, strict=True):
             image = light.copy()
-            image.data += background_of(own, exposure).image(exposure.wcs, exposure.shape)
-            images.append(expose_image(own, imager_of(own), image, exposure, **common)[1])
-        mosaic = next(one for label, one, _ in mosaics_of(own, images) if label == suffix)
+            image.data += background_of(changed, exposure).image(exposure.wcs, exposure.shape)
+            _, cal = expose_image(
+                changed,
+                imager_of(changed),
+                image,
+                exposure,
+                seed=context.seed,
+                n_threads=context.n_threads,
+            )
+            images.append(cal)
+        mosaics = mosaics_of(changed, images)
+        mosaic = next(mosaic for label, mosaic, _ in mosaics if label == suffix)
         result = measure_band(context, mosaic, band, config.photometry.method).to_table()
-        radius = config.photometry.match_radius * u.arcsec
         matched = match_truth(truth, joined_photometry({band: result}), [band], radius=radius)
-        kept = ["id", f"{band}_true", band, error_column(band), f"{band}_flags"]
-        context.save_table(f"variants/{name}/{band}.ecsv", matched[kept])
+        columns = ["id", f"{band}_true", band, error_column(band), f"{band}_flags"]
+        context.save_table(f"variants/{name}/{band}.ecsv", matched[columns])
 
 
 def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_size=30):
@@ -108,40 +121,49 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
         in changes.
     """
     selection = np.asarray(matched["selection"])
-    inside, field = (selection & SampleFlags.OUTSIDE_FIELD) == 0, (selection & _OUT) == 0
+    inside = (selection & SampleFlags.OUTSIDE_FIELD) == 0
+    field = (selection & (SampleFlags.OUTSIDE_FIELD | NOT_COUNTED)) == 0
     rows = []
     for band, limit in calculator.items():
         true = matched[f"{band}_true"].value
         fluxes = {STUDY: matched[band].value}
-        fluxes |= {name: one[band][band].value for name, one in tables.items()}
-        good = inside & np.all([np.isfinite(v) for v in (true, *fluxes.values())], axis=0)
+        for name, variant in tables.items():
+            fluxes[name] = variant[band][band].value
+        good = inside & np.all(np.isfinite([true, *fluxes.values()]), axis=0)
         bright = field & (true > 10 ** (-0.4 * (limit - 23.9)))
         faint = good & ~bright
         rng = stream(seed, "variants", band)
         # the whole sample, then its draws
         samples = [np.flatnonzero(good)]
         samples += [rng.choice(samples[0], size=good.sum()) for _ in range(N_DRAWS)]
-        found = {}
+        # limit and scatter of each sample, by images
+        measures = {}
         for name, flux in fluxes.items():
-            curves = [measured_curve(band, true[k], flux[k], bin_size, statistic) for k in samples]
-            off = ((flux - true)[k][faint[k]] for k in samples)
-            found[name] = np.array([_measures(*pair) for pair in zip(curves, off, strict=True)])
+            measures[name] = np.empty((len(samples), 2))
+            for k, sample in enumerate(samples):
+                curve = measured_curve(band, true[sample], flux[sample], bin_size, statistic)
+                off = (flux - true)[sample]
+                measures[name][k] = _measures(curve, off[faint[sample]])
+                if k == 0:
+                    with np.errstate(divide="ignore", invalid="ignore"):
+                        detected = flux > 5 * curve.sigma(flux)
             # the images of the study, by rates too
-            other = RATES if RATES in tables and name not in (STUDY, RATES) else STUDY
+            reference_name = STUDY
+            if RATES in tables and name not in (STUDY, RATES):
+                reference_name = RATES
             with np.errstate(divide="ignore", invalid="ignore"):
-                change = found[name] - found[other]
-                change[:, 1] /= found[other][:, 1]
-                seen = flux > 5 * curves[0].sigma(flux)
-            if name == other:
+                change = measures[name] - measures[reference_name]
+                change[:, 1] /= measures[reference_name][:, 1]
+            if name == reference_name:
                 change[:] = np.nan
             row = {"band": band, "images": name, "n": len(samples[0]), "calculator": limit}
             for k, measure in enumerate(("limit", "scatter")):
-                row[measure] = found[name][0, k]
-                row[f"{measure}_err"] = _half_width(found[name][1:, k])
+                row[measure] = measures[name][0, k]
+                row[f"{measure}_err"] = _half_width(measures[name][1:, k])
                 row[f"{measure}_change"] = change[0, k]
                 row[f"{measure}_change_err"] = _half_width(change[1:, k])
-            complete = Estimate.of_fraction(np.count_nonzero(seen & bright), bright.sum())
-            row["detected"] = int(np.count_nonzero(seen & field))
+            complete = Estimate.of_fraction(np.count_nonzero(detected & bright), bright.sum())
+            row["detected"] = int(np.count_nonzero(detected & field))
             row["completeness"] = complete.value
             row["completeness_err"] = complete.error
             rows.append(row)
@@ -149,47 +171,15 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
 
 
 def _measures(curve, faint):
-    """The 5-sigma limit of a curve of errors in AB magnitudes, and the scatter of faint sources."""
+    """Return the 5-sigma limit of a curve of errors in AB magnitudes, and the scatter of faint sources."""
     limit = float((limiting_flux(curve, 5.0) * u.uJy).to_value(u.ABmag))
     return limit, biweight_scale(faint) if faint.size else np.nan
 
 
 def _half_width(draws):
-    """Half of the central 68 % of draws; NaN where there are none that are finite."""
+    """Return half of the central 68 % of draws; NaN where there are none that are finite."""
     draws = draws[np.isfinite(draws)]
-    return float(np.diff(np.percentile(draws, [15.865, 84.135]))[0] / 2) if draws.size else np.nan
-
-
-def variant_label(name, changes):
-    """Return the name of images on the page."""
-    if name == STUDY:
-        return "of the study"
-    if name == RATES:
-        return "the same, by rates"
-    (values,) = changes[name].values()
-    (value,) = values.values()
-    return _LABELS[name][0 if value else 1]
-
-
-def variant_entries(table, changes):
-    """
-    Rows of the table of the page.
-
-    ``table`` is of `variant_numbers`, ``changes`` of `~miricigale.workflow.truths.variant_changes`.
-    """
-    rows = []
-    for row in table:
-        labels = {"band": band_label(row["band"]), "images": variant_label(row["images"], changes)}
-        rows.append(dict(row) | labels | {"offset": row["limit"] - row["calculator"]})
-    return rows
-
-
-def measured_reasons(table, config):
-    """Reasons by key of `~miricigale.evaluation.PUBLISHED`: of limits with what the variants change of them."""
-    changes, reasons = variant_changes(config), {one.key: one.why for one in PUBLISHED}
-    for row in () if table is None else table:
-        key = f"limit.{row['band'].removeprefix('miri.')}"
-        if key in reasons and row["images"] in _LABELS and np.isfinite(row["limit_change"]):
-            cost = f"{variant_label(row['images'], changes)} {row['limit_change']:+.2f} mag"
-            reasons[key] = "; ".join(part for part in (reasons[key], cost) if part)
-    return reasons
+    if draws.size == 0:
+        return np.nan
+    low, high = np.percentile(draws, [15.865, 84.135])
+    return float((high - low) / 2)
