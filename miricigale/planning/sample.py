@@ -126,16 +126,20 @@ def make_sample(config, bands, *, executor=None):
     if agn == "field":
         add_field_agn(sources, model, next(iter(bands)), seed)
         n_skies += _DRAWS // len(sources)
-        options = {"least": config.agn.limit, "seed": seed}
-        sky_rows, _ = other_skies(sources, model, next(iter(bands)), n_skies - 1, **options)
+        sky_rows, _ = other_skies(
+            sources,
+            model,
+            next(iter(bands)),
+            n_skies - 1,
+            min_frac_agn=config.agn.limit,
+            seed=seed,
+        )
         sources = vstack([sources, sky_rows], metadata_conflicts="silent")
     else:
         add_agn(sources, 0.0, seed)
-        mixed = fractions is None
-        if mixed:
-            sources["frac_agn"] = agn_mix(config.agn, len(sources), rng)
-        else:
-            sources["frac_agn"] = fractions
+        if fractions is None:
+            fractions = agn_mix(config.agn, len(sources), rng)
+        sources["frac_agn"] = fractions
     light = library_fluxes(model, sources, list(bands))
     for name in bands:
         sources[name] = light[name]
