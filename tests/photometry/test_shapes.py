@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 
 from helpers.light import gaussian_image
 from miricigale.photometry.shapes.shape_models import ShapeModels
-from miricigale.photometry.shapes.shapes import Beside, ShapeFitter
+from miricigale.photometry.shapes.shapes import Neighbors, ShapeFitter
 from miricigale.photometry.shapes.template_choice import cutouts
 from miricigale.profiles import sersic_image
 
@@ -125,7 +125,7 @@ def test_galaxies_that_overlap_are_recovered_together():
         other = both[0].flux * fitter.profiles(size, both[0].parameters)[0]
         data = sum(images) + noise - other
         again = (
-            fitter.fit(data, weight, centers[1], start=both[1], beside=free)
+            fitter.fit(data, weight, centers[1], start=both[1], neighbors=free)
             for free in (None, beside[1])
         )
         stated.append([np.sqrt(one.covariance[0, 0]) for one in again])
@@ -140,7 +140,7 @@ def test_light_of_a_neighbor_beyond_the_stamp_is_where_it_is():
     fitter, x, y = ShapeFitter(gaussian_psf(), SCALE), 44.3, 14.8
     stamp = fitter._stamp(*np.ones((2, 33, 33)), np.array([[16.0, 16.0]]), 16)
     parameters = np.array([[x, y, np.log(3.0), 0.0, 0.0, 0.0], [x + 60, y, np.log(3.0), 0, 0, 0]])
-    found = stamp.changes(Beside(np.array([5.0, 5.0]), parameters, np.eye(14)))
+    found = stamp.changes(Neighbors(np.array([5.0, 5.0]), parameters, np.eye(14)))
     near, far = found.reshape(2, 7, 33, 33)
     truth = galaxy((33, 60), x, y, r_eff=3.0, n=1.0)
     truth[:, : round(x) - 16] = 0.0

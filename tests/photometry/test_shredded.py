@@ -160,7 +160,7 @@ def test_galaxies_side_by_side_stay_what_they_are(tools):
 
 
 def test_pieces_are_kept_in_files_and_joined(scene, tmp_path):
-    assert sum(one is not None and one.whole is not None for one in scene.pieces.light) == 1
+    assert sum(one is not None and one.galaxy is not None for one in scene.pieces.light) == 1
     scene.pieces.write(tmp_path / "templates.fits")
     assert_equal_values("pieces", scene.pieces, SourceTemplates.read(tmp_path / "templates.fits"))
     n = len(scene.pieces)

@@ -111,7 +111,9 @@ def test_noise_of_the_image_in_the_core(changes):
     image = gaussian_image(51, 3.0)
     rest = Cutout(image, (45, 95))
     # a profile of no light, all of the image being the rest
-    template = Cutout(np.zeros((3, 3)), (69, 119), 1e-8 * image.size, convolved=False, rest=rest)
+    template = Cutout(
+        np.zeros((3, 3)), (69, 119), 1e-8 * image.size, convolved=False, correction=rest
+    )
     one = record(3.0, np.zeros(6))
     found, noise = changes.of(template, one, 1e-6)
     assert found == []

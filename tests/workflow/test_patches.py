@@ -72,7 +72,7 @@ def test_each_position_is_in_one_core_and_lines_stay_where_they_are():
     assert (grid.shape, wider.shape, wider.first) == ((3, 4), (3, 5), (0, -1))
     xy = np.random.default_rng(1).uniform(-0.5, 449.5, (1000, 2))
     xy[:4] = [[199.5, 199.5], [199.49, 199.5], [-0.5, 0], [399.5, 449.49]]
-    assert_array_equal(np.sum([grid.near(k, xy, 0.0) for k in range(12)], axis=0), 1)
+    assert_array_equal(np.sum([grid.is_near(k, xy, 0.0) for k in range(12)], axis=0), 1)
     assert_array_equal(grid.holder(xy[:4]), [5, 4, 0, 10])
     # the same lines, whatever the images are
     names = [[one.names[k] for k in one.holder(xy)] for one in (grid, wider)]

@@ -8,7 +8,7 @@ from miricigale.utils.compilation import njit
 @njit(cache=True, nogil=True)
 def cholesky(matrix):
     """
-    Cholesky's factor of a symmetric matrix.
+    Factorize a symmetric matrix after Cholesky.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def cholesky(matrix):
 @njit(cache=True, nogil=True)
 def solve_factor(factor, right):
     """
-    Solve a system of which there is Cholesky's factor.
+    Solve a linear system whose matrix has a given Cholesky factor.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def solve_factor(factor, right):
 @njit(cache=True, nogil=True)
 def log_determinant(factor):
     """
-    Logarithm of the determinant of a matrix of which there is Cholesky's factor.
+    Return the logarithm of the determinant of a matrix with a given Cholesky factor.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def log_determinant(factor):
 @njit(cache=True, nogil=True)
 def inverse_of(factor):
     """
-    Inverse of a matrix of which there is Cholesky's factor.
+    Invert a matrix with a given Cholesky factor.
 
     Parameters
     ----------
@@ -101,7 +101,8 @@ def inverse_of(factor):
     inverse : `~numpy.ndarray`, shape (n, n)
     """
     n = len(factor)
-    inverse, unit = np.empty((n, n)), np.zeros(n)
+    inverse = np.empty((n, n))
+    unit = np.zeros(n)
     for i in range(n):
         unit[i] = 1.0
         inverse[i] = solve_factor(factor, unit)

@@ -8,7 +8,7 @@ from miricigale.utils.compilation import njit
 
 def spline_response(shape):
     """
-    Transform of the quintic B-spline at the nodes, for `scipy.fft.rfft2` of ``shape``.
+    Return the transform of the quintic B-spline at the nodes, for `scipy.fft.rfft2` of ``shape``.
 
     Dividing by it turns an image into the coefficients of its interpolating spline.
     """
@@ -16,12 +16,13 @@ def spline_response(shape):
 
 
 def _spline_1d(f):
+    # values of the quintic B-spline at its nodes are 1, 26, 66, 26 and 1 over 120
     return (66.0 + 52.0 * np.cos(2 * np.pi * f) + 2.0 * np.cos(4 * np.pi * f)) / 120.0
 
 
 def box_response(shape, sides):
     """
-    Transform of the mean over a parallelogram, for `scipy.fft.rfft2` of ``shape``.
+    Return the transform of the mean over a parallelogram, for `scipy.fft.rfft2` of ``shape``.
 
     ``sides``, (2, 2), are its two sides as vectors (x, y) in pixels.
     """
@@ -46,6 +47,7 @@ def convolve_batch(stamps, transfer, shape):
     return scipy.fft.irfft2(spectrum, s=shape, axes=(1, 2), overwrite_x=True)
 
 
+# the quintic B-spline is a polynomial for distances up to 1, from 1 to 2, and from 2 to 3, of a node
 @njit(cache=True, nogil=True)
 def _inner(x):
     return 0.55 - 0.5 * x**2 + 0.25 * x**4 - x**5 / 12.0
@@ -73,7 +75,7 @@ def _quintic(position, node, weight):
 
 
 @njit(cache=True, nogil=True)
-def sample_stamps(coefficients, which, amplitude, center, poly, box, start, out):
+def sample_stamps(coefficients, fine_stamp, amplitude, center, poly, box, start, out):
     """
     Add splines evaluated at the centers of target pixels, as fractions per target pixel.
 
@@ -81,8 +83,8 @@ def sample_stamps(coefficients, which, amplitude, center, poly, box, start, out)
     ----------
     coefficients : `~numpy.ndarray`, shape (m, h, w)
         Quintic spline coefficients of fine-grid stamps (fraction per fine pixel).
-    which, amplitude : int and float arrays, shape (n,)
-        Which of them each template uses, and its factor; a template of amplitude zero is skipped.
+    fine_stamp, amplitude : int and float arrays, shape (n,)
+        Number of the stamp that each template uses, and its factor; a template of amplitude zero is skipped.
     center, poly : float arrays, shape (n, 2) and (n, 2, 6)
         Target positions (x, y), and about them fine coordinates X, Y in the frame of the stamp as quadratics
         c0 + c1 u + c2 v + c3 u^2 + c4 u v + c5 v^2 of the offset (u, v) in target pixels.
@@ -91,17 +93,21 @@ def sample_stamps(coefficients, which, amplitude, center, poly, box, start, out)
     out : `~numpy.ndarray`, shape (start[-1],)
         Amplitude times spline value times Jacobian is added to it.
     """
-    h, w = coefficients.shape[1], coefficients.shape[2]
+    h = coefficients.shape[1]
+    w = coefficients.shape[2]
     width = 0
     for k in range(box.shape[0]):
         width = max(width, box[k, 3])
-    fx, fy = np.empty(width), np.empty(width)
-    ix, iy = np.empty(width, np.int64), np.empty(width, np.int64)
-    wx, wy = np.empty((6, width)), np.empty((6, width))
+    fx = np.empty(width)
+    fy = np.empty(width)
+    ix = np.empty(width, np.int64)
+    iy = np.empty(width, np.int64)
+    wx = np.empty((6, width))
+    wy = np.empty((6, width))
     for k in range(box.shape[0]):
         if amplitude[k] == 0.0:
             continue
-        image = coefficients[which[k]]
+        image = coefficients[fine_stamp[k]]
         px = poly[k, 0]
         py = poly[k, 1]
         nx = box[k, 3]
@@ -119,22 +125,29 @@ def sample_stamps(coefficients, which, amplitude, center, poly, box, start, out)
             _quintic(fx[:nx], ix, wx)
             _quintic(fy[:nx], iy, wy)
             for m in range(nx):
-                top, left = iy[m] - 2, ix[m] - 2
+                first_row = iy[m] - 2
+                first_column = ix[m] - 2
                 value = 0.0
-                if top >= 0 and left >= 0 and top <= h - 6 and left <= w - 6:
+                if (
+                    first_row >= 0
+                    and first_column >= 0
+                    and first_row <= h - 6
+                    and first_column <= w - 6
+                ):
                     for j in range(6):
                         part = 0.0
                         for i in range(6):
-                            part += wx[i, m] * image[top + j, left + i]
+                            part += wx[i, m] * image[first_row + j, first_column + i]
                         value += wy[j, m] * part
                 else:
                     # nodes beyond the rim are zero
-                    for j in range(max(-top, 0), min(h - top, 6)):
+                    for j in range(max(-first_row, 0), min(h - first_row, 6)):
                         part = 0.0
-                        for i in range(max(-left, 0), min(w - left, 6)):
-                            part += wx[i, m] * image[top + j, left + i]
+                        for i in range(max(-first_column, 0), min(w - first_column, 6)):
+                            part += wx[i, m] * image[first_row + j, first_column + i]
                         value += wy[j, m] * part
                 u = box[k, 1] + m - center[k, 0]
+                # area of a target pixel on the fine grid, by the determinant of the map's derivatives
                 jac = (px[1] + 2 * px[3] * u + px[4] * v) * (py[2] + py[4] * u + 2 * py[5] * v) - (
                     px[2] + px[4] * u + 2 * px[5] * v
                 ) * (py[1] + 2 * py[3] * u + py[4] * v)

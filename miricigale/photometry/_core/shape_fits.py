@@ -25,7 +25,7 @@ Plan = collections.namedtuple("Plan", "kx ky weight response inner outer")
 
 def make_plan(size, transform, passed):
     """
-    The `Plan` of square images, corners of a square that is periodic.
+    Make the `Plan` of square images, corners of a square that is periodic.
 
     Parameters
     ----------
@@ -47,19 +47,27 @@ def make_plan(size, transform, passed):
     ny = 1 + np.flatnonzero((use[rows] | use[-rows]).any(axis=1)).max()
     # frequencies that are not their own negative count twice, along x, or are there twice, along y
     twice = (rows > 0) & (2 * rows != period)
-    used = np.where(use, transform, 0.0)[:, :nx] / period
-    response = np.stack([used[rows[:ny]], used[-rows[:ny]] * twice[:ny, None]])
+    passed_waves = np.where(use, transform, 0.0)[:, :nx] / period
+    response = np.stack([passed_waves[rows[:ny]], passed_waves[-rows[:ny]] * twice[:ny, None]])
     weight = (np.abs(response) ** 2 * (1 + twice[:nx])).ravel()
     response *= (1 + twice[:nx]) / period
-    ky, kx = np.meshgrid(*(2 * np.pi / period * np.arange(k) for k in (ny, nx)), indexing="ij")
-    along, across = np.arange(size)[:, None] * ky[:, 0], kx[0, :, None] * np.arange(size)
-    inner, outer = np.exp(1j * along), np.exp(1j * across)
-    # images move against the pixels
-    inner = [np.hstack([one.real, one.imag]) for one in (inner, -1j * ky[:, 0] * inner)]
-    outer = [np.vstack([one.real, -one.imag]) for one in (outer, -1j * kx[0, :, None] * outer)]
-    real = np.tile(kx.ravel(), 2), np.append(ky, -ky), weight, np.array(inner), np.array(outer)
-    kx, ky, weight, inner, outer = (one.astype(np.float32) for one in real)
-    return Plan(kx, ky, weight, response.astype(np.complex64), inner, outer)
+    frequency = 2 * np.pi / period
+    ky, kx = np.meshgrid(frequency * np.arange(ny), frequency * np.arange(nx), indexing="ij")
+    waves_y = np.exp(1j * (np.arange(size)[:, None] * ky[:, 0]))
+    waves_x = np.exp(1j * (kx[0, :, None] * np.arange(size)))
+    # images move against the pixels: derivatives to the place are -i k times the waves
+    slopes_y = -1j * ky[:, 0] * waves_y
+    slopes_x = -1j * kx[0, :, None] * waves_x
+    inner = [np.hstack([waves_y.real, waves_y.imag]), np.hstack([slopes_y.real, slopes_y.imag])]
+    outer = [np.vstack([waves_x.real, -waves_x.imag]), np.vstack([slopes_x.real, -slopes_x.imag])]
+    return Plan(
+        kx=np.tile(kx.ravel(), 2).astype(np.float32),
+        ky=np.append(ky, -ky).astype(np.float32),
+        weight=weight.astype(np.float32),
+        response=response.astype(np.complex64),
+        inner=np.array(inner).astype(np.float32),
+        outer=np.array(outer).astype(np.float32),
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -73,12 +81,12 @@ def _placed(plan, x, y):
     for i in range(ny):
         turn = np.complex64(np.exp(-1j * y * plan.ky[i * nx]))
         for j in range(nx):
-            above = plan.response[0, i, j] * along[j] * turn
-            below = plan.response[1, i, j] * along[j] * np.conj(turn)
-            placed[0, i, j] = above.real
-            placed[1, i, j] = above.imag
-            placed[2, i, j] = below.real
-            placed[3, i, j] = below.imag
+            positive = plan.response[0, i, j] * along[j] * turn
+            negative = plan.response[1, i, j] * along[j] * np.conj(turn)
+            placed[0, i, j] = positive.real
+            placed[1, i, j] = positive.imag
+            placed[2, i, j] = negative.real
+            placed[3, i, j] = negative.imag
     return placed
 
 
@@ -89,19 +97,23 @@ def _images(plan, curves, placed, n_moved):
 
     After them come the derivatives of the first ``n_moved`` to x and to y, (size, n_moved, size) each.
     """
-    (n, _, ny, nx), size = curves.shape, plan.inner.shape[1]
+    n, _, ny, nx = curves.shape
+    size = plan.inner.shape[1]
     # sums and differences of the two at +-ky, real and imaginary parts
     right = np.empty((2 * ny, n, 2 * nx), np.float32)
     for i in range(ny):
         for c in range(n):
             for j in range(nx):
-                above, below = curves[c, 0, i, j], curves[c, 1, i, j]
-                above_real, above_imag = above * placed[0, i, j], above * placed[1, i, j]
-                below_real, below_imag = below * placed[2, i, j], below * placed[3, i, j]
-                right[i, c, j] = above_real + below_real
-                right[i, c, nx + j] = above_imag + below_imag
-                right[ny + i, c, j] = below_imag - above_imag
-                right[ny + i, c, nx + j] = above_real - below_real
+                positive = curves[c, 0, i, j]
+                negative = curves[c, 1, i, j]
+                positive_real = positive * placed[0, i, j]
+                positive_imag = positive * placed[1, i, j]
+                negative_real = negative * placed[2, i, j]
+                negative_imag = negative * placed[3, i, j]
+                right[i, c, j] = positive_real + negative_real
+                right[i, c, nx + j] = positive_imag + negative_imag
+                right[ny + i, c, j] = negative_imag - positive_imag
+                right[ny + i, c, nx + j] = positive_real - negative_real
     middle = np.dot(plan.inner[0], right.reshape(2 * ny, -1)).reshape(size, n, 2 * nx)
     images = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0]).reshape(size, n, size)
     if n_moved < n:
@@ -115,7 +127,7 @@ def _images(plan, curves, placed, n_moved):
 
 
 @njit(cache=True, nogil=True)
-def draw_curves(plan, curves, x, y, more):
+def draw_curves(plan, curves, x, y, n_derivatives):
     """
     Draw the images of transforms.
 
@@ -127,15 +139,16 @@ def draw_curves(plan, curves, x, y, more):
         Real transforms, without the PSF.
     x, y : float
         Their center.
-    more : {0, 2}
+    n_derivatives : {0, 2}
         Whether derivatives of the first to x and y come after it.
 
     Returns
     -------
-    images : float32 `~numpy.ndarray`, shape (size, n + more, size)
+    images : float32 `~numpy.ndarray`, shape (size, n + n_derivatives, size)
     """
     _, ny, nx = plan.response.shape
-    placed, n_moved = _placed(plan, x, y), more // 2
+    placed = _placed(plan, x, y)
+    n_moved = n_derivatives // 2
     images, along_x, along_y = _images(plan, curves.reshape(-1, 2, ny, nx), placed, n_moved)
     return np.concatenate((images[:, :n_moved], along_x, along_y, images[:, n_moved:]), axis=1)
 
@@ -143,7 +156,8 @@ def draw_curves(plan, curves, x, y, more):
 @njit(cache=True, nogil=True)
 def _whiten(images, k, inverse, y, x, column):
     """Write image k of (size, n, size) over the noise into a column: the pixels of a rectangle, from (y, x) on."""
-    size, width = len(images), inverse.shape[1]
+    size = len(images)
+    width = inverse.shape[1]
     # by pixel: expressions of short pieces of arrays take longer than their pixels
     for row in range(size):
         for i in range(size):
@@ -154,16 +168,22 @@ def _whiten(images, k, inverse, y, x, column):
 @njit(cache=True, nogil=True)
 def _products(plan, table, inverse, corners, parameters, columns):
     """Write whitened models and derivatives into all columns but the last; products of all columns."""
-    k, (_, ny, nx) = (len(columns) - 1) // len(parameters), plan.response.shape
-    left, top = corners[:, 0].min(), corners[:, 1].min()
-    curves = np.empty((5 if k == 7 else 1, 2, ny, nx), np.float32)
+    k = (len(columns) - 1) // len(parameters)
+    _, ny, nx = plan.response.shape
+    x0 = corners[:, 0].min()
+    y0 = corners[:, 1].min()
+    # with the shape free (k = 7) the derivatives to its four parameters are drawn too
+    n_curves = 5 if k == 7 else 1
+    curves = np.empty((n_curves, 2, ny, nx), np.float32)
     n_moved = min(k - 1, 1)
     for s in range(len(parameters)):
-        shape, first = parameters[s, 2:], s * k
+        shape = parameters[s, 2:]
+        first = s * k
         fill_curves(plan.kx, plan.ky, shape, table, curves.reshape(len(curves), -1))
         placed = _placed(plan, parameters[s, 0] - corners[s, 0], parameters[s, 1] - corners[s, 1])
         images, along_x, along_y = _images(plan, curves, placed, n_moved)
-        x, y = corners[s, 0] - left, corners[s, 1] - top
+        x = corners[s, 0] - x0
+        y = corners[s, 1] - y0
         _whiten(images, 0, inverse, y, x, columns[first])
         if n_moved:
             _whiten(along_x, 0, inverse, y, x, columns[first + 1])
@@ -175,33 +195,40 @@ def _products(plan, table, inverse, corners, parameters, columns):
 
 @njit(cache=True, nogil=True)
 def _state(products, parameters, mean, precision):
-    """Chi^2 with the prior, best light, and half of the second and (negative) first derivatives."""
+    """Return chi^2 with the prior, the best light, and half of the second and (negative) first derivatives."""
     n, m = precision.shape[:2]
     k = 1 + m
-    last, power = n * k, np.empty((n, n))
+    last = n * k
+    power = np.empty((n, n))
     for s in range(n):
         for t in range(n):
             power[s, t] = products[s * k, t * k]
         # those without light have none
         power[s, s] += 1e-12 * power[s, s] + 1e-300
     flux = solve_factor(cholesky(power), products[last, :last:k])
-    matrix, slope = np.empty((last, last)), np.empty(last)
+    matrix = np.empty((last, last))
+    slope = np.empty(last)
     chi2 = products[last, last]
     for i in range(last):
-        seen = products[i, last]
-        slope[i] = seen
+        projection = products[i, last]
+        slope[i] = projection
         for s in range(n):
             slope[i] -= products[i, s * k] * flux[s]
         if i % k == 0:
-            chi2 -= flux[i // k] * (seen + slope[i])
+            chi2 -= flux[i // k] * (projection + slope[i])
+    # columns are images of unit light: derivatives of the model to the shape are those times the light
+    scale = np.ones(last)
     for i in range(last):
-        scale = flux[i // k] if i % k else 1.0
-        slope[i] *= scale
+        if i % k:
+            scale[i] = flux[i // k]
+    for i in range(last):
+        slope[i] *= scale[i]
         for j in range(last):
-            matrix[i, j] = products[i, j] * scale * (flux[j // k] if j % k else 1.0)
+            matrix[i, j] = products[i, j] * scale[i] * scale[j]
     for s in range(n):
         for i in range(m):
-            pull, row = 0.0, s * k + 1 + i
+            pull = 0.0
+            row = s * k + 1 + i
             for j in range(m):
                 pull += precision[s, i, j] * (parameters[s, j] - mean[s, j])
                 matrix[row, s * k + 1 + j] += precision[s, i, j]
@@ -219,22 +246,25 @@ def _step(matrix, slope, parameters, limits, damping):
     221).
     """
     n, m = parameters.shape
-    damped, free = matrix.copy(), slope.copy()
+    damped = matrix.copy()
+    free_slope = slope.copy()
     for k in range(len(slope)):
         damped[k, k] += damping * matrix[k, k]
     for s in range(n):
         for j in range(m):
-            k, value = s * (1 + m) + 1 + j, parameters[s, j]
-            below, above = value <= limits[0, j], value >= limits[1, j]
-            if (below and slope[k] < 0.0) or (above and slope[k] > 0.0):
+            k = s * (1 + m) + 1 + j
+            value = parameters[s, j]
+            at_lower = value <= limits[0, j]
+            at_upper = value >= limits[1, j]
+            if (at_lower and slope[k] < 0.0) or (at_upper and slope[k] > 0.0):
                 damped[k, :] = 0.0
                 damped[:, k] = 0.0
                 damped[k, k] = 1.0
-                free[k] = 0.0
-    step = solve_factor(cholesky(damped), free)
+                free_slope[k] = 0.0
+    step = solve_factor(cholesky(damped), free_slope)
     gained = 0.0
     for k in range(len(slope)):
-        gained += step[k] * free[k]
+        gained += step[k] * free_slope[k]
     return step, gained
 
 
@@ -278,16 +308,23 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     k = 1 + m
     columns = np.zeros((n * k + 1, white.size))
     columns[-1] = white.reshape(-1)
-    flux, matrix, slope = np.zeros(n), np.eye(n * k), np.zeros(n * k)
-    trial, parameters, chi2, damping = start, start, np.inf, 0.1
+    flux = np.zeros(n)
+    matrix = np.eye(n * k)
+    slope = np.zeros(n * k)
+    trial = start
+    parameters = start
+    chi2 = np.inf
+    damping = 0.1
     while True:
         products = _products(plan, table, inverse, corners, trial, columns)
         state = _state(products, trial, mean, precision)
         if state[0] <= chi2:
-            parameters, (chi2, flux, matrix, slope) = trial, state
+            parameters = trial
+            chi2, flux, matrix, slope = state
             if steps == 0:
                 break
-            steps, damping = steps - 1, max(0.1 * damping, 1e-6)
+            steps -= 1
+            damping = max(0.1 * damping, 1e-6)
         else:
             damping *= 10.0
             if damping >= 1e6:
@@ -300,17 +337,20 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
                 trial[s, j] = min(max(moved, limits[0, j]), limits[1, j])
         if gained < gain:
             # so near the minimum everything is linear
-            flux, parameters, chi2 = flux + step[::k], trial, chi2 - gained
+            flux = flux + step[::k]
+            parameters = trial
+            chi2 = chi2 - gained
             break
     factor = cholesky(matrix)
-    evidence, covariance = -0.5 * (chi2 + log_determinant(factor)), np.empty((n, k, k))
+    evidence = -0.5 * (chi2 + log_determinant(factor))
+    covariance = np.empty((n, k, k))
     # without a positive matrix the evidence is no number
     if not (np.isfinite(evidence) and flux.min() > 0):
         return np.inf, flux, parameters, evidence, covariance, matrix
-    whole = inverse_of(factor)
+    joint_covariance = inverse_of(factor)
     for s in range(n):
         evidence += 0.5 * log_determinant(cholesky(precision[s]))
-        covariance[s] = whole[s * k : (s + 1) * k, s * k : (s + 1) * k]
+        covariance[s] = joint_covariance[s * k : (s + 1) * k, s * k : (s + 1) * k]
         covariance[s, 0] /= flux[s]
         covariance[s, :, 0] /= flux[s]
     return chi2, flux, parameters, evidence, covariance, matrix
@@ -322,16 +362,29 @@ def _center_products(images, along_x, along_y, s, inverse, white, products):
     aa = ab = ac = ad = bb = bc = bd = cc = cd = 0.0
     for row in range(len(images)):
         for i in range(len(images)):
-            noise, d = inverse[row, i], white[row, i]
-            a, b, c = images[row, s, i], along_x[row, s, i], along_y[row, s, i]
-            a, b, c = a * noise, b * noise, c * noise
-            aa, ab, ac, ad = aa + a * a, ab + a * b, ac + a * c, ad + a * d
-            bb, bc, bd, cc, cd = bb + b * b, bc + b * c, bd + b * d, cc + c * c, cd + c * d
-    products[0], products[1], products[2] = (aa, ab, ac, ad), (ab, bb, bc, bd), (ac, bc, cc, cd)
+            noise = inverse[row, i]
+            d = white[row, i]
+            a = images[row, s, i] * noise
+            b = along_x[row, s, i] * noise
+            c = along_y[row, s, i] * noise
+            aa += a * a
+            ab += a * b
+            ac += a * c
+            ad += a * d
+            bb += b * b
+            bc += b * c
+            bd += b * d
+            cc += c * c
+            cd += c * d
+    products[0] = (aa, ab, ac, ad)
+    products[1] = (ab, bb, bc, bd)
+    products[2] = (ac, bc, cc, cd)
 
 
 @njit(cache=True, nogil=True)
-def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, precision, beside):
+def evidence_of(
+    plan, table, white, inverse, corners, best, flux, shapes, mean, precision, neighbors
+):
     """
     Likelihoods of shapes of a source, with the light, the center and the neighbors that fit best.
 
@@ -345,12 +398,12 @@ def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, 
         The shapes.
     mean, precision : `~numpy.ndarray`, shapes (1, 6) and (1, 2, 2)
         The prior of the center.
-    beside : `~numpy.ndarray`, shape (b, pixels)
+    neighbors : `~numpy.ndarray`, shape (b, pixels)
         Whitened changes of the light of neighbors for each independent unit normal deviate.
 
     Returns
     -------
-    found : `~numpy.ndarray`, shape (k, 2)
+    likelihoods : `~numpy.ndarray`, shape (k, 2)
         Ln of the likelihood, integrated over a light that is flat in its logarithm, and ln flux; -1e9 and 0
         where no positive light fits.
     """
@@ -359,10 +412,15 @@ def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, 
     shapes = np.concatenate((best[:, 2:], shapes))
     placed = _placed(plan, best[0, 0] - corners[0, 0], best[0, 1] - corners[0, 1])
     curves = np.empty((_TOGETHER, 2, ny, nx), np.float32)
-    found, known = np.zeros((len(shapes), 2)), np.zeros(len(beside))
-    products, columns, data = np.empty((3, 4)), np.empty((3, white.size)), np.sum(white**2)
-    center, off = precision[0], best[0, :2] - mean[0, :2]
+    likelihoods = np.zeros((len(shapes), 2))
+    neighbor_data = np.zeros(len(neighbors))
+    products = np.empty((3, 4))
+    columns = np.empty((3, white.size))
+    data = np.sum(white**2)
+    center = precision[0]
+    off = best[0, :2] - mean[0, :2]
     log_prior = np.log(center[0, 0] * center[1, 1] - center[0, 1] ** 2)
+    # derivative of half of the prior's chi^2 by the center
     pull_x = center[0, 0] * off[0] + center[0, 1] * off[1]
     pull_y = center[0, 1] * off[0] + center[1, 1] * off[1]
     for first in range(0, len(shapes), _TOGETHER):
@@ -372,36 +430,41 @@ def evidence_of(plan, table, white, inverse, corners, best, flux, shapes, mean, 
         images, along_x, along_y = _images(plan, curves[:n], placed, n)
         for s in range(n):
             _center_products(images, along_x, along_y, s, inverse, white, products)
-            if len(beside):
+            if len(neighbors):
                 # neighbors' light that was taken off is the best together with this one's
                 _whiten(images, s, inverse, 0, 0, columns[0])
                 _whiten(along_x, s, inverse, 0, 0, columns[1])
                 _whiten(along_y, s, inverse, 0, 0, columns[2])
-                shared = np.dot(columns, beside.T)
+                shared = np.dot(columns, neighbors.T)
                 if first + s == 0:
-                    known = flux * shared[0]
-                    data -= np.sum(known * known)
+                    neighbor_data = flux * shared[0]
+                    data -= np.sum(neighbor_data * neighbor_data)
                 for i in range(3):
                     for j in range(3):
                         products[i, j] -= np.sum(shared[i] * shared[j])
-                    products[i, 3] -= np.sum(shared[i] * known)
-            found[first + s, 0] = -1e9
-            power, seen = products[0, 0], products[0, 3]
-            if power > 0 and seen > 0:
+                    products[i, 3] -= np.sum(shared[i] * neighbor_data)
+            likelihoods[first + s, 0] = -1e9
+            power = products[0, 0]
+            projection = products[0, 3]
+            if power > 0 and projection > 0:
                 # the center: changes of the pixels are in proportion to the light
-                light, own_x, own_y = seen / power, products[1, 0], products[2, 0]
+                light = projection / power
+                own_x = products[1, 0]
+                own_y = products[2, 0]
                 slope_x = light * (products[1, 3] - light * own_x) - pull_x
                 slope_y = light * (products[2, 3] - light * own_y) - pull_y
                 xx = center[0, 0] + light**2 * (products[1, 1] - own_x * own_x / power)
                 xy = center[0, 1] + light**2 * (products[1, 2] - own_x * own_y / power)
                 yy = center[1, 1] + light**2 * (products[2, 2] - own_y * own_y / power)
+                # one Newton step of the center, with the light that is best at each place
                 det = xx * yy - xy * xy
                 step_x = (yy * slope_x - xy * slope_y) / det
                 step_y = (xx * slope_y - xy * slope_x) / det
-                chi2 = data - light * seen + off[0] * pull_x + off[1] * pull_y
+                chi2 = data - light * projection + off[0] * pull_x + off[1] * pull_y
                 gained = slope_x * step_x + slope_y * step_y
+                # Laplace's integral over center and light
                 evidence = gained - chi2 - np.log(abs(det)) - np.log(power) + log_prior
                 moved = (own_x * step_x + own_y * step_y) / power
-                found[first + s, 1] = np.log(light * max(1.0 - moved, 0.1))
-                found[first + s, 0] = 0.5 * evidence - found[first + s, 1]
-    return found[1:]
+                likelihoods[first + s, 1] = np.log(light * max(1.0 - moved, 0.1))
+                likelihoods[first + s, 0] = 0.5 * evidence - likelihoods[first + s, 1]
+    return likelihoods[1:]

@@ -12,7 +12,9 @@ from miricigale.utils.compilation import njit
 INDEX_RANGE = (0.4, 6.0)
 
 #: Table of the transform: even in the fourth root of k R_e, from 0, and in ln n, from below the range.
-_STEP, _NODES, _INDEX_STEP = 0.0125, 460, 0.1
+_STEP = 0.0125
+_NODES = 460
+_INDEX_STEP = 0.1
 _FIRST = np.log(INDEX_RANGE[0]) - 2 * _INDEX_STEP
 
 #: What the compiler may do with sums: nothing here is infinite or no number.
@@ -25,7 +27,7 @@ _POINT = -9.0
 @cached
 def profile_table():
     """
-    Transforms of Sersic profiles of unit light and radius, for the kernels.
+    Return the transforms of Sersic profiles of unit light and radius, for the kernels.
 
     Returns
     -------
@@ -50,17 +52,20 @@ def profile_table():
 
 @njit(cache=True, nogil=True)
 def profile_of(table, log_n, changes):
-    """The transform of one index at the nodes, and its changes with ln n if they are wanted."""
+    """Return the transform of one index at the nodes, and its derivative to ln n if ``changes`` is True."""
     place = (log_n - _FIRST) / _INDEX_STEP
     m = min(max(int(place), 0), table.shape[1] - 1)
     t = _INDEX_STEP * (place - m)
-    found = np.empty((2, table.shape[2]), np.float32)
+    profile = np.empty((2, table.shape[2]), np.float32)
     for i in range(table.shape[2]):
-        a, b, c, d = table[0, m, i], table[1, m, i], table[2, m, i], table[3, m, i]
-        found[0, i] = d + t * (c + t * (b + t * a))
+        a = table[0, m, i]
+        b = table[1, m, i]
+        c = table[2, m, i]
+        d = table[3, m, i]
+        profile[0, i] = d + t * (c + t * (b + t * a))
         if changes:
-            found[1, i] = c + t * (2.0 * b + 3.0 * t * a)
-    return found
+            profile[1, i] = c + t * (2.0 * b + 3.0 * t * a)
+    return profile
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -81,18 +86,26 @@ def fill_curves(kx, ky, shape, table, out):
     """
     changes = len(out) > 1
     profile = profile_of(table, shape[1], changes)
-    g1, g2 = np.float32(shape[2]), np.float32(shape[3])
+    g1 = np.float32(shape[2])
+    g2 = np.float32(shape[3])
     eta = np.sqrt(shape[2] ** 2 + shape[3] ** 2)
-    ch, sh, bend = 1.0 + 0.5 * eta * eta, 1.0 + eta * eta / 6.0, 1.0 / 3.0
+    ch = 1.0 + 0.5 * eta * eta
+    sh = 1.0 + eta * eta / 6.0
+    bend = 1.0 / 3.0
     if eta > 1e-4:
-        ch, sh = np.cosh(eta), np.sinh(eta) / eta
+        ch = np.cosh(eta)
+        sh = np.sinh(eta) / eta
         bend = (ch - sh) / (eta * eta)
-    ch, sh, bend = np.float32(ch), np.float32(sh), np.float32(bend)
+    ch = np.float32(ch)
+    sh = np.float32(sh)
+    bend = np.float32(bend)
     size = np.float32(np.exp(2.0 * shape[0]))
-    light, last = out[0], np.float32(_NODES - 2.5)
+    light = out[0]
+    last = np.float32(_NODES - 2.5)
     # a loop without branches, which the compiler turns into vector instructions
     for i in range(kx.size):
-        x, y = kx[i], ky[i]
+        x = kx[i]
+        y = ky[i]
         form = ch * (x * x + y * y) + sh * (g1 * (x * x - y * y) + g2 * (x * y + x * y))
         # rounded it may be below zero
         place = np.sqrt(np.sqrt(np.sqrt(max(form, np.float32(0.0)) * size)))
@@ -101,7 +114,10 @@ def fill_curves(kx, ky, shape, table, out):
         place = light[i]
         m = max(int(place), 1)
         t = place - np.float32(m)
-        a, b, e, f = profile[0, m - 1], profile[0, m], profile[0, m + 1], profile[0, m + 2]
+        a = profile[0, m - 1]
+        b = profile[0, m]
+        e = profile[0, m + 1]
+        f = profile[0, m + 2]
         c1 = np.float32(0.5) * (e - a)
         c2 = a - np.float32(2.5) * b + np.float32(2.0) * e - np.float32(0.5) * f
         c3 = np.float32(0.5) * (f - a) + np.float32(1.5) * (b - e)
@@ -109,10 +125,14 @@ def fill_curves(kx, ky, shape, table, out):
         if changes:
             # the derivative to ln(k R_e)
             slope = 0.25 * place * (c1 + t * (2.0 * c2 + 3.0 * t * c3))
-            x, y = kx[i], ky[i]
-            k2, d, c = x * x + y * y, x * x - y * y, 2.0 * x * y
+            x = kx[i]
+            y = ky[i]
+            k2 = x * x + y * y
+            d = x * x - y * y
+            c = 2.0 * x * y
             turn = g1 * d + g2 * c
-            half, bent = 0.5 * slope / max(ch * k2 + sh * turn, 1e-30), sh * k2 + bend * turn
+            half = 0.5 * slope / max(ch * k2 + sh * turn, 1e-30)
+            bent = sh * k2 + bend * turn
             out[1, i] = slope
             out[2, i] = profile[1, m] + t * (profile[1, m + 1] - profile[1, m])
             out[3, i] = half * (g1 * bent + sh * d)
@@ -121,7 +141,7 @@ def fill_curves(kx, ky, shape, table, out):
 
 def shape_curves(kx, ky, shapes):
     """
-    Transforms of centered Sersic profiles of unit light, without a PSF.
+    Return the transforms of centered Sersic profiles of unit light, without a PSF.
 
     Parameters
     ----------
@@ -135,7 +155,9 @@ def shape_curves(kx, ky, shapes):
     -------
     curves : `~numpy.ndarray`, shape (n, m)
     """
-    kx, ky, table = kx.astype(np.float32), ky.astype(np.float32), profile_table()
+    kx = kx.astype(np.float32)
+    ky = ky.astype(np.float32)
+    table = profile_table()
     out = np.empty((len(shapes), 1, len(kx)), np.float32)
     for shape, curve in zip(shapes, out, strict=True):
         fill_curves(kx, ky, shape, table, curve)

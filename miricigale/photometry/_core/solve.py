@@ -22,7 +22,10 @@ def factorize(matrix):
     """
     Factorize a symmetric positive sparse matrix after scaling it to a unit diagonal.
 
-    A function that solves for a vector or a matrix of right-hand sides.
+    Returns
+    -------
+    solve : callable
+        Solves for a vector or a matrix of right-hand sides.
 
     Raises
     ------
@@ -42,15 +45,15 @@ def factorize(matrix):
 
     def solve(rhs):
         rhs = np.asarray(rhs, float)
-        s = scale if rhs.ndim == 1 else scale[:, None]
-        return lu.solve(rhs / s) / s
+        row_scale = scale if rhs.ndim == 1 else scale[:, None]
+        return lu.solve(rhs / row_scale) / row_scale
 
     return solve
 
 
 def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None, exact=1500):
     """
-    Elements of the inverse of a normal matrix, by dense inversion of blocks on the sky.
+    Calculate elements of the inverse of a normal matrix, by dense inversion of blocks on the sky.
 
     Parameters
     ----------
@@ -80,32 +83,43 @@ def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None,
     unit = scipy.sparse.diags_array(scale)
     matrix = (unit @ matrix @ unit).tocsr()
     # H M H = D (S^-1 (D M D) S^-1) D with S = D H^-1 D
-    middles = [None if one is None else (unit @ one @ unit).tocsr() for one in middles]
-    pattern = _arrays(matrix if pattern is None else pattern.tocsr())
-    parts, filled = _arrays(matrix), [None if one is None else _arrays(one) for one in middles]
-    rows, columns, values = [], [], [[] for _ in middles]
-    inverse_diagonal, place = np.empty(n), np.full(n, -1)
-    for near, inner in _blocks(n, y, x, core, halo, exact):
-        place[near] = np.arange(len(near))
-        inverse = _dense_inverse(_dense(*parts, near, place))
-        inverse_diagonal[near[inner]] = np.diag(inverse)[inner]
-        i, j = _elements(*pattern[:2], near, inner, place)
-        rows.append(near[i])
-        columns.append(near[j])
-        for middle, found in zip(filled, values, strict=True):
+    parts = _arrays(matrix)
+    scaled_middles = []
+    for middle in middles:
+        if middle is None:
+            scaled_middles.append(None)
+        else:
+            scaled_middles.append(_arrays((unit @ middle @ unit).tocsr()))
+    row_start, row_columns = parts[:2]
+    if pattern is not None:
+        row_start, row_columns, _ = _arrays(pattern.tocsr())
+    rows = []
+    columns = []
+    values = [[] for _ in scaled_middles]
+    inverse_diagonal = np.empty(n)
+    place = np.full(n, -1)
+    for members, inner in _blocks(n, y, x, core, halo, exact):
+        place[members] = np.arange(len(members))
+        inverse = _dense_inverse(_dense(*parts, members, place))
+        inverse_diagonal[members[inner]] = np.diag(inverse)[inner]
+        i, j = _elements(row_start, row_columns, members, inner, place)
+        rows.append(members[i])
+        columns.append(members[j])
+        for middle, elements in zip(scaled_middles, values, strict=True):
             block = inverse
             if middle is not None:
-                block = inverse @ _dense(*middle, near, place) @ inverse
-            found.append(block[i, j])
-        place[near] = -1
-    rows, columns = np.concatenate(rows), np.concatenate(columns)
+                block = inverse @ _dense(*middle, members, place) @ inverse
+            elements.append(block[i, j])
+        place[members] = -1
+    rows = np.concatenate(rows)
+    columns = np.concatenate(columns)
 
-    def matrix_of(found):
-        data = np.concatenate(found) * scale[rows] * scale[columns]
+    def matrix_of(elements):
+        data = np.concatenate(elements) * scale[rows] * scale[columns]
         half = scipy.sparse.coo_array((data, (rows, columns)), shape=(n, n)).tocsr()
         return ((half + half.T) * 0.5).tocsr()
 
-    return [matrix_of(found) for found in values], inverse_diagonal * scale**2
+    return [matrix_of(elements) for elements in values], inverse_diagonal * scale**2
 
 
 def _arrays(matrix):
@@ -114,10 +128,10 @@ def _arrays(matrix):
 
 
 @njit(cache=True, nogil=True)
-def _dense(start, column, data, near, place):
+def _dense(start, column, data, members, place):
     """Some rows and columns of a sparse matrix; ``place``, (n,), is that of each among them, or -1."""
-    block = np.zeros((len(near), len(near)))
-    for i, row in enumerate(near):
+    block = np.zeros((len(members), len(members)))
+    for i, row in enumerate(members):
         for k in range(start[row], start[row + 1]):
             j = place[column[k]]
             if j >= 0:
@@ -126,20 +140,22 @@ def _dense(start, column, data, near, place):
 
 
 @njit(cache=True, nogil=True)
-def _elements(start, column, near, inner, place):
+def _elements(start, column, members, inner, place):
     """Places, among some rows and columns, of the non-zeros in the inner ones of the rows."""
-    most = 0
-    for i, row in enumerate(near):
-        most += start[row + 1] - start[row] if inner[i] else 0
-    found, count = np.empty((2, most), np.int64), 0
-    for i, row in enumerate(near):
+    capacity = 0
+    for i, row in enumerate(members):
+        if inner[i]:
+            capacity += start[row + 1] - start[row]
+    places = np.empty((2, capacity), np.int64)
+    count = 0
+    for i, row in enumerate(members):
         if inner[i]:
             for k in range(start[row], start[row + 1]):
                 if place[column[k]] >= 0:
-                    found[0, count] = i
-                    found[1, count] = place[column[k]]
+                    places[0, count] = i
+                    places[1, count] = place[column[k]]
                     count += 1
-    return found[:, :count]
+    return places[:, :count]
 
 
 def _blocks(n, y, x, core, halo, exact):
@@ -147,17 +163,18 @@ def _blocks(n, y, x, core, halo, exact):
     if n <= exact:
         yield np.arange(n), np.ones(n, bool)
         return
-    iy, ix = np.floor(y / core).astype(int), np.floor(x / core).astype(int)
+    iy = np.floor(y / core).astype(int)
+    ix = np.floor(x / core).astype(int)
     order = np.argsort(y, kind="stable")
     ys = y[order]
     for row in np.unique(iy):
         low, high = np.searchsorted(ys, [row * core - halo, (row + 1) * core + halo])
         strip = order[low:high]
         for column in np.unique(ix[iy == row]):
-            near = strip[
+            members = strip[
                 (x[strip] >= column * core - halo) & (x[strip] < (column + 1) * core + halo)
             ]
-            yield near, (iy[near] == row) & (ix[near] == column)
+            yield members, (iy[members] == row) & (ix[members] == column)
 
 
 def _dense_inverse(block):

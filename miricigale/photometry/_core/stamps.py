@@ -26,11 +26,12 @@ def _sweep(box, grow, pairs):
     return count
 
 
-def _listed(search, *boxes):
-    """The pairs that a search finds, after counting them."""
-    pairs = np.empty((search(*boxes, np.empty((0, 2), np.int32)), 2), np.int32)
-    if len(pairs):
-        search(*boxes, pairs)
+def _listed(search):
+    """Return the pairs that ``search(pairs)`` fills in; given an empty array it counts them only."""
+    n_pairs = search(np.empty((0, 2), np.int32))
+    pairs = np.empty((n_pairs, 2), np.int32)
+    if n_pairs:
+        search(pairs)
     return pairs
 
 
@@ -40,17 +41,19 @@ def find_pairs(box, grow=0):
 
     Boxes, (n, 4), are (y0, x0, ny, nx), sorted by y0.
     """
-    return _listed(_sweep, box, grow)
+    return _listed(lambda pairs: _sweep(box, grow, pairs))
 
 
 @njit(cache=True, nogil=True)
-def _cross(box, other, tallest, pairs):
+def _cross(box, other_box, tallest, pairs):
     # both sorted by y0: what ends above one of the others ends above all that follow
     count = 0
     low = 0
-    for j in range(other.shape[0]):
-        y0, x0 = other[j, 0], other[j, 1]
-        y1, x1 = y0 + other[j, 2], x0 + other[j, 3]
+    for j in range(other_box.shape[0]):
+        y0 = other_box[j, 0]
+        x0 = other_box[j, 1]
+        y1 = y0 + other_box[j, 2]
+        x1 = x0 + other_box[j, 3]
         while low < box.shape[0] and box[low, 0] + tallest <= y0:
             low += 1
         if y1 == y0 or x1 == x0:
@@ -71,14 +74,14 @@ def _cross(box, other, tallest, pairs):
     return count
 
 
-def cross_pairs(box, other):
+def cross_pairs(box, other_box):
     """
     List the pairs, (n_pairs, 2), of boxes of two sets that overlap.
 
     Boxes, (n, 4) and (m, 4), are (y0, x0, ny, nx), each set sorted by y0.
     """
     tallest = box[:, 2].max(initial=0)
-    return _listed(_cross, box, other, tallest)
+    return _listed(lambda pairs: _cross(box, other_box, tallest, pairs))
 
 
 # products of float32 add up in float64 without rounding, in whatever order
@@ -90,7 +93,8 @@ def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
     ``pairs``, (n, 2), are rows of ``a`` and ``b``; ``out``, (n,), is filled with the sums.
     """
     for k in range(pairs.shape[0]):
-        i, j = pairs[k, 0], pairs[k, 1]
+        i = pairs[k, 0]
+        j = pairs[k, 1]
         y0 = max(a_box[i, 0], b_box[j, 0])
         y1 = min(a_box[i, 0] + a_box[i, 2], b_box[j, 0] + b_box[j, 2])
         x0 = max(a_box[i, 1], b_box[j, 1])
@@ -99,7 +103,8 @@ def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
         for y in range(y0, y1):
             na = a_start[i] + (y - a_box[i, 0]) * a_box[i, 3] - a_box[i, 1] + x0
             nb = b_start[j] + (y - b_box[j, 0]) * b_box[j, 3] - b_box[j, 1] + x0
-            row_a, row_b = a[na : na + x1 - x0], b[nb : nb + x1 - x0]
+            row_a = a[na : na + x1 - x0]
+            row_b = b[nb : nb + x1 - x0]
             part = 0.0
             for x in range(row_a.size):
                 part += np.float64(row_a[x]) * np.float64(row_b[x])
@@ -116,10 +121,10 @@ def projections(values, box, start, image, out):
         total = 0.0
         for y in range(box[k, 0], box[k, 0] + box[k, 2]):
             row = values[n : n + nx]
-            below = image[y, box[k, 1] : box[k, 1] + nx]
+            image_row = image[y, box[k, 1] : box[k, 1] + nx]
             part = 0.0
             for x in range(nx):
-                part += np.float64(row[x]) * np.float64(below[x])
+                part += np.float64(row[x]) * np.float64(image_row[x])
             total += part
             n += nx
         out[k] = total
@@ -137,7 +142,7 @@ def whiten_stamps(values, box, start, inverse_sigma, out, sums):
         n = start[k]
         nx = box[k, 3]
         light = 0.0
-        seen = 0.0
+        usable_light = 0.0
         power = 0.0
         white_power = 0.0
         for y in range(box[k, 0], box[k, 0] + box[k, 2]):
@@ -149,12 +154,13 @@ def whiten_stamps(values, box, start, inverse_sigma, out, sums):
                 w = v * weight[x]
                 white[x] = w
                 light += v
-                seen += v if weight[x] > 0 else np.float32(0)
+                # no branch, for the sake of vector instructions
+                usable_light += v if weight[x] > 0 else np.float32(0)
                 power += np.float64(v) * np.float64(v)
                 white_power += np.float64(w) * np.float64(w)
             n += nx
         sums[k, 0] = light
-        sums[k, 1] = seen
+        sums[k, 1] = usable_light
         sums[k, 2] = power
         sums[k, 3] = white_power
 
@@ -188,7 +194,7 @@ def residual_statistics(values, box, start, residual, inverse_sigma, out):
         n = start[k]
         square = 0.0
         weight = 0.0
-        left = 0.0
+        residual_sum = 0.0
         core = 0.0
         for y in range(box[k, 0], box[k, 0] + box[k, 2]):
             for x in range(box[k, 1], box[k, 1] + box[k, 3]):
@@ -199,11 +205,11 @@ def residual_statistics(values, box, start, residual, inverse_sigma, out):
                     square += t * z * z
                     weight += t
                     if t > 0.1 * peak:
-                        left += r
+                        residual_sum += r
                         core += t
                 n += 1
         out[k, 0] = square / weight if weight > 0.0 else np.nan
-        out[k, 1] = left
+        out[k, 1] = residual_sum
         out[k, 2] = core
 
 
@@ -219,31 +225,37 @@ def offset_sums(values, box, start, flux, at, half, model, residual, inverse_sig
     term = np.empty(4)
     for k in range(box.shape[0]):
         y0, x0, ny, nx = box[k]
-        first, last = max(at[k, 1] - half, y0), min(at[k, 1] + half + 1, y0 + ny)
-        left, right = max(at[k, 0] - half, x0), min(at[k, 0] + half + 1, x0 + nx)
+        first_row = max(at[k, 1] - half, y0)
+        last_row = min(at[k, 1] + half + 1, y0 + ny)
+        first_column = max(at[k, 0] - half, x0)
+        last_column = min(at[k, 0] + half + 1, x0 + nx)
         sums = out[k]
         sums[:] = 0.0
-        if min(last - first, right - left) < 5:
+        if min(last_row - first_row, last_column - first_column) < 5:
             continue
         stamp = values[start[k] : start[k] + ny * nx].reshape(ny, nx)
-        stamp = stamp[first - y0 : last - y0, left - x0 : right - x0]
+        stamp = stamp[first_row - y0 : last_row - y0, first_column - x0 : last_column - x0]
         for j in range(stamp.shape[0]):
             # at the window's edges one-sided differences
-            j0, j1 = max(j - 1, 0), min(j + 1, stamp.shape[0] - 1)
+            j0 = max(j - 1, 0)
+            j1 = min(j + 1, stamp.shape[0] - 1)
             for i in range(stamp.shape[1]):
-                weight = np.float64(inverse_sigma[first + j, left + i])
+                weight = np.float64(inverse_sigma[first_row + j, first_column + i])
                 if weight == 0.0:
                     continue
-                i0, i1 = max(i - 1, 0), min(i + 1, stamp.shape[1] - 1)
+                i0 = max(i - 1, 0)
+                i1 = min(i + 1, stamp.shape[1] - 1)
                 white = flux[k] * weight
                 term[0] = white * stamp[j, i]
                 term[1] = white * (np.float64(stamp[j, i0]) - stamp[j, i1]) / (i1 - i0)
                 term[2] = white * (np.float64(stamp[j0, i]) - stamp[j1, i]) / (j1 - j0)
-                term[3] = weight * residual[first + j, left + i]
+                term[3] = weight * residual[first_row + j, first_column + i]
                 for a in range(4):
                     for b in range(4):
                         sums[4 * a + b] += term[a] * term[b]
-                sums[16] += abs(term[0] * (weight * model[first + j, left + i] - term[0]))
+                sums[16] += abs(
+                    term[0] * (weight * model[first_row + j, first_column + i] - term[0])
+                )
                 sums[17] += 1.0
 
 

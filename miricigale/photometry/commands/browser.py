@@ -36,27 +36,28 @@ def write_browser(path, title, bands, highres, confidence, detected):
     ``detected`` sigma are shown as limits.
     """
     name = _browser_name(path)
-    results = {one.name: one.result for one in bands}
+    results = {band.name: band.result for band in bands}
     first = bands[0].result
     images = {}
-    for band, one in results.items():
-        image, model = one.residual_image.copy(), one.model_image
+    for band, result in results.items():
+        image = result.residual_image.copy()
+        model = result.model_image
         image.data = image.data + model.data
-        images[band] = image, model, one.residual_image
+        images[band] = image, model, result.residual_image
     pictures = Cutouts(highres, images)
     imaged = pictures.on_image(first.sky)
-    best = np.max([np.nan_to_num(one.snr, nan=-np.inf) for one in results.values()], axis=0)
+    best = np.max([np.nan_to_num(result.snr, nan=-np.inf) for result in results.values()], axis=0)
     order = np.lexsort((-best, ~imaged))
     shown = np.zeros(len(first), bool)
     shown[order[:_PICTURES]] = imaged[order[:_PICTURES]]
     columns = {"id": first.id, "ra": first.sky.ra.deg, "dec": first.sky.dec.deg}
-    limits = {band: one.upper_limit(confidence) for band, one in results.items()}
-    for band, one in results.items():
-        below = ~(one.snr > detected)
-        mag = np.where(below, ab_magnitude(limits[band]), ab_magnitude(one.flux))
-        columns |= {f"mag_{band}": mag, f"limit_{band}": below, f"sn_{band}": one.snr}
-        columns |= {f"chi2_{band}": one.chi2, f"flags_{band}": one.flags}
-    waves = [Filter.from_name(one).pivot.value for one in results]
+    limits = {band: result.upper_limit(confidence) for band, result in results.items()}
+    for band, result in results.items():
+        is_limit = ~(result.snr > detected)
+        mag = np.where(is_limit, ab_magnitude(limits[band]), ab_magnitude(result.flux))
+        columns |= {f"mag_{band}": mag, f"limit_{band}": is_limit, f"sn_{band}": result.snr}
+        columns |= {f"chi2_{band}": result.chi2, f"flags_{band}": result.flags}
+    waves = [Filter.from_name(band).pivot.value for band in results]
     facts = {
         "turn": float(grid_angle(highres.wcs, highres.shape).to_value("deg")),
         "report": path.name,
@@ -78,12 +79,12 @@ def write_browser(path, title, bands, highres, confidence, detected):
 
     def entry(row):
         parts = {"flux": "flux", "error": "flux_err", "flags": "flags"}
-        found = {
-            key: rounded([np.asarray(getattr(one, part))[row] for one in results.values()])
+        values = {
+            key: rounded([np.asarray(getattr(result, part))[row] for result in results.values()])
             for key, part in parts.items()
         }
-        found["upper"] = rounded([one[row].value for one in limits.values()])
-        return found | {"imaged": bool(imaged[row])}
+        values["upper"] = rounded([limit[row].value for limit in limits.values()])
+        return values | {"imaged": bool(imaged[row])}
 
     def save(file, write):
         place = path.parent / file

@@ -159,7 +159,8 @@ class ExposureMeasurement(Measurement):
         from miricigale.photometry.commands.page import empty_positions
         from miricigale.photometry.fit.forced import ForcedPhotometer
 
-        images, result = self.pixels.images[band], self.results[band]
+        images = self.pixels.images[band]
+        result = self.results[band]
         if result.exposures is None:
             return images, None
         image = images[0].copy()

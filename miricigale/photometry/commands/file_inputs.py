@@ -45,52 +45,52 @@ class Inputs:
     options: dict = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def of(cls, image, highres, *, detection=(), kernel=None, **given):
+    def of(cls, image, highres, *, detection=(), kernel=None, **settings):
         """Of the arguments of `~miricigale.photometry.measure_files`."""
         images, kernels = (v if isinstance(v, (list, tuple)) else [v] for v in (image, kernel))
         kernels = [None] * len(images) if kernel is None else kernels
         if len(kernels) != len(images):
             raise argument_error("kernel", f"one for each of {len(images)} images", len(kernels))
         files = [
-            one if isinstance(one, MosaicFile) else MosaicFile(one)
-            for one in (highres, *images, *detection)
+            file if isinstance(file, MosaicFile) else MosaicFile(file)
+            for file in (highres, *images, *detection)
         ]
         n = 1 + len(images)
         parts = {"highres": files[0], "images": tuple(files[1:n]), "detection": tuple(files[n:])}
-        names = {one.name for one in dataclasses.fields(cls)}
-        options = {name: given.pop(name) for name in sorted(given.keys() - names)}
-        return cls(**parts, kernels=tuple(kernels), options=options, **given)
+        names = {field.name for field in dataclasses.fields(cls)}
+        options = {name: settings.pop(name) for name in sorted(settings.keys() - names)}
+        return cls(**parts, kernels=tuple(kernels), options=options, **settings)
 
     @property
     def bands(self):
         """Names of the filters."""
-        return [one.header.filter for one in self.images]
+        return [file.header.filter for file in self.images]
 
     @property
     def _named(self):
         named = [("segmentation", self.segmentation), ("catalog", self.catalog)]
-        named += [("highres_psf", self.highres.psf), *(("psf", one.psf) for one in self.images)]
-        named += [("kernel", one) for one in self.kernels]
-        return [(what, path) for what, path in named if path is not None]
+        named += [("highres_psf", self.highres.psf), *(("psf", file.psf) for file in self.images)]
+        named += [("kernel", path) for path in self.kernels]
+        return [(argument, path) for argument, path in named if path is not None]
 
     @property
     def paths(self):
         """Files that are read, maps of the noise left out."""
         files = [*self.images, self.highres, *self.detection]
-        return [one.path for one in files] + [path for _, path in self._named]
+        return [file.path for file in files] + [path for _, path in self._named]
 
     def check(self):
         """Refuse, before any image is read, what is missing, or not what it should be."""
-        for one in self.images:
-            _check_images(one, self.highres)
-        for what, path in self._named:
+        for image in self.images:
+            _check_images(image, self.highres)
+        for argument, path in self._named:
             if not os.path.isfile(file_place(path)[0]):
-                msg = f"no file {path} ('{what}')"
+                msg = f"no file {path} ('{argument}')"
                 raise DataError(msg)
-        for one, own in zip(self.images, self.kernels, strict=True):
+        for image, kernel in zip(self.images, self.kernels, strict=True):
             if self.catalog is not None:
-                _check_catalog(self.catalog, one, self.highres)
-            _check_psfs(one, self.highres, own)
+                _check_catalog(self.catalog, image, self.highres)
+            _check_psfs(image, self.highres, kernel)
         self._check_bands()
 
     def _check_bands(self):
@@ -108,9 +108,9 @@ class Inputs:
         """About how many bytes parts of these shapes take, with sources; without, the whole images alone."""
         dense = 0 if prior is None else _BYTES["sources"]
         prior = self.highres.header.shape if prior is None else prior
-        images = [one.header.shape for one in self.images] if images is None else images
+        images = [image.header.shape for image in self.images] if images is None else images
         fine = np.prod(prior, dtype=float) * (1 + len(self.detection))
-        coarse = sum(np.prod(one, dtype=float) for one in images)
+        coarse = sum(np.prod(shape, dtype=float) for shape in images)
         return int(_BYTES["process"] + _BYTES["prior"] * fine + _BYTES["image"] * coarse + dense)
 
     def read(self, prior=None, images=None):
@@ -130,23 +130,29 @@ class Inputs:
             Of the parts without data there are images that hold no source.
         """
         if images is None:
-            found = {k: one.read() for k, one in zip(self.bands, self.images, strict=True)}
-            return Pixels(self.highres.read(), [one.read() for one in self.detection], found)
+            images_of_bands = {
+                k: file.read() for k, file in zip(self.bands, self.images, strict=True)
+            }
+            return Pixels(
+                self.highres.read(), [file.read() for file in self.detection], images_of_bands
+            )
         away = self.highres.header.wcs.pixel_to_world(0, 0).icrs
         away = away.directional_offset_by(0 * u.deg, 90 * u.deg)
-        found = {}
-        for band, one, part in zip(self.bands, self.images, images, strict=True):
-            image = part and one.replace(section=part).read()
-            found[band] = image or _blank((3, 3), north_up_wcs(away, 1 * u.arcsec, (3, 3)))
-        whole = self.highres.header
+        images_of_bands = {}
+        for band, file, part in zip(self.bands, self.images, images, strict=True):
+            image = part and file.replace(section=part).read()
+            images_of_bands[band] = image or _blank(
+                (3, 3), north_up_wcs(away, 1 * u.arcsec, (3, 3))
+            )
+        whole_header = self.highres.header
         if prior is None:
-            return Pixels(_blank((3, 3), whole.wcs), [], found)
-        files = [one.replace(section=prior) for one in (self.highres, *self.detection)]
-        sharp, *others = (one.read() for one in files)
+            return Pixels(_blank((3, 3), whole_header.wcs), [], images_of_bands)
+        files = [file.replace(section=prior) for file in (self.highres, *self.detection)]
+        sharp, *detection = (file.read() for file in files)
         if sharp is None:
             # its pixels are those of the segments
             sharp = _blank(files[0].header.shape, files[0].header.wcs)
-        return Pixels(sharp, [one for one in others if one is not None], found)
+        return Pixels(sharp, [image for image in detection if image is not None], images_of_bands)
 
     def fit_options(self, n_threads=None):
         """Options of a `~miricigale.photometry.ForcedPhotometer`, with the defaults of files."""
@@ -158,12 +164,12 @@ class Inputs:
         from miricigale.photometry import ForcedPhotometer
 
         options = self.fit_options(n_threads)
-        found = {}
-        for band, one, own in zip(self.bands, self.images, self.kernels, strict=True):
-            kernel = matching_kernel(one, self.highres, own)
-            stars = self.psf_stars if own is None else False
-            found[band] = ForcedPhotometer(kernel, psf_stars=stars, **options)
-        return found
+        photometers = {}
+        for band, file, path in zip(self.bands, self.images, self.kernels, strict=True):
+            kernel = matching_kernel(file, self.highres, path)
+            stars = self.psf_stars if path is None else False
+            photometers[band] = ForcedPhotometer(kernel, psf_stars=stars, **options)
+        return photometers
 
     def find_sources(self, pixels, catalog=None, part=None):
         """Segments and sources (as of `~miricigale.photometry.read_prior`); ``part`` is () without a prior."""
@@ -174,14 +180,16 @@ class Inputs:
             sources_of,
         )
 
-        prior, others = pixels.prior, pixels.detection
+        prior = pixels.prior
+        detection = pixels.detection
         if self.segmentation is None or part == ():
-            return detected_prior(chi_image([prior, *others]) if others else prior, catalog)
+            return detected_prior(chi_image([prior, *detection]) if detection else prior, catalog)
         if part is None:
             return read_prior(prior, segmentation=self.segmentation, catalog=catalog)
-        whole, what = self.highres.header, ("a segmentation map", "the segmentation", SEGMENTS)
-        grid = whole.shape, whole.wcs, self.highres.path
-        with open_map(self.segmentation, *what, grid) as hdu:
+        header = self.highres.header
+        roles = ("a segmentation map", "the segmentation", SEGMENTS)
+        grid = header.shape, header.wcs, self.highres.path
+        with open_map(self.segmentation, *roles, grid) as hdu:
             return sources_of(prior, np.array(plane_data(hdu, part)), catalog)
 
     def measure(self, pixels, photometers, segments, sources):
@@ -212,21 +220,24 @@ class Measurement:
         """The table of all bands."""
         from miricigale.photometry.fit.bands import join_bands
 
-        inputs, found = self.inputs, self.results
-        if len(found) == 1:
-            ((band, one),) = found.items()
-            table = one.to_table(band, confidence=inputs.confidence)
+        inputs = self.inputs
+        results = self.results
+        if len(results) == 1:
+            ((band, result),) = results.items()
+            table = result.to_table(band, confidence=inputs.confidence)
         else:
-            each = {k: one.to_table(confidence=inputs.confidence) for k, one in found.items()}
-            table = join_bands(each)
-        paths = [str(one.path) for one in inputs.images]
+            tables = {
+                k: result.to_table(confidence=inputs.confidence) for k, result in results.items()
+            }
+            table = join_bands(tables)
+        paths = [str(file.path) for file in inputs.images]
         paths = paths[0] if len(paths) == 1 else paths
         table.meta.update(image=paths, highres=str(inputs.highres.path))
         return table
 
     def products(self, name):
         """Models (``"model"``) or residuals (``"residual"``), one for each image that was read."""
-        return [getattr(one, f"{name}_image") for one in self.results.values()]
+        return [getattr(result, f"{name}_image") for result in self.results.values()]
 
     def write_page(self, path):
         """Write the page, of those bands that have data."""
@@ -244,7 +255,8 @@ class Measurement:
             if result.exposures is not None or isinstance(kernel, KernelField):
                 kernel = kernel.mean
             measured.append(Measured(name, result, image, kernel, pulls))
-        confidence, seed = self.inputs.confidence, self.inputs.seed
+        confidence = self.inputs.confidence
+        seed = self.inputs.seed
         write_page(path, measured, self.pixels.prior, self.segments, confidence, seed)
 
     def _shown(self, band):
@@ -262,31 +274,38 @@ def _blank(shape, wcs):
 
 def _check_images(image, highres):
     """Refuse images that are not what they should be, or do not overlap."""
-    wanted, stated = image.filter, [MosaicFile(one.path).header.filter for one in (image, highres)]
-    if wanted is not None and stated[0] not in (None, wanted) and stated[1] == wanted:
+    wanted = image.filter
+    header_filters = [MosaicFile(file.path).header.filter for file in (image, highres)]
+    if (
+        wanted is not None
+        and header_filters[0] not in (None, wanted)
+        and header_filters[1] == wanted
+    ):
         msg = (
             f"'image' and 'highres' seem to be swapped: {highres.path} is the image in {wanted}, "
-            f"{image.path} is in {stated[0]}"
+            f"{image.path} is in {header_filters[0]}"
         )
         raise ValueError(msg)
-    found, _ = (one.header.filter for one in (image, highres))
-    if found is None:
+    name, _ = (file.header.filter for file in (image, highres))
+    if name is None:
         wanted = f"given, for the header of {image.path} does not name it"
         raise argument_error("filter", wanted, None)
-    if found not in Filter.names() and not found.startswith("sedpy."):
+    if name not in Filter.names() and not name.startswith("sedpy."):
         wanted = f"a filter that 'miricigale filters' lists, for {image.path}"
-        raise argument_error("filter", wanted, repr(found))
-    for one in (image, highres):
+        raise argument_error("filter", wanted, repr(name))
+    for file in (image, highres):
         try:
-            grid_angle(one.header.wcs, one.header.shape)
+            grid_angle(file.header.wcs, file.header.shape)
         except ValueError as err:
-            msg = f"{one.path}: {err}"
+            msg = f"{file.path}: {err}"
             raise ValueError(msg) from err
     if not (_overlap(image.header, highres.header) or _overlap(highres.header, image.header)):
-        where = [_middle(one.header).to_string("decimal", precision=4) for one in (image, highres)]
+        middles = [
+            _middle(file.header).to_string("decimal", precision=4) for file in (image, highres)
+        ]
         msg = (
             f"'image' and 'highres' show different fields: the middle of {image.path} is at "
-            f"{where[0]}, that of {highres.path} at {where[1]} deg"
+            f"{middles[0]}, that of {highres.path} at {middles[1]} deg"
         )
         raise ValueError(msg)
 
@@ -303,11 +322,11 @@ def _inside(sky, header):
     return np.isfinite(sky_pixels(sky, header.wcs, header.shape, 0.0)).any()
 
 
-def _overlap(one, other):
+def _overlap(first, second):
     """Whether some of a coarse grid of pixels of one image are on the other."""
-    axes = [np.linspace(0, n - 1, 15) for n in one.shape]
+    axes = [np.linspace(0, n - 1, 15) for n in first.shape]
     y, x = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
-    return _inside(one.wcs.pixel_to_world(x, y), other)
+    return _inside(first.wcs.pixel_to_world(x, y), second)
 
 
 def _check_psfs(image, highres, kernel):
@@ -337,16 +356,16 @@ def _check_catalog(path, image, highres):
     from miricigale.photometry.detection.prior_catalog import read_catalog
 
     sky = read_catalog(path, epoch=epoch_of(highres.header))["sky"]
-    for what, file in (("image", image), ("highres", highres)):
+    for argument, file in (("image", image), ("highres", highres)):
         if _inside(sky, file.header):
             continue
-        msg = f"none of the {len(sky)} sources of {path} is on {file.path} ('{what}')"
-        known = np.isfinite(sky.ra.deg)
-        hours = SkyCoord(15 * sky.ra[known], sky.dec[known])
+        msg = f"none of the {len(sky)} sources of {path} is on {file.path} ('{argument}')"
+        is_known = np.isfinite(sky.ra.deg)
+        hours = SkyCoord(15 * sky.ra[is_known], sky.dec[is_known])
         if _inside(hours, file.header):
             msg += ": is ra in hours? Wanted are degrees, or a column with a unit"
-        elif known.any():
-            first = sky[known][0].to_string("decimal", precision=4)
-            where = _middle(file.header).to_string("decimal", precision=4)
-            msg += f": the first is at {first}, the middle of the image at {where} deg"
+        elif is_known.any():
+            first = sky[is_known][0].to_string("decimal", precision=4)
+            middle = _middle(file.header).to_string("decimal", precision=4)
+            msg += f": the first is at {first}, the middle of the image at {middle} deg"
         raise ValueError(msg)

@@ -119,8 +119,8 @@ def measure_files(
             ("residual", k): _labelled(residual, label),
         }
     results = {key: path for key, path in results.items() if path is not None}
-    for (what, _), path in results.items():
-        check_output(path, what, overwrite=overwrite, inputs=inputs.paths, **_KINDS[what])
+    for (kind, _), path in results.items():
+        check_output(path, kind, overwrite=overwrite, inputs=inputs.paths, **_KINDS[kind])
     if page is not None:
         # the modules of pages are not needed where none is written
         from miricigale.photometry.commands.browser import browser_files
@@ -128,8 +128,8 @@ def measure_files(
         check_outputs(browser_files(page), "page", overwrite=overwrite, inputs=inputs.paths)
     written = [Path(path).resolve() for path in results.values()]
     if len(set(written)) < len(written):
-        given = ", ".join(dict.fromkeys(what for what, _ in results))
-        raise argument_error(given, "different files", [str(path) for path in written])
+        arguments = ", ".join(dict.fromkeys(kind for kind, _ in results))
+        raise argument_error(arguments, "different files", [str(path) for path in written])
     inputs.check()
     check_memory(inputs.n_bytes(), "photometry of whole images", advice=_IN_PATCHES)
     with progress(show=progress_bar, total=4, desc="images", unit="steps") as bar:
@@ -149,9 +149,9 @@ def measure_files(
         if output is not None:
             with replacing(output, overwrite=overwrite) as partial:
                 write_table(table, partial)
-        for what in {"model", "residual"} & {one for one, _ in results}:
-            for k, image in enumerate(measured.products(what)):
-                with replacing(results[what, k]) as partial:
+        for kind in {"model", "residual"} & {kind for kind, _ in results}:
+            for k, image in enumerate(measured.products(kind)):
+                with replacing(results[kind, k]) as partial:
                     write_image(image, partial)
         if page is not None:
             measured.write_page(page)

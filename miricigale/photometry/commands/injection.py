@@ -30,7 +30,8 @@ from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, check_count
 _POINT = 0.05
 
 #: Least distance of two injected sources in widths of the PSF (FWHM), and attempts to place each.
-_APART, _ATTEMPTS = 4.0, 50
+_APART = 4.0
+_ATTEMPTS = 50
 
 #: Injected fluxes, over the median error of sources by noise: uniform in the logarithm between these.
 _SNR_RANGE = (1.0, 100.0)
@@ -39,7 +40,8 @@ _SNR_RANGE = (1.0, 100.0)
 _HARMLESS = ForcedFlags.BLENDED | ForcedFlags.POOR_FIT | ForcedFlags.UNEXPLAINED_NEIGHBOR
 
 #: Half-width (fine pixels) of the stamps that are injected into the prior, least and most.
-_HALF, _MOST = 16, 96
+_HALF = 16
+_MOST = 96
 
 
 def calibrate_errors(
@@ -145,7 +147,9 @@ class _Field:
     """The images, the sources that are copied, and free places."""
 
     def __init__(self, photometer, image, highres, segmentation, catalog):
-        self.photometer, self.image, self.highres = photometer, image, highres
+        self.photometer = photometer
+        self.image = image
+        self.highres = highres
         self.base = photometer.measure(image, highres, segmentation, catalog)
         error = self.base.flux_err_noise.value
         if not np.isfinite(error).any():
@@ -155,7 +159,7 @@ class _Field:
         place = image if highres is None else highres
         self.sky = at_epoch(catalog["sky"], epoch_of(place), "catalog")
         self.fwhm = self.base.psf_fwhm.value
-        self.labels = self.own = None
+        self.labels = self.own_labels = None
         self.donors = []
         if highres is None or segmentation is None or photometer.template == "psf":
             return
@@ -167,17 +171,19 @@ class _Field:
         self.models = ShapeModels(source / source.sum())
         templates = SourceTemplates.from_images(highres, segmentation, catalog, psf=source)
         if "label" in catalog.colnames:
-            self.own = np.asarray(catalog["label"], int)
+            self.own_labels = np.asarray(catalog["label"], int)
         else:
             xy = np.stack(highres.wcs.world_to_pixel(catalog["sky"]), axis=-1).reshape(-1, 2)
-            self.own, _ = nearest_values(self.labels, xy)
+            self.own_labels, _ = nearest_values(self.labels, xy)
         places = scipy.ndimage.find_objects(self.labels)
         usable = (self.base.flags & ~int(_HARMLESS) == 0) & (templates.flags == 0)
-        found = zip(templates.fitted, templates.kind, self.own, strict=True)
+        candidates = zip(templates.fitted, templates.kind, self.own_labels, strict=True)
         donors = [
-            self._donor(*one, places) for one, good in zip(found, usable, strict=True) if good
+            self._donor(*candidate, places)
+            for candidate, good in zip(candidates, usable, strict=True)
+            if good
         ]
-        self.donors = [one for one in donors if one is not None]
+        self.donors = [donor for donor in donors if donor is not None]
         wanted = "with sources that are points or profiles, to be copied"
         check_that(self.donors, "highres", wanted, "none")
 
@@ -190,7 +196,8 @@ class _Field:
             return None
         parameters = np.array(fitted["parameters"])
         if kind == "point":
-            parameters[2], parameters[3:] = np.log(_POINT), 0.0
+            parameters[2] = np.log(_POINT)
+            parameters[3:] = 0.0
         mask = self.labels[place] == label
         corner = np.array([place[1].start, place[0].start])
         moved = parameters - [*corner, 0, 0, 0, 0]
@@ -203,44 +210,45 @@ class _Field:
             return None
         return _Donor(parameters, float(light), mask, corner, kind == "point")
 
-    def _places(self, n, rng, taken):
+    def _places(self, n, rng, occupied):
         """Sky positions on usable pixels of the image, apart from each other."""
         y, x = np.nonzero(self.arrays.usable)
-        apart = _APART * self.fwhm / pixel_scale(self.image.wcs)
-        found = []
+        min_distance = _APART * self.fwhm / pixel_scale(self.image.wcs)
+        positions = []
         for _ in range(_ATTEMPTS * n):
-            if len(found) == n:
+            if len(positions) == n:
                 break
             k = rng.integers(len(x))
             at = np.array([x[k], y[k]]) + rng.uniform(-0.5, 0.5, 2)
-            near = np.array([*taken, *found]).reshape(-1, 2)
-            if len(near) and np.min(np.hypot(*(near - at).T)) < apart:
+            placed = np.array([*occupied, *positions]).reshape(-1, 2)
+            if len(placed) and np.min(np.hypot(*(placed - at).T)) < min_distance:
                 continue
-            found.append(at)
-        return found
+            positions.append(at)
+        return positions
 
     def trial(self, n, rng):
         """Inject sources and measure them: a table of true and measured fluxes."""
         at = self._places(2 * n, rng, [])
         check_that(len(at) >= 2, "image", "large enough for sources", "none")
-        full, empty = np.array(at[::2]), np.array(at[1::2])
+        full = np.array(at[::2])
+        empty = np.array(at[1::2])
         flux = self.error * np.exp(rng.uniform(*np.log(_SNR_RANGE), len(full)))
         new = self._galaxies(full, flux, rng) if self.donors else self._points(full, flux)
         light = self.photometer.render(self.image, new.light, new.flux * FNU)
         image = _with_light(self.image, light)
         nothing = self.image.wcs.pixel_to_world(*empty.T).transform_to(self.sky.frame)
-        both = QTable({"sky": joined_sky([self.sky, new.catalog["sky"], nothing])})
-        if self.own is not None:
-            both["label"] = np.concatenate(
-                [self.own, new.catalog["label"], np.zeros(len(empty), int)]
+        catalog = QTable({"sky": joined_sky([self.sky, new.catalog["sky"], nothing])})
+        if self.own_labels is not None:
+            catalog["label"] = np.concatenate(
+                [self.own_labels, new.catalog["label"], np.zeros(len(empty), int)]
             )
-        result = self.photometer.measure(image, new.highres, new.labels, both)
+        result = self.photometer.measure(image, new.highres, new.labels, catalog)
         table = QTable({"kind": np.append(new.kind, np.full(len(empty), "empty", "U6"))})
         table["flux_true"] = np.append(new.flux, np.zeros(len(empty))) * FNU
-        rows = np.arange(len(self.sky), len(both))
+        rows = np.arange(len(self.sky), len(catalog))
         for name in ("flux", "flux_err", "flux_err_noise", "flags", "template", "template_snr"):
             table[name] = getattr(result, name)[rows]
-        table["sky"] = both["sky"][rows].icrs
+        table["sky"] = catalog["sky"][rows].icrs
         return table
 
     def _points(self, at, flux):
@@ -255,19 +263,22 @@ class _Field:
         """Copies of the prior's sources, with their segments."""
         wcs = self.highres.wcs
         places = np.array(wcs.world_to_pixel(self.image.wcs.pixel_to_world(*at.T))).T
-        data, labels, first = np.zeros(self.labels.shape), self.labels.copy(), self.labels.max() + 1
-        rows, light = [], []
+        data = np.zeros(self.labels.shape)
+        labels = self.labels.copy()
+        first = self.labels.max() + 1
+        rows = []
+        light = []
         for (x, y), total in zip(places, flux, strict=True):
             donor = self.donors[rng.integers(len(self.donors))]
             shift = np.rint([x, y] - donor.parameters[:2]).astype(int)
             corner = donor.corner + shift
             h, w = donor.mask.shape
             cut = np.s_[corner[1] : corner[1] + h, corner[0] : corner[0] + w]
-            free = labels[cut]
-            if corner.min() < 0 or free.shape != (h, w) or not self.fine.usable[cut].all():
+            labels_there = labels[cut]
+            if corner.min() < 0 or labels_there.shape != (h, w) or not self.fine.usable[cut].all():
                 continue
             # another source there would own the light
-            if np.any(free[donor.mask] != 0):
+            if np.any(labels_there[donor.mask] != 0):
                 continue
             shape = Shape(donor.light, donor.parameters + [*shift, 0, 0, 0, 0], 0.0, None)
             self._paint(data, shape)
@@ -275,10 +286,10 @@ class _Field:
             rows.append((total, donor.point, corner + (np.array([w, h]) - 1) / 2))
             light.append(shape.drawn(1.0, max(self.models.reach, 2 * shape.axes[0])))
         check_that(rows, "image", "large enough for sources", "none")
-        flux, point, middle = (np.array(one) for one in zip(*rows, strict=True))
+        flux, point, middle = (np.array(column) for column in zip(*rows, strict=True))
         # positions are those that detection would find
-        own = np.maximum(labels - (first - 1), 0)
-        x, y = bright_centroids(self.fine.flux + data, own, middle.T)
+        new_labels = np.maximum(labels - (first - 1), 0)
+        x, y = bright_centroids(self.fine.flux + data, new_labels, middle.T)
         catalog = QTable({"sky": wcs.pixel_to_world(x, y).transform_to(self.sky.frame)})
         catalog["label"] = first + np.arange(len(rows))
         kinds = np.where(point, "point", "galaxy")
@@ -294,12 +305,12 @@ class _Field:
         x, y = np.rint(shape.parameters[:2]).astype(int)
         moved = shape.parameters - [x - half, y - half, 0, 0, 0, 0]
         stamp = shape.flux * self.models.profiles((2 * half + 1,) * 2, moved)[0]
-        here, own = overlap_slices(image.shape, stamp.shape, (y, x))
-        image[here] += stamp[own]
+        inside, source = overlap_slices(image.shape, stamp.shape, (y, x))
+        image[inside] += stamp[source]
 
 
 def _with_light(image, light):
     """A copy of an image with light (a quantity) added to it, whose noise is not known."""
-    found = image.copy()
-    found.data = image.data + light.to_value(image.unit)
-    return found
+    changed = image.copy()
+    changed.data = image.data + light.to_value(image.unit)
+    return changed

@@ -25,13 +25,16 @@ from miricigale.utils.package_tables import declared
 from miricigale.utils.units import ANGLE, ab_magnitude
 
 #: Largest number of pixels across a drawing of a whole image, rows of a table, arcsec across a source.
-_ACROSS, _ROWS, _SIZE = 1500, 40, 12.0
+_ACROSS = 1500
+_ROWS = 40
+_SIZE = 12.0
 #: Largest number of empty positions at which errors are tested.
 _EMPTY = 400
 #: Number of stars that are drawn.
 _STARS = 6
 #: Signal-to-noise above which a poor fit points to a wrong PSF, and above which there is a magnitude.
-_BRIGHT, _DETECTED = 20.0, 3.0
+_BRIGHT = 20.0
+_DETECTED = 3.0
 
 
 #: A band on the page: name, result, image, kernel, and pulls at empty positions (made by `write_page`).
@@ -50,86 +53,89 @@ def write_page(path, bands, highres, segments, confidence, seed):
     are of the ``confidence``, and ``seed`` that of the empty positions.
     """
     tested = []
-    for one in bands:
-        pulls = empty_pulls(one.result, one.kernel, seed) if one.pulls is None else one.pulls
-        tested.append(one._replace(pulls=pulls))
+    for band in bands:
+        pulls = empty_pulls(band.result, band.kernel, seed) if band.pulls is None else band.pulls
+        tested.append(band._replace(pulls=pulls))
     bands = tested
-    names = ", ".join(one.name for one in bands)
-    files = ", ".join(Path(one.image.meta["source"]).name for one in bands)
-    title, prior = f"Forced photometry: {names}", Path(highres.meta["source"]).name
+    names = ", ".join(band.name for band in bands)
+    files = ", ".join(Path(band.image.meta["source"]).name for band in bands)
+    title = f"Forced photometry: {names}"
+    prior = Path(highres.meta["source"]).name
     report = Page(title, subtitle=f"{files} on the prior {prior}")
     page = SectionWriter(report, declared("miricigale.photometry"))
     page.facts = {"confidence": f"{100 * confidence:g}", "detected": f"{_DETECTED:g}"}
     browser = write_browser(Path(path), title, bands, highres, confidence, _DETECTED)
     _notices(page, bands, highres)
     page.section("summary", browser=Link("one by one", browser))
-    page.table("table", (_summary(one) for one in bands))
+    page.table("table", (_summary(band) for band in bands))
     page.section("images")
-    for one in bands:
-        page.figure("whole", _whole(one.result), band=one.name)
-    for one in bands:
-        result = one.result
-        for k, what in _examples(result):
+    for band in bands:
+        page.figure("whole", _whole_image(band.result), band=band.name)
+    for band in bands:
+        result = band.result
+        for k, reason in _examples(result):
             facts = {"id": result.id[k], "snr": result.snr[k], "chi2": result.chi2[k]}
             figure = _zoom(result, highres, segments, k)
-            page.figure("source", figure, what=what, band=one.name, **facts)
+            page.figure("source", figure, what=reason, band=band.name, **facts)
     page.section("magnitudes")
-    for one in bands:
-        page.figure("figure", _magnitudes(one, confidence))
-    tested = [one for one in bands if one.pulls is not None]
+    for band in bands:
+        page.figure("figure", _magnitudes(band, confidence))
+    tested = [band for band in bands if band.pulls is not None]
     if tested:
         page.section("pulls")
-    for one in tested:
+    for band in tested:
         figure, axes = new_figure(1, 1, size=(5.6, 3.4))
-        plot_pulls(one.pulls, ax=axes[0, 0], limit=6.0).set_xlabel("flux / error")
-        page.figure("figure", figure, n=len(one.pulls), band=one.name)
-    joint = [one for one in bands if one.result.exposures is not None]
+        plot_pulls(band.pulls, ax=axes[0, 0], limit=6.0).set_xlabel("flux / error")
+        page.figure("figure", figure, n=len(band.pulls), band=band.name)
+    joint = [band for band in bands if band.result.exposures is not None]
     if joint:
         page.section("exposures")
-    for one in joint:
-        page.table("table", _exposure_rows(one.result.exposures.table), band=one.name)
-    shown = [one for one in bands if one.result.psf_stars is not None]
+    for band in joint:
+        page.table("table", _exposure_rows(band.result.exposures.table), band=band.name)
+    shown = [band for band in bands if band.result.psf_stars is not None]
     if shown:
         page.section("stars")
-    for one in shown:
-        _stars(page, one.result.psf_stars, one.name)
+    for band in shown:
+        _stars(page, band.result.psf_stars, band.name)
     _flag_table(page, bands)
     page.section("sources", n=min(_ROWS, len(bands[0].result)), n_all=len(bands[0].result))
-    for one in bands:
-        page.table("table", _source_rows(one.result, confidence), band=one.name)
+    for band in bands:
+        page.table("table", _source_rows(band.result, confidence), band=band.name)
     _input_table(page, bands, highres)
     report.write(path, overwrite=True)
 
 
 def _notices(page, bands, highres):
-    noted = [(f"image ({one.name})", one.image) for one in bands]
-    for one in bands:
-        result, rms = one.result, _pulls_rms(one.pulls)
-        if one.kernel.target is None:
+    noted = [(f"image ({band.name})", band.image) for band in bands]
+    for band in bands:
+        result = band.result
+        rms = _pulls_rms(band.pulls)
+        if band.kernel.target is None:
             page.notice("no_psfs")
         bright = np.nan_to_num(result.snr) > _BRIGHT
         poor = bright & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
-        n, n_poor = np.count_nonzero(bright), np.count_nonzero(poor)
+        n = np.count_nonzero(bright)
+        n_poor = np.count_nonzero(poor)
         if n >= 5 and n_poor > 0.5 * n:
-            page.notice("poor", n_poor=n_poor, n=n, bright=_BRIGHT, band=one.name)
-        if one.pulls is not None and len(one.pulls) >= 100 and not 0.8 < rms < 1.25:
-            page.notice("pulls", rms=rms, band=one.name)
+            page.notice("poor", n_poor=n_poor, n=n, bright=_BRIGHT, band=band.name)
+        if band.pulls is not None and len(band.pulls) >= 100 and not 0.8 < rms < 1.25:
+            page.notice("pulls", rms=rms, band=band.name)
         evidence = result.meta.get("second_pass", {})
         if evidence.get("peaks") and not evidence["fitted"]:
-            page.notice("unfitted", **evidence, band=one.name)
+            page.notice("unfitted", **evidence, band=band.name)
         offset, error = (np.array(result.meta.get(k, [0.0])) for k in ("offset", "offset_err"))
-        least = 0.1 * pixel_scale(result.residual_image.wcs)
-        if result.shift is None and np.any((abs(offset) > least) & (abs(offset) > 3 * error)):
-            page.notice("offset", offset=_pairs(result.meta), band=one.name)
-    for what, one in (*noted, ("prior", highres)):
-        scale = one.meta.get("noise_scale")
-        if one.meta.get("n_filled"):
-            page.notice("filled", n=one.meta["n_filled"], what=what)
-        if one.uncertainty is None:
-            page.notice("no_noise", what=what)
+        threshold = 0.1 * pixel_scale(result.residual_image.wcs)
+        if result.shift is None and np.any((abs(offset) > threshold) & (abs(offset) > 3 * error)):
+            page.notice("offset", offset=_pairs(result.meta), band=band.name)
+    for name, image in (*noted, ("prior", highres)):
+        scale = image.meta.get("noise_scale")
+        if image.meta.get("n_filled"):
+            page.notice("filled", n=image.meta["n_filled"], what=name)
+        if image.uncertainty is None:
+            page.notice("no_noise", what=name)
         elif scale is not None and not 0.1 < scale < 10:
-            done = "were scaled by it" if "weight_scale" in one.meta else "were kept"
-            page.notice("noise", what=what, scale=scale, done=done)
+            done = "were scaled by it" if "weight_scale" in image.meta else "were kept"
+            page.notice("noise", what=name, scale=scale, done=done)
     level = highres.meta.get("sky_over_noise", 0.0)
     if abs(level) > 1:
         page.notice("sky", level=level)
@@ -138,8 +144,8 @@ def _notices(page, bands, highres):
 def _exposure_rows(table):
     """Rows of the table of exposures that were fitted together."""
     rows = []
-    for one in table:
-        row = {name: getattr(one[name], "value", one[name]) for name in table.colnames}
+    for exposure in table:
+        row = {name: getattr(exposure[name], "value", exposure[name]) for name in table.colnames}
         offset = f"{row['offset_east']:+.3f}, {row['offset_north']:+.3f} ± {row['offset_err']:.3f}"
         sky = f"{row['sky']:.5g} ± {row['sky_err']:.1g}"
         rows.append(row | {"source": Path(row["source"]).name, "offset": offset, "level": sky})
@@ -148,8 +154,8 @@ def _exposure_rows(table):
 
 def _pairs(meta):
     """The offset of an image along x and y with its errors, as text."""
-    both = zip(meta["offset"], meta["offset_err"], strict=True)
-    return ", ".join(f"{x:+.3f} ± {error:.3f}" for x, error in both)
+    pairs = zip(meta["offset"], meta["offset_err"], strict=True)
+    return ", ".join(f"{x:+.3f} ± {error:.3f}" for x, error in pairs)
 
 
 def _pulls_rms(pulls):
@@ -157,26 +163,28 @@ def _pulls_rms(pulls):
     return float(mad_std(values)) if len(values) else np.nan
 
 
-def _summary(one):
-    result, good = one.result, np.isfinite(one.result.flux.value)
+def _summary(band):
+    result = band.result
+    good = np.isfinite(band.result.flux.value)
     errors = result.flux_err[good & (result.flags == 0)]
     values = {
-        "band": one.name,
+        "band": band.name,
         "n": len(result),
         "n_measured": np.count_nonzero(good),
         "n_detected": np.count_nonzero(good & (result.snr > 5)),
         "depth": (5 * np.median(errors)).to_value(u.ABmag) if len(errors) else np.nan,
-        "rms": _pulls_rms(one.pulls),
+        "rms": _pulls_rms(band.pulls),
         "background": Missing("not fitted"),
         "offset": _pairs(result.meta) if "offset" in result.meta else Missing("no light"),
     }
     if result.background is not None:
-        background, error = result.background.value, result.background_err.value
+        background = result.background.value
+        error = result.background_err.value
         values["background"] = f"{background:.3g} ± {error:.1g}"
     return values
 
 
-def _whole(result):
+def _whole_image(result):
     model = result.model_image.data
     step = max(1, -(-max(model.shape) // _ACROSS))
     data = result.residual_image.data + model
@@ -196,12 +204,12 @@ def _examples(result):
     clean = good & (result.flags == 0)
     chosen = {}
     if good.any():
-        what = "the brightest without a flag" if clean.any() else "the brightest"
-        chosen[what] = np.argmax(np.where(clean if clean.any() else good, snr, -np.inf))
+        reason = "the brightest without a flag" if clean.any() else "the brightest"
+        chosen[reason] = np.argmax(np.where(clean if clean.any() else good, snr, -np.inf))
     poor = good & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
     if poor.any():
         chosen["the poorest fit"] = np.argmax(np.where(poor, result.chi2, -np.inf))
-    return [(int(k), what) for what, k in chosen.items()]
+    return [(int(k), reason) for reason, k in chosen.items()]
 
 
 def _zoom(result, highres, segments, k):
@@ -209,11 +217,13 @@ def _zoom(result, highres, segments, k):
 
     def square(data, wcs, fill=np.nan):
         scale = pixel_scale(wcs)
-        at, size = wcs.world_to_pixel(result.sky[k]), 2 * round(_SIZE / 2 / scale) + 1
+        at = wcs.world_to_pixel(result.sky[k])
+        size = 2 * round(_SIZE / 2 / scale) + 1
         cut = Cutout2D(data, at, size, mode="partial", fill_value=fill)
         return cut.data, {"pixel_scale": scale, "center": cut.input_position_cutout}
 
-    model, wcs = result.model_image.data, result.model_image.wcs
+    model = result.model_image.data
+    wcs = result.model_image.wcs
     _, axes = new_figure(1, 4, size=(2.9, 3.0))
     sharp = np.array(highres.data, float)
     if highres.mask is not None:
@@ -232,31 +242,41 @@ def _zoom(result, highres, segments, k):
     return axes[0, 0].figure
 
 
-def _magnitudes(one, confidence):
-    result, xlabel = one.result, f"{plain_text(one.name)} (AB)"
-    figure, [[left, right]] = new_figure(1, 2, size=(5.2, 3.6))
+def _magnitudes(band, confidence):
+    result = band.result
+    xlabel = f"{plain_text(band.name)} (AB)"
+    figure, [[counts_ax, error_ax]] = new_figure(1, 2, size=(5.2, 3.6))
     detected = result.snr > _DETECTED
-    mag, limit = ab_magnitude(result.flux), ab_magnitude(result.upper_limit(confidence))
+    mag = ab_magnitude(result.flux)
+    limit = ab_magnitude(result.upper_limit(confidence))
     error = 1.0857 / np.where(detected, result.snr, np.nan)
-    clean, fainter = detected & (result.flags == 0), np.isfinite(limit) & ~detected
+    clean = detected & (result.flags == 0)
+    fainter = np.isfinite(limit) & ~detected
     shown = np.where(detected, mag, limit)
     if np.isfinite(shown).any():
-        low, high = np.floor(np.nanmin(shown)), np.nanmax(shown)
+        low = np.floor(np.nanmin(shown))
+        high = np.nanmax(shown)
         bins = np.arange(low, max(high, low) + 1.0, 0.5)
-        left.hist(mag[detected], bins, color="0.75", label=f"above {_DETECTED:g} sigma")
-        left.hist(mag[clean], bins, histtype="step", color="#1d4ed8", label="of these, no flag")
-        others = {"color": "#c2410c", "ls": ":", "label": f"limits of others ({confidence:.0%})"}
-        left.hist(limit[fainter], bins, histtype="step", **others)
-        left.legend(frameon=False)
-    left.set(xlabel=xlabel, ylabel="sources")
+        counts_ax.hist(mag[detected], bins, color="0.75", label=f"above {_DETECTED:g} sigma")
+        counts_ax.hist(
+            mag[clean], bins, histtype="step", color="#1d4ed8", label="of these, no flag"
+        )
+        limit_style = {
+            "color": "#c2410c",
+            "ls": ":",
+            "label": f"limits of others ({confidence:.0%})",
+        }
+        counts_ax.hist(limit[fainter], bins, histtype="step", **limit_style)
+        counts_ax.legend(frameon=False)
+    counts_ax.set(xlabel=xlabel, ylabel="sources")
     for rows, marker, color, label in (
         (detected & ~clean, "x", "#c2410c", "flagged"),
         (clean, ".", "#1d4ed8", "no flag"),
     ):
-        right.plot(mag[rows], error[rows], marker, color=color, ms=5, label=label)
-    right.axhline(1.0857 / 5, color="0.5", lw=0.8, ls="--", label="5 sigma")
-    right.set(xlabel=xlabel, ylabel="error (mag)", yscale="log")
-    right.legend(frameon=False)
+        error_ax.plot(mag[rows], error[rows], marker, color=color, ms=5, label=label)
+    error_ax.axhline(1.0857 / 5, color="0.5", lw=0.8, ls="--", label="5 sigma")
+    error_ax.set(xlabel=xlabel, ylabel="error (mag)", yscale="log")
+    error_ax.legend(frameon=False)
     return figure
 
 
@@ -267,22 +287,23 @@ def _stars(page, stars, band):
         changes = ", ".join(
             f"{key.replace('_', ' ')} {x:+.1f} ± {err:.1f} %" for key, x, err in terms
         )
-        what = f"{band} image" if name == "image" else name
-        facts = {"what": what, "n": len(fit.after), "error": 100 * fit.error, "changes": changes}
+        label = f"{band} image" if name == "image" else name
+        facts = {"what": label, "n": len(fit.after), "error": 100 * fit.error, "changes": changes}
         for text in star_texts(fit):
             page.text(text, **facts, **_star_numbers(fit))
         pairs = list(zip(fit.before, fit.after, strict=True))[:_STARS]
         figure, axes = new_figure(len(pairs), 3, size=(3.0, 2.8))
         scale = stars.kernel.pixel_scale.to_value(ANGLE) * np.sqrt(fit.after[0].star.area)
-        plain = {"pixel_scale": scale}
-        pulls = {"limits": (-5, 5), "stretch": "linear", "cmap": "RdBu_r", **plain}
+        form = {"pixel_scale": scale}
+        pulls = {"limits": (-5, 5), "stretch": "linear", "cmap": "RdBu_r", **form}
         for row, (before, after) in zip(axes, pairs, strict=True):
-            star, known = before.star, np.isfinite(before.star.sigma)
-            plot_image(np.where(known, star.data, np.nan), ax=row[0], title="star", **plain)
-            for ax, one, title in ((row[1], before, "model"), (row[2], after, "corrected")):
+            star = before.star
+            has_data = np.isfinite(before.star.sigma)
+            plot_image(np.where(has_data, star.data, np.nan), ax=row[0], title="star", **form)
+            for ax, fit, title in ((row[1], before, "model"), (row[2], after, "corrected")):
                 pull = np.full(star.data.shape, np.nan)
-                pull[known] = one.residual * one.weight
-                plot_image(pull, ax=ax, title=f"{title}, chi2 {one.chi2:.2f}", **pulls)
+                pull[has_data] = fit.residual * fit.weight
+                plot_image(pull, ax=ax, title=f"{title}, chi2 {fit.chi2:.2f}", **pulls)
         page.figure("figure", figure, **facts)
     rows = [dict(zip(stars.table.colnames, row, strict=True)) for row in stars.table]
     for row in rows:
@@ -292,8 +313,8 @@ def _stars(page, stars, band):
 
 def star_texts(fit):
     """Names of texts of a `~miricigale.psf.star_fit.StarPSF`: what was done, and whether that fits the stars."""
-    tried = len(fit.chi2) > 1
-    texts = [fit.kind if tried else "untried"]
+    was_tried = len(fit.chi2) > 1
+    texts = [fit.kind if was_tried else "untried"]
     if fit.chi2[fit.kind] > _UNLIKE * fit.dof:
         texts.append("unlike")
     return texts
@@ -310,7 +331,7 @@ def _flag_table(page, bands):
     page.section("flags")
 
     def row(name, meaning, flux, of):
-        counts = {one.name: np.count_nonzero(of(one.result)) for one in bands}
+        counts = {band.name: np.count_nonzero(of(band.result)) for band in bands}
         return {"flag": name, "meaning": meaning, "flux": flux, **counts}
 
     rows = [row("none", "", "usable", lambda result: result.flags == 0)]
@@ -326,11 +347,11 @@ def _source_rows(result, confidence):
     order = np.argsort(np.nan_to_num(-result.flux.value, nan=np.inf), kind="stable")[:_ROWS]
     table = result.to_table(confidence=confidence)[order]
     rows = []
-    for one in table:
-        row = {name: getattr(one[name], "value", one[name]) for name in table.colnames}
+    for source in table:
+        row = {name: getattr(source[name], "value", source[name]) for name in table.colnames}
         flags = ", ".join(ForcedFlags.names(row["flags"])).replace("_", " ") or "none"
-        position = {"ra": f"{one['sky'].ra.deg:.5f}", "dec": f"{one['sky'].dec.deg:.5f}"}
-        mag, limit = (float(ab_magnitude(one[name])) for name in ("flux", "upper"))
+        position = {"ra": f"{source['sky'].ra.deg:.5f}", "dec": f"{source['sky'].dec.deg:.5f}"}
+        mag, limit = (float(ab_magnitude(source[name])) for name in ("flux", "upper"))
         mag = f"{mag:.2f}" if row["snr"] > _DETECTED else f"> {limit:.2f}"
         lost = Missing("not measured")
         mag = mag if np.isfinite(limit) else lost
@@ -340,22 +361,27 @@ def _source_rows(result, confidence):
 
 def _input_table(page, bands, highres):
     page.section("inputs")
-    files, facts = [(one.name, one.image, one.kernel, "psf") for one in bands], {}
-    for what, image, kernel, psf in (*files, ("prior", highres, bands[0].kernel, "highres_psf")):
-        known = kernel.meta.get("psfs", {}).get(psf, {})
-        facts[what] = {**image.meta, **{f"psf_{key}": v for key, v in known.items()}}
-        facts[what]["pixels"] = f"{image.data.shape[1]} x {image.data.shape[0]}"
-        facts[what]["pixel_scale"] = f"{pixel_scale(image.wcs):.4f}"
+    files = [(band.name, band.image, band.kernel, "psf") for band in bands]
+    facts = {}
+    for name, image, kernel, psf in (*files, ("prior", highres, bands[0].kernel, "highres_psf")):
+        psf_facts = kernel.meta.get("psfs", {}).get(psf, {})
+        facts[name] = {**image.meta, **{f"psf_{key}": v for key, v in psf_facts.items()}}
+        facts[name]["pixels"] = f"{image.data.shape[1]} x {image.data.shape[0]}"
+        facts[name]["pixel_scale"] = f"{pixel_scale(image.wcs):.4f}"
     rows = [
-        {"": label, **{what: _text(known.get(key)) for what, known in facts.items()}}
+        {
+            "": label,
+            **{name: _text(facts_of_image.get(key)) for name, facts_of_image in facts.items()},
+        }
         for key, label in page.texts["inputs"]["facts"].items()
     ]
     page.table("table", rows)
-    for one in bands:
-        values, scale = one.kernel.array, one.kernel.pixel_scale.value
+    for band in bands:
+        values = band.kernel.array
+        scale = band.kernel.pixel_scale.value
         facts = {"size": values.shape[0], "scale": scale, "sum": values.sum()}
-        facts["origin"] = one.kernel.meta.get("file", "made from two PSFs")
-        page.text("kernel", band=one.name, gain=one.kernel.noise_gain, **facts)
+        facts["origin"] = band.kernel.meta.get("file", "made from two PSFs")
+        page.text("kernel", band=band.name, gain=band.kernel.noise_gain, **facts)
 
 
 def _text(value):
@@ -386,12 +412,12 @@ def empty_positions(result, seed):
     residual = result.residual_image
     sigma = residual.uncertainty.array
     level = 0.0 if result.background is None else result.background.to_value(residual.unit)
-    free = ~np.asarray(residual.mask, bool)
-    free &= np.abs(result.model_image.data - level) < 0.3 * np.where(free, sigma, 1.0)
+    is_free = ~np.asarray(residual.mask, bool)
+    is_free &= np.abs(result.model_image.data - level) < 0.3 * np.where(is_free, sigma, 1.0)
     steps = max(1, round(0.3 / pixel_scale(residual.wcs)))
     # pixels beyond the image count as without data
-    free = scipy.ndimage.binary_erosion(free, iterations=steps)
-    y, x = np.nonzero(free)
+    is_free = scipy.ndimage.binary_erosion(is_free, iterations=steps)
+    y, x = np.nonzero(is_free)
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(x), min(_EMPTY, len(x)), replace=False) if len(x) else np.zeros(0, int)
     sky = residual.wcs.pixel_to_world(x[chosen].astype(float), y[chosen].astype(float)).icrs
@@ -400,7 +426,8 @@ def empty_positions(result, seed):
 
 def write_errors_page(path, errors, *, overwrite=False):
     """Write the page of the errors of an image (`~miricigale.photometry.ImageErrors`)."""
-    table, meta = errors.table, errors.table.meta
+    table = errors.table
+    meta = errors.table.meta
     report = Page(f"Errors of {Path(meta['source']).name}", subtitle=meta.get("filter", ""))
     page = SectionWriter(report, declared("miricigale.photometry"))
     facts = {"over": meta["noise_over_stated"], "factor": errors.factor}
@@ -409,14 +436,14 @@ def write_errors_page(path, errors, *, overwrite=False):
     aperture, limit = next((k, v.value) for k, v in errors.limits.items())
     step = max(1, -(-max(limit.shape) // 1500))
     scale = step * pixel_scale(errors.noise.wcs)
-    figure, [[left, right]] = new_figure(1, 2, size=(5.2, 4.2))
+    figure, [[limit_ax, correlation_ax]] = new_figure(1, 2, size=(5.2, 4.2))
     form = {"limits": np.nanpercentile(limit, [1, 99]), "colorbar": "limit (uJy)"}
-    plot_image(limit[::step, ::step], ax=left, pixel_scale=scale, stretch="linear", **form)
+    plot_image(limit[::step, ::step], ax=limit_ax, pixel_scale=scale, stretch="linear", **form)
     form = {"limits": (0, 1), "colorbar": "correlation"}
     shown = errors.correlation / errors.correlation.max()
-    plot_image(shown, ax=right, stretch="linear", **form).set(
+    plot_image(shown, ax=correlation_ax, stretch="linear", **form).set(
         xlabel="x (pixels)", ylabel="y (pixels)"
     )
-    what = "a point fitted" if aperture == "psf" else f"a circle of {aperture} arcsec"
-    page.figure("map", figure, aperture=what, n_sigma=meta["n_sigma"])
+    shape = "a point fitted" if aperture == "psf" else f"a circle of {aperture} arcsec"
+    page.figure("map", figure, aperture=shape, n_sigma=meta["n_sigma"])
     report.write(path, overwrite=overwrite)

@@ -57,13 +57,14 @@ class PatchGrid:
     def over(cls, prior, images, size, overlap):
         """The grid over a prior and images (each with ``wcs`` and ``shape``), as far as these reach."""
         low, high = np.array([[0, 0], prior.shape])
-        for one in images:
-            edge = _raster([(0, one.shape[0]), (0, one.shape[1])])
-            xy = pixel_to_pixel(one.wcs, prior.wcs, *edge)
+        for image in images:
+            edge = _raster([(0, image.shape[0]), (0, image.shape[1])])
+            xy = pixel_to_pixel(image.wcs, prior.wcs, *edge)
             # the patches at the edge have an overlap beyond it too
             low = np.fmin(low, np.nanmin(xy, axis=1)[::-1] + overlap)
             high = np.fmax(high, np.nanmax(xy, axis=1)[::-1] - overlap)
-        first, last = np.floor(low / size).astype(int), np.ceil(high / size).astype(int)
+        first = np.floor(low / size).astype(int)
+        last = np.ceil(high / size).astype(int)
         return cls(size, overlap, tuple(first.tolist()), tuple((last - first).tolist()))
 
     @property
@@ -81,12 +82,14 @@ class PatchGrid:
     def holder(self, xy):
         """Number of the patch whose core holds each pixel (x, y), (n,); the nearest beyond them, -1 for NaN."""
         xy = np.asarray(xy, float).reshape(-1, 2)
-        known = np.isfinite(xy).all(axis=1)
-        place = np.floor((np.where(known[:, None], xy, 0)[:, ::-1] + 0.5) / self.size) - self.first
+        is_known = np.isfinite(xy).all(axis=1)
+        place = (
+            np.floor((np.where(is_known[:, None], xy, 0)[:, ::-1] + 0.5) / self.size) - self.first
+        )
         place = np.clip(place, 0, np.array(self.shape) - 1).astype(int)
-        return np.where(known, np.ravel_multi_index(tuple(place.T), self.shape), -1)
+        return np.where(is_known, np.ravel_multi_index(tuple(place.T), self.shape), -1)
 
-    def near(self, k, xy, margin):
+    def is_near(self, k, xy, margin):
         """Whether pixels (x, y) are in the core of a patch or within a margin of it."""
         steps = itertools.product((-margin, 0.0, margin), repeat=2)
         return np.any([self.holder(np.asarray(xy) + step) == k for step in steps], axis=0)
@@ -94,23 +97,26 @@ class PatchGrid:
 
 def patch_parts(inputs, grid, k):
     """The parts (slices, or None) of the prior and of each image that a patch has with its overlap."""
-    box, whole = grid.box(k), inputs.highres.header
-    headers = (one.header for one in inputs.images)
-    seen = [seen_part(box, whole.wcs, one.wcs, one.shape) for one in headers]
-    return [_within(box, whole.shape), *seen]
+    box = grid.box(k)
+    prior = inputs.highres.header
+    headers = (image.header for image in inputs.images)
+    parts = [seen_part(box, prior.wcs, image.wcs, image.shape) for image in headers]
+    return [_within(box, prior.shape), *parts]
 
 
-def seen_part(box, wcs, other, shape):
+def seen_part(box, wcs, other_wcs, shape):
     """The part (slices, or None) of an image with a WCS that has what a box of pixels of another has."""
-    xy = np.array(pixel_to_pixel(wcs, other, *_raster([(one.start, one.stop) for one in box])))
+    xy = np.array(
+        pixel_to_pixel(wcs, other_wcs, *_raster([(axis.start, axis.stop) for axis in box]))
+    )
     ends = np.floor(np.nanmin(xy, axis=1)), np.ceil(np.nanmax(xy, axis=1)) + 1
-    found = [slice(int(a), int(b)) for a, b in zip(*ends, strict=True)]
-    return _within(found[::-1], shape)
+    span = [slice(int(a), int(b)) for a, b in zip(*ends, strict=True)]
+    return _within(span[::-1], shape)
 
 
 def _within(box, shape):
-    found = tuple(slice(max(b.start, 0), min(b.stop, n)) for b, n in zip(box, shape, strict=True))
-    return found if all(one.start < one.stop for one in found) else None
+    inside = tuple(slice(max(b.start, 0), min(b.stop, n)) for b, n in zip(box, shape, strict=True))
+    return inside if all(axis.start < axis.stop for axis in inside) else None
 
 
 def _raster(spans):
@@ -140,26 +146,29 @@ def own_rows(patch, grid, xy):
     kept : bool `~numpy.ndarray`, shape (n,)
     """
     core = grid.holder(xy) == patch
-    kept, links, taken = core.copy(), [], set()
+    is_kept = core.copy()
+    links = []
+    used_keys = set()
     pairs = cKDTree(xy).query_pairs(RIM, output_type="ndarray")
     pairs = pairs[patch[pairs[:, 0]] != patch[pairs[:, 1]]]
     far = np.hypot(*(xy[pairs[:, 0]] - xy[pairs[:, 1]]).T)
     for i, j in pairs[np.argsort(far, kind="stable")].tolist():
         # the nearest that each patch has for a source of the other
         keys = {(i, patch[j]), (j, patch[i])}
-        if not keys & taken:
+        if not keys & used_keys:
             links.append((i, j))
-            taken |= keys
+            used_keys |= keys
     if links:
         graph = scipy.sparse.coo_array(
             (np.ones(len(links)), np.transpose(links)), shape=(len(patch),) * 2
         )
-        same, rows = connected_components(graph, directed=False)[1], np.unique(links)
+        component = connected_components(graph, directed=False)[1]
+        rows = np.unique(links)
         # the core first, then the first patch
-        rows = rows[np.lexsort((patch[rows], ~core[rows], same[rows]))]
-        kept[rows] = False
-        kept[rows[np.unique(same[rows], return_index=True)[1]]] = True
-    return kept
+        rows = rows[np.lexsort((patch[rows], ~core[rows], component[rows]))]
+        is_kept[rows] = False
+        is_kept[rows[np.unique(component[rows], return_index=True)[1]]] = True
+    return is_kept
 
 
 def join_patches(tables, grid, prior, catalog=None, ids=False):
@@ -184,32 +193,36 @@ def join_patches(tables, grid, prior, catalog=None, ids=False):
     table : `~astropy.table.QTable`
         With ``patch``, the name of the patch, in place of ``new``; new sources are the last rows.
     """
-    patch = np.repeat(list(tables), [len(one) for one in tables.values()])
+    patch = np.repeat(list(tables), [len(patch_table) for patch_table in tables.values()])
     table = vstack(list(tables.values()), metadata_conflicts="silent")
     xy = _pixels(table["sky"], prior)
-    known, new = ~np.asarray(table["new"]), np.asarray(table["new"])
-    kept = np.zeros(len(table), bool)
-    for some in (known, new) if catalog is None and not ids else (new,):
-        kept[some] = own_rows(patch[some], grid, xy[some])
+    is_known = ~np.asarray(table["new"])
+    new = np.asarray(table["new"])
+    is_kept = np.zeros(len(table), bool)
+    for rows_of_kind in (is_known, new) if catalog is None and not ids else (new,):
+        is_kept[rows_of_kind] = own_rows(patch[rows_of_kind], grid, xy[rows_of_kind])
     table["patch"] = np.array(grid.names)[patch]
     table["patch"].info.description = "Patch whose core holds the source"
     flags = [table[name] for name in table.colnames if name.endswith("flags")]
-    cut = np.any([one & ForcedFlags.CUT for one in flags], axis=0)
+    cut = np.any([values & ForcedFlags.CUT for values in flags], axis=0)
     if catalog is None:
-        rows = np.flatnonzero(known if ids else known & kept)
+        rows = np.flatnonzero(is_known if ids else is_known & is_kept)
         if ids:
             core = grid.holder(xy[rows]) == patch[rows]
             rows = rows[np.lexsort((~core, cut[rows]))]
             rows = rows[np.unique(np.asarray(table["id"])[rows], return_index=True)[1]]
-        found, key, sky = rows, np.asarray(table["id"])[rows], table["sky"][rows]
+        source_rows = rows
+        key = np.asarray(table["id"])[rows]
+        sky = table["sky"][rows]
         key = key if ids else np.arange(1, len(rows) + 1)
     else:
-        place = {one: k for k, one in enumerate(np.asarray(table["id"]).tolist()) if known[k]}
-        key, sky = np.asarray(catalog["id"]), catalog["sky"].icrs
-        found = np.array([place.get(one, -1) for one in key.tolist()], int)
-    extra = np.flatnonzero(new & kept)
-    found = np.concatenate([found, extra])
-    if n_cut := np.count_nonzero(cut[found[found >= 0]]):
+        place = {key: k for k, key in enumerate(np.asarray(table["id"]).tolist()) if is_known[k]}
+        key = np.asarray(catalog["id"])
+        sky = catalog["sky"].icrs
+        source_rows = np.array([place.get(key, -1) for key in key.tolist()], int)
+    extra = np.flatnonzero(new & is_kept)
+    source_rows = np.concatenate([source_rows, extra])
+    if n_cut := np.count_nonzero(cut[source_rows[source_rows >= 0]]):
         text = f"{n_cut} sources have segments that reach beyond their patches (flag CUT): a larger overlap"
         warn(f"{text} than {grid.overlap} pixels has them whole", PhotometryWarning)
     joined = QTable()
@@ -218,7 +231,7 @@ def join_patches(tables, grid, prior, catalog=None, ids=False):
     for name in table.colnames:
         if name not in ("id", "sky", "new"):
             kind = "flags" if name.endswith("flags") else name
-            joined[name] = spread_rows(table[name], found, kind)
+            joined[name] = spread_rows(table[name], source_rows, kind)
             joined[name].info.description = table[name].info.description
     return joined
 
@@ -247,16 +260,17 @@ def measure_patch(inputs, grid, k, catalog=None, n_threads=None):
     measured : `~miricigale.photometry.commands.file_inputs.Measurement` or None
         None without a source and an image.
     """
-    whole = inputs.highres.header
+    prior = inputs.highres.header
     part, *parts = patch_parts(inputs, grid, k)
     pixels = inputs.read(part, parts)
-    own = None
+    in_core = None
     if catalog is not None:
-        xy = _pixels(catalog["sky"], whole)
-        rows = np.flatnonzero(grid.near(k, xy, grid.overlap))
-        catalog, own = catalog[rows], grid.holder(xy[rows]) == k
+        xy = _pixels(catalog["sky"], prior)
+        rows = np.flatnonzero(grid.is_near(k, xy, grid.overlap))
+        catalog = catalog[rows]
+        in_core = grid.holder(xy[rows]) == k
     segments, sources = inputs.find_sources(pixels, catalog, part or ())
-    if not len(sources) and not any("source" in one.meta for one in pixels.images.values()):
+    if not len(sources) and not any("source" in image.meta for image in pixels.images.values()):
         return QTable({"id": [], "new": []}), None
     with warnings.catch_warnings():
         # of images without data here
@@ -268,27 +282,27 @@ def measure_patch(inputs, grid, k, catalog=None, n_threads=None):
         for name, pixels in zip(("y", "x"), section or (), strict=False):
             table[f"{band}_{name}"] += pixels.start
     columns = [table[name] for name in table.colnames if name.endswith("flags")]
-    table["new"] = np.any([one & ForcedFlags.NOT_IN_CATALOG for one in columns], axis=0)
-    xy = _pixels(table["sky"], whole)
-    kept = grid.near(k, xy, RIM)
+    table["new"] = np.any([flags & ForcedFlags.NOT_IN_CATALOG for flags in columns], axis=0)
+    xy = _pixels(table["sky"], prior)
+    is_kept = grid.is_near(k, xy, RIM)
     if part:
-        cut = _is_cut(segments, part, whole.shape, xy)
-        for one in columns:
-            one[cut] |= int(ForcedFlags.CUT)
+        cut = _is_cut(segments, part, prior.shape, xy)
+        for flags in columns:
+            flags[cut] |= int(ForcedFlags.CUT)
         if inputs.segmentation is not None:
             # its position may be in another core than that of the whole, and in none
-            kept |= cut
-    if own is not None:
-        kept[: len(own)] = own
-    return table[kept], measured
+            is_kept |= cut
+    if in_core is not None:
+        is_kept[: len(in_core)] = in_core
+    return table[is_kept], measured
 
 
 def _is_cut(segments, part, shape, xy):
     """Whether the segment at each pixel x, y of the prior reaches an edge of a part which is none of the prior."""
     edges = [np.zeros(0, int)]
-    for labels, one, n in zip((segments, segments.T), part, shape, strict=True):
-        edges += [labels[0]] * (one.start > 0) + [labels[-1]] * (one.stop < n)
-    place = np.nan_to_num(xy[:, ::-1] - [one.start for one in part], nan=-1.0)
+    for labels, axis, n in zip((segments, segments.T), part, shape, strict=True):
+        edges += [labels[0]] * (axis.start > 0) + [labels[-1]] * (axis.stop < n)
+    place = np.nan_to_num(xy[:, ::-1] - [axis.start for axis in part], nan=-1.0)
     place = np.rint(place).astype(int)
     inside = np.all((place >= 0) & (place < segments.shape), axis=1)
     label = np.where(inside, segments[tuple(np.where(inside[:, None], place, 0).T)], 0)

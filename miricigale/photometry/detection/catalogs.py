@@ -45,8 +45,8 @@ def catalog_sources(catalog, epoch=None):
         check_that(not np.any(mask_of(components)), "catalog", wanted, "some")
         components = np.asarray(components)
         if components.dtype.kind not in "iu" or not np.isin(components, (1, 2)).all():
-            found = np.unique(components)[:5].tolist()
-            raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")
+            numbers = np.unique(components)[:5].tolist()
+            raise argument_error("catalog", "a column 'components' of 1 and 2", f"{numbers}")
     sky = at_epoch(sky, epoch, "catalog")
     sky = SkyCoord(sky.ra.deg, sky.dec.deg, unit="deg")
     return {"id": ids, "sky": sky, "flux": flux, "components": components}
@@ -71,5 +71,5 @@ def sersic_rows(catalog):
 def joined_sky(skies):
     """Positions (ICRS) one after the other."""
     skies = [sky.icrs for sky in skies]
-    angles = (np.concatenate([getattr(sky, one).deg for sky in skies]) for one in ("ra", "dec"))
+    angles = (np.concatenate([getattr(sky, axis).deg for sky in skies]) for axis in ("ra", "dec"))
     return SkyCoord(*angles, unit="deg")

@@ -27,9 +27,9 @@ class Cutout:
     convolved: bool = True
     #: What is added to a profile: the image less the profile, which has the sharp PSF; None
     #: without.
-    rest: "Cutout | None" = None
+    correction: "Cutout | None" = None
     #: Of the largest piece of a divided galaxy the template of the whole; None without, or if that is a point.
-    whole: "Cutout | None" = None
+    galaxy: "Cutout | None" = None
 
     def __post_init__(self):
         object.__setattr__(self, "data", np.asarray(self.data, np.float32))
@@ -37,12 +37,12 @@ class Cutout:
     @property
     def kind(self):
         """``"cutout"`` if any of it is the image itself, else ``"sersic"``."""
-        return "cutout" if self.convolved or self.rest is not None else "sersic"
+        return "cutout" if self.convolved or self.correction is not None else "sersic"
 
     @property
     def layers(self):
         """The profile and the rest, or the one there is."""
-        return (self,) if self.rest is None else (self, self.rest)
+        return (self,) if self.correction is None else (self, self.correction)
 
 
 def own_segments(segmentation, labels, xy):
@@ -105,17 +105,19 @@ def saturated_cores(data, usable, segmentation, label, xy, width):
     flat : bool `~numpy.ndarray`, shape (ny, nx)
         Pixels of flat tops.
     """
-    holes, flat = scipy.ndimage.binary_fill_holes(usable) & ~usable, np.zeros(data.shape, bool)
-    saturated, places = np.zeros(len(label), bool), scipy.ndimage.find_objects(segmentation)
+    holes = scipy.ndimage.binary_fill_holes(usable) & ~usable
+    flat = np.zeros(data.shape, bool)
+    saturated = np.zeros(len(label), bool)
+    places = scipy.ndimage.find_objects(segmentation)
     reach = max(width / 2, 1.0)
-    for k, one in enumerate(label):
-        if not 0 < one <= len(places) or places[one - 1] is None:
+    for k, number in enumerate(label):
+        if not 0 < number <= len(places) or places[number - 1] is None:
             continue
-        place = places[one - 1]
-        own = (segmentation[place] == one) & usable[place]
-        light = np.where(own, data[place], -np.inf)
+        place = places[number - 1]
+        is_own = (segmentation[place] == number) & usable[place]
+        light = np.where(is_own, data[place], -np.inf)
         # a solid angle may have been multiplied
-        top = own & (light > (1 - 1e-6) * light.max())
+        top = is_own & (light > (1 - 1e-6) * light.max())
         if np.count_nonzero(top) >= _FLAT:
             flat[place] |= top
             saturated[k] = True

@@ -198,18 +198,19 @@ def detect_sources(
         stated_on=stated_on, threshold=threshold, n_pixels=n_pixels,
     )  # fmt: skip
     rule = None if dilation is None else dilation_rule(dilation)
-    objects, found = _extract(arrays.flux, arrays, settings)
-    largest = np.bincount(found.ravel(), minlength=2)[1:].max() / np.count_nonzero(arrays.usable)
+    objects, detected = _extract(arrays.flux, arrays, settings)
+    largest = np.bincount(detected.ravel(), minlength=2)[1:].max() / np.count_nonzero(arrays.usable)
     if largest > 0.5:
         msg = f"one segment has {largest:.0%} of the image: {_SKY_LEFT}"
         warn(msg, PhotometryWarning)
     name = preset if isinstance(preset, str) else "own"
-    labels, meta = found, provenance(preset=name, **dataclasses.asdict(settings))
+    labels = detected
+    meta = provenance(preset=name, **dataclasses.asdict(settings))
     if rule is not None:
         scale = pixel_scale(arrays.wcs)
-        labels = dilate_segments(found, rule, pixel_scale=scale, mask=~arrays.usable).data
+        labels = dilate_segments(detected, rule, pixel_scale=scale, mask=~arrays.usable).data
         meta["dilation"] = dataclasses.asdict(rule)
-    return SegmentationImage(labels), _catalog(objects, found, labels, arrays, meta)
+    return SegmentationImage(labels), _catalog(objects, detected, labels, arrays, meta)
 
 
 def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
@@ -295,10 +296,11 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
         raise argument_error("snr_edges", "two numbers or more that ascend", snr_edges)
     counts = [np.histogram(snr, edges)[0] for snr in (positive, negative)]
     n_positive, n_negative = counts
-    fewest, most = poisson_conf_interval(n_negative, interval="frequentist-confidence")
+    n_low, n_high = poisson_conf_interval(n_negative, interval="frequentist-confidence")
     with np.errstate(divide="ignore", invalid="ignore"):
         purity, low, high = (
-            np.where(n_positive > 0, 1 - n / n_positive, np.nan) for n in (n_negative, most, fewest)
+            np.where(n_positive > 0, 1 - n / n_positive, np.nan)
+            for n in (n_negative, n_high, n_low)
         )
         above = [np.cumsum(n[::-1])[::-1] for n in counts]
         purity_above = np.where(above[0] > 0, 1 - above[1] / above[0], np.nan)
@@ -318,14 +320,14 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
 
 
 def _prepared(
-    image, preset, *, subtract_background=False, box=64, filter_size=6, stated_on=None, **given
+    image, preset, *, subtract_background=False, box=64, filter_size=6, stated_on=None, **changes
 ):
     """Arrays with the background taken off, and settings on the image's pixels."""
     if not isinstance(preset, DetectionPreset):
         check_names([preset], "detection preset", DETECTION_PRESETS)
         preset = DETECTION_PRESETS[preset]
-    given = {name: value for name, value in given.items() if value is not None}
-    settings = dataclasses.replace(preset, **given)
+    changes = {name: value for name, value in changes.items() if value is not None}
+    settings = dataclasses.replace(preset, **changes)
     check_positive(settings.threshold, "threshold")
     arrays = image_arrays(as_mosaic(image, "image"), "image")
     ratio = 1.0
@@ -406,27 +408,31 @@ def bright_centroids(flux, labels, fallback):
     smooth = scipy.ndimage.gaussian_filter(flux, 1.5)
     # the sky is most of the image and has no peak
     y, x = np.nonzero(labels)
-    weight, label = smooth[y, x], labels[y, x]
+    weight = smooth[y, x]
+    label = labels[y, x]
     peak = np.append(np.inf, scipy.ndimage.maximum(weight, label, np.arange(1, n + 1)))
     core = weight > 0.3 * peak[label]
-    y, x, weight, label = y[core], x[core], weight[core], label[core]
+    y = y[core]
+    x = x[core]
+    weight = weight[core]
+    label = label[core]
     total = np.bincount(label, weight, n + 1)[1:]
-    found = []
+    centroids = []
     for values, otherwise in ((x, fallback[0]), (y, fallback[1])):
         moment = np.bincount(label, weight * values, n + 1)[1:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            found.append(np.where(total > 0, moment / total, otherwise))
-    return found
+            centroids.append(np.where(total > 0, moment / total, otherwise))
+    return centroids
 
 
-def _catalog(objects, found, labels, arrays, meta):
+def _catalog(objects, detected, labels, arrays, meta):
     """The table of the detections: segments as found, and as they are returned."""
     n = len(objects)
     index = np.arange(1, n + 1)
     flux = arrays.flux
     total, noise = _segment_sums(labels, flux, arrays, n)
     scale = pixel_scale(arrays.wcs)
-    x, y = bright_centroids(flux, found, (objects["x"], objects["y"]))
+    x, y = bright_centroids(flux, detected, (objects["x"], objects["y"]))
     sky = arrays.wcs.pixel_to_world(x, y) if n else SkyCoord([], [], unit="deg")
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = total / noise
@@ -443,7 +449,7 @@ def _catalog(objects, found, labels, arrays, meta):
         "semiminor_axis": objects["b"] * scale * ANGLE,
         "orientation": np.degrees(objects["theta"]) * u.deg,
         "n_pixels": np.bincount(labels.ravel(), minlength=n + 1)[1:],
-        "n_detected": np.bincount(found.ravel(), minlength=n + 1)[1:],
+        "n_detected": np.bincount(detected.ravel(), minlength=n + 1)[1:],
         "snr": snr,
         "flags": flags,
     }

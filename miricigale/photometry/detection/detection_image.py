@@ -59,20 +59,20 @@ def chi_image(images):
     >>> (chi.data / chi.uncertainty.array).std().round(2)
     np.float64(1.0)
     """
-    images = [as_mosaic(one, "images") for one in images]
-    arrays = [image_arrays(one, "images") for one in images]
+    images = [as_mosaic(image, "images") for image in images]
+    arrays = [image_arrays(image, "images") for image in images]
     alike = all(
-        one.flux.shape == arrays[0].flux.shape and same_grid(one.wcs, arrays[0].wcs)
-        for one in arrays
+        exposure.flux.shape == arrays[0].flux.shape and same_grid(exposure.wcs, arrays[0].wcs)
+        for exposure in arrays
     )
     wanted = "at least one, all on the same pixels"
     check_that(arrays and alike, "images", wanted, f"{len(arrays)} images")
     square, n = (np.zeros(arrays[0].flux.shape) for _ in range(2))
-    for one in arrays:
-        values = one.flux / one.sigma
-        level, rms, _ = sky_noise(values, one.usable)
-        square += np.where(one.usable, (values - level) / rms, 0.0) ** 2
-        n += one.usable
+    for exposure in arrays:
+        values = exposure.flux / exposure.sigma
+        level, rms, _ = sky_noise(values, exposure.usable)
+        square += np.where(exposure.usable, (values - level) / rms, 0.0) ** 2
+        n += exposure.usable
     sigma = np.where(arrays[0].usable, arrays[0].sigma / arrays[0].area, np.nan)
     sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
     # mean of the chi distribution
@@ -84,5 +84,5 @@ def chi_image(images):
         wcs=arrays[0].wcs,
         mask=n == 0,
         uncertainty=StdDevUncertainty(spread * sigma),
-        meta={"bands": [one.meta.get("filter") for one in images]},
+        meta={"bands": [image.meta.get("filter") for image in images]},
     )

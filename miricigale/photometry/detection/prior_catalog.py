@@ -70,13 +70,14 @@ def read_prior(highres, *, segmentation=None, catalog=None):
     segments = ids = None
     if segmentation is not None:
         if isinstance(segmentation, np.ndarray):
-            data, segmentation = segmentation, "the segmentation"
+            data = segmentation
+            segmentation = "the segmentation"
             wanted = "whole numbers, one for each source (scipy.ndimage.label makes them)"
             check_that(data.dtype != bool, "segmentation", wanted, "a mask")
         else:
             image = highres.data.shape, highres.wcs, highres.meta.get("source", "the image")
-            what = "a segmentation map", "the segmentation"
-            with open_map(segmentation, *what, SEGMENTS, image) as hdu:
+            roles = "a segmentation map", "the segmentation"
+            with open_map(segmentation, *roles, SEGMENTS, image) as hdu:
                 data = np.array(hdu.data)
         segments, ids = _numbered(data, segmentation)
     if catalog is None:
@@ -201,7 +202,7 @@ def read_catalog(catalog, wcs=None, epoch=None):
     return table
 
 
-def check_labels(labels, here, what):
+def check_labels(labels, found_labels, name):
     """
     Refuse labels that are those of another segmentation map, or warn of them.
 
@@ -209,34 +210,36 @@ def check_labels(labels, here, what):
     ``what`` is the name for messages. Refused if more than half of the sources are on another segment than
     theirs, warned of from three and a tenth on.
     """
-    both = (labels > 0) & (here > 0)
-    n, wrong = (int(np.count_nonzero(one)) for one in (both, both & (labels != here)))
+    on_both = (labels > 0) & (found_labels > 0)
+    n, wrong = (
+        int(np.count_nonzero(rows)) for rows in (on_both, on_both & (labels != found_labels))
+    )
     text = f"{wrong} of {n} sources that stand on another segment than theirs"
     wanted = "labels of the segmentation map"
-    check_that(not wrong > 0.5 * n, what, wanted, f"{text}: is it the map of another detection?")
+    check_that(not wrong > 0.5 * n, name, wanted, f"{text}: is it the map of another detection?")
     if wrong >= max(3, 0.1 * n):
-        msg = f"the labels of {what} are those of {text}"
+        msg = f"the labels of {name} are those of {text}"
         warn(msg, CatalogWarning)
 
 
 def _labels(sources, segments, ids, wcs, catalog, segmentation):
     """The segment of each source: by id if that is what the ids are, by position otherwise."""
     sky = sources["sky"]
-    known = np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)
+    is_placed = np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)
     xy = np.full((len(sources), 2), np.nan)
-    if known.any():
-        xy[known] = np.stack(wcs.world_to_pixel(sky[known]), axis=-1)
-    here, inside = nearest_values(segments, xy)
-    own = np.zeros(len(sources), np.int64)
+    if is_placed.any():
+        xy[is_placed] = np.stack(wcs.world_to_pixel(sky[is_placed]), axis=-1)
+    labels_at, inside = nearest_values(segments, xy)
+    by_number = np.zeros(len(sources), np.int64)
     if np.asarray(sources["id"]).dtype.kind in "iu":
         place = np.clip(np.searchsorted(ids, sources["id"]), 0, len(ids) - 1)
-        own = np.where(ids[place] == sources["id"], place + 1, 0)
-    both = here > 0
-    by_id = both.any() and np.mean(own[both] == here[both]) > 0.5
-    label = own if by_id else here.astype(np.int64)
-    check_labels(label, here, f"{catalog} by id")
+        by_number = np.where(ids[place] == sources["id"], place + 1, 0)
+    has_label = labels_at > 0
+    by_id = has_label.any() and np.mean(by_number[has_label] == labels_at[has_label]) > 0.5
+    label = by_number if by_id else labels_at.astype(np.int64)
+    check_labels(label, labels_at, f"{catalog} by id")
     _log.info("%s: segments of %s by %s", catalog, segmentation, "id" if by_id else "position")
-    n_without, n_inside = (int(np.count_nonzero(one)) for one in (inside & (label == 0), inside))
+    n_without, n_inside = (int(np.count_nonzero(rows)) for rows in (inside & (label == 0), inside))
     msg = f"{n_without} of the {n_inside} sources of {catalog} on the map have no segment"
     msg += f" of {segmentation} and are taken as points"
     if n_without > 0.5 * n_inside:
@@ -248,10 +251,10 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
     edge = np.concatenate([segments[[0, -1]].ravel(), segments[:, [0, -1]].ravel()])
     orphans = np.setdiff1d(np.arange(1, len(ids) + 1), np.append(label, edge))
     if orphans.size:
-        some = ", ".join(map(str, ids[orphans[:5] - 1]))
+        examples = ", ".join(map(str, ids[orphans[:5] - 1]))
         msg = (
             f"{orphans.size} segments of {segmentation} belong to no source of {catalog} and are not "
-            f"fitted (ids {some}{', ...' if orphans.size > 5 else ''})"
+            f"fitted (ids {examples}{', ...' if orphans.size > 5 else ''})"
         )
         warn(msg, CatalogWarning)
     return label

@@ -13,7 +13,10 @@ from miricigale.utils.parallel import chunks, parallel_map
 #: Least signal-to-noise of light that no template explains, its least share of the model below it and
 #: of a neighbor's flux, and its distance to sources in full widths at half maximum: the least to any,
 #: and the largest to one that is flagged.
-LEFT_SNR, _LEFT_SHARE, _LEFT_DISTANCE, _LEFT_REACH = 5.0, 0.1, 0.7, 2.0
+LEFT_SNR = 5.0
+_LEFT_SHARE = 0.1
+_LEFT_DISTANCE = 0.7
+_LEFT_REACH = 2.0
 
 #: Share of a source's flux, and distance to it in full widths, within which peaks are of its wings.
 _WINGS = 0.02, 10.0
@@ -50,71 +53,83 @@ def residual_peaks(fit, residual, model, xy):
     nearest source, if that is within two full widths, has more than half as much light is that
     source's own. Of two peaks within 0.7 full widths the brighter one counts.
     """
-    inverse_sigma, width = fit.inverse_sigma, fit.psf_width
+    inverse_sigma = fit.inverse_sigma
+    width = fit.psf_width
     full_width = 2.0 * np.sqrt(2.0 * np.log(2.0)) * width
     placed = xy[np.isfinite(xy).all(axis=1)]
     if not inverse_sigma.any():
         return ResidualPeaks(np.empty((0, 2), int), np.empty((0, 2)), np.empty(0), full_width)
-    matched, executor = _Matched(inverse_sigma, width, residual), fit.bank.executor
+    matched = _Matched(inverse_sigma, width, residual)
+    executor = fit.bank.executor
     # of very many pixels only those of some rows
-    some = [part for part in chunks(len(residual), _ROWS // 8) if inverse_sigma[part].any()]
-    some = some[:: max(1, residual.size // _SOME)]
-    found = parallel_map(matched.rows, some, executor=executor)
-    snr, power = map(np.concatenate, zip(*found, strict=True))
-    seen = np.concatenate([inverse_sigma[part] for part in some]) > 0
-    matched.least = 0.25 * np.median(power[seen])
+    sampled = [part for part in chunks(len(residual), _ROWS // 8) if inverse_sigma[part].any()]
+    sampled = sampled[:: max(1, residual.size // _SOME)]
+    strips = parallel_map(matched.rows, sampled, executor=executor)
+    snr, power = map(np.concatenate, zip(*strips, strict=True))
+    is_usable = np.concatenate([inverse_sigma[part] for part in sampled]) > 0
+    matched.min_power = 0.25 * np.median(power[is_usable])
     # what is a thousandth of the stated noise is that of the arithmetic
-    limit = LEFT_SNR * max(mad_std(snr[power > matched.least]), 1e-3)
+    limit = LEFT_SNR * max(mad_std(snr[power > matched.min_power]), 1e-3)
     reach = int(np.ceil(width))
 
     def find(part):
         """Places, lights and tops of the parabolas of peaks on some rows."""
         first = max(part.start - reach, 0)
         snr, power = matched.rows(slice(first, part.stop + reach))
-        own, found = slice(part.start - first, part.stop - first), []
-        y, x = np.nonzero(snr[own] > limit)
+        inner = slice(part.start - first, part.stop - first)
+        peaks = []
+        y, x = np.nonzero(snr[inner] > limit)
         # few pixels are left for what follows, unless the image has a background
-        for some in chunks(len(y), _CANDIDATES):
-            i, j = y[some] + own.start, x[some]
+        for group in chunks(len(y), _CANDIDATES):
+            i = y[group] + inner.start
+            j = x[group]
             top = snr[i, j] >= _windows(snr, i, j, np.arange(-reach, reach + 1)).max(axis=(1, 2))
-            i, j = i[top], j[top]
+            i = i[top]
+            j = j[top]
             root = np.sqrt(power[i, j])
             top = snr[i, j] * root > _LEFT_SHARE * matched.at(i + first, j, width, model)
-            place, light = np.stack([j, i], axis=1)[top], (snr[i, j] / root)[top]
-            found.append([place + [0, first], light, place + [0, first] + _parabola(snr, place)])
-        return found
+            place = np.stack([j, i], axis=1)[top]
+            light = (snr[i, j] / root)[top]
+            peaks.append([place + [0, first], light, place + [0, first] + _parabola(snr, place)])
+        return peaks
 
-    found = parallel_map(find, chunks(len(residual), _ROWS), executor=executor)
+    peaks = parallel_map(find, chunks(len(residual), _ROWS), executor=executor)
     none = np.empty((0, 2), int), np.empty(0), np.empty((0, 2))
-    found = zip(none, *itertools.chain(*found), strict=True)
-    pixel, light, refined = map(np.concatenate, found)
+    peaks = zip(none, *itertools.chain(*peaks), strict=True)
+    pixel, light, refined = map(np.concatenate, peaks)
     order = np.argsort(-light, kind="stable")
-    pixel, light, refined = pixel[order], light[order], refined[order]
+    pixel = pixel[order]
+    light = light[order]
+    refined = refined[order]
     distance = np.full(len(pixel), np.inf)
     if len(placed) and len(pixel):
         distance, nearest = scipy.spatial.KDTree(placed).query(pixel)
         # a template that is too narrow leaves as much on the other side of the source
-        near = np.flatnonzero(distance < _LEFT_REACH * full_width)
-        for rows in (near[part] for part in chunks(len(near), _CANDIDATES // 10)):
+        close = np.flatnonzero(distance < _LEFT_REACH * full_width)
+        for rows in (close[part] for part in chunks(len(close), _CANDIDATES // 10)):
             mirror = np.rint(2 * placed[nearest[rows]] - pixel[rows]).astype(int)
-            even = matched.light_at(*mirror.T[::-1]) > 0.5 * light[rows]
-            even &= np.all((mirror >= 0) & (mirror < residual.shape[::-1]), axis=1)
-            distance[rows[even]] = 0.0
-    apart = distance >= _LEFT_DISTANCE * full_width
-    pixel, light, refined = pixel[apart], light[apart], refined[apart]
+            is_symmetric = matched.light_at(*mirror.T[::-1]) > 0.5 * light[rows]
+            is_symmetric &= np.all((mirror >= 0) & (mirror < residual.shape[::-1]), axis=1)
+            distance[rows[is_symmetric]] = 0.0
+    is_apart = distance >= _LEFT_DISTANCE * full_width
+    pixel = pixel[is_apart]
+    light = light[is_apart]
+    refined = refined[is_apart]
     lone = np.ones(len(pixel), bool)
     if len(pixel):
         # brightest first: each that is kept removes the fainter ones near it
-        for one, other in sorted(
+        for row, neighbor in sorted(
             scipy.spatial.KDTree(pixel).query_pairs(_LEFT_DISTANCE * full_width)
         ):
-            lone[other] &= ~lone[one]
+            lone[neighbor] &= ~lone[row]
     return ResidualPeaks(pixel[lone], refined[lone], light[lone], full_width)
 
 
 #: Rows that are filtered at a time, pixels of which medians are taken, where there are more, and pixels
 #: that are looked at together.
-_ROWS, _SOME, _CANDIDATES = 256, 4_000_000, 100_000
+_ROWS = 256
+_SOME = 4_000_000
+_CANDIDATES = 100_000
 
 
 def _radius(width):
@@ -129,13 +144,13 @@ class _Matched:
     inverse_sigma: np.ndarray
     width: float
     residual: np.ndarray
-    least: float = 0.0  # Power below which too little of a source is seen.
+    min_power: float = 0.0  # Power below which too little of a source is seen.
 
     def rows(self, part):
         """Signal-to-noise and power on some rows, both zero where too little of a source is seen."""
         light = self._filtered(part, self.width, self.residual)
         power = self._filtered(part, self.width / np.sqrt(2)) / (4 * np.pi * self.width**2)
-        power[power <= self.least] = 0.0
+        power[power <= self.min_power] = 0.0
         return np.divide(light, np.sqrt(power), out=np.zeros_like(light), where=power > 0), power
 
     def _filtered(self, part, width, image=None):
@@ -148,50 +163,50 @@ class _Matched:
 
     def at(self, y, x, width, image=None):
         """The inverse variance, times an image if there is one, filtered with a Gaussian at some pixels."""
-        around = np.arange(-_radius(width), _radius(width) + 1)
-        hat = np.exp(-0.5 * (around / width) ** 2)
-        values = _windows(self.inverse_sigma, y, x, around) ** 2
-        values *= 1 if image is None else _windows(image, y, x, around)
+        steps = np.arange(-_radius(width), _radius(width) + 1)
+        hat = np.exp(-0.5 * (steps / width) ** 2)
+        values = _windows(self.inverse_sigma, y, x, steps) ** 2
+        values *= 1 if image is None else _windows(image, y, x, steps)
         return np.einsum("kij,i,j->k", values, hat, hat) / hat.sum() ** 2
 
     def light_at(self, y, x):
         """Fluxes at some pixels, zero where too little of a source is seen."""
         power = self.at(y, x, self.width / np.sqrt(2)) / (4 * np.pi * self.width**2)
         light = self.at(y, x, self.width, self.residual)
-        return np.divide(light, power, out=np.zeros_like(light), where=power > self.least)
+        return np.divide(light, power, out=np.zeros_like(light), where=power > self.min_power)
 
 
-def _windows(image, y, x, around):
+def _windows(image, y, x, steps):
     """Windows about some pixels, zero beyond the image, shape (n, k, k)."""
-    rows, columns = (place[:, None] + around for place in (y, x))
+    rows, columns = (place[:, None] + steps for place in (y, x))
     inside = [(c >= 0) & (c < n) for c, n in zip((rows, columns), image.shape, strict=True)]
-    found = image[
+    values = image[
         np.clip(rows, 0, image.shape[0] - 1)[:, :, None],
         np.clip(columns, 0, image.shape[1] - 1)[:, None],
     ]
-    return np.where(inside[0][:, :, None] & inside[1][:, None], found, 0.0)
+    return np.where(inside[0][:, :, None] & inside[1][:, None], values, 0.0)
 
 
 def _parabola(image, xy):
     """Offsets (x, y) of maxima from their pixels, at most half a pixel."""
-    near = _windows(image, xy[:, 1], xy[:, 0], np.arange(-1, 2))
+    windows = _windows(image, xy[:, 1], xy[:, 0], np.arange(-1, 2))
     offsets = []
-    for low, high in ((near[:, 1, 0], near[:, 1, 2]), (near[:, 0, 1], near[:, 2, 1])):
-        curvature = 2 * near[:, 1, 1] - low - high
+    for low, high in ((windows[:, 1, 0], windows[:, 1, 2]), (windows[:, 0, 1], windows[:, 2, 1])):
+        curvature = 2 * windows[:, 1, 1] - low - high
         step = 0.5 * (high - low) / np.where(curvature > 0, curvature, np.inf)
         offsets.append(np.clip(step, -0.5, 0.5))
     return np.stack(offsets, axis=1)
 
 
-def _near(peaks, xy, reach=_LEFT_REACH):
+def _close_pairs(peaks, xy, reach=_LEFT_REACH):
     """Pairs of a peak and a source within reach (full widths) of it, as two arrays of numbers."""
     placed = np.flatnonzero(np.isfinite(xy).all(axis=1))
     if not len(placed) or not len(peaks.xy):
         return np.empty(0, int), np.empty(0, int)
     tree = scipy.spatial.KDTree(xy[placed])
-    found = tree.query_ball_point(peaks.xy, reach * peaks.full_width)
-    peak = np.repeat(np.arange(len(found)), [len(rows) for rows in found])
-    return peak, placed[np.concatenate(found).astype(int)]
+    sources_of_peaks = tree.query_ball_point(peaks.xy, reach * peaks.full_width)
+    peak = np.repeat(np.arange(len(sources_of_peaks)), [len(rows) for rows in sources_of_peaks])
+    return peak, placed[np.concatenate(sources_of_peaks).astype(int)]
 
 
 def unexplained_neighbors(peaks, xy, flux):
@@ -201,10 +216,10 @@ def unexplained_neighbors(peaks, xy, flux):
     A peak is within two full widths at half maximum of these, and as a point source has more than a tenth of
     the flux (NaN where not measured).
     """
-    found = np.zeros(len(xy), bool)
-    peak, source = _near(peaks, xy)
-    found[source[peaks.flux[peak] > _LEFT_SHARE * flux[source]]] = True
-    return found
+    has_light = np.zeros(len(xy), bool)
+    peak, source = _close_pairs(peaks, xy)
+    has_light[source[peaks.flux[peak] > _LEFT_SHARE * flux[source]]] = True
+    return has_light
 
 
 def new_sources(peaks, xy, flux, *, usable=None):
@@ -215,11 +230,12 @@ def new_sources(peaks, xy, flux, *, usable=None):
     ``usable``, (ny, nx), also for those with less than 2 % of that of one within ten, which a PSF that is not
     exact leaves of wings and spikes, and for those less than two from others, beyond which a source may lie.
     """
-    new, strict = np.ones(len(peaks.xy), bool), usable is not None
+    new = np.ones(len(peaks.xy), bool)
+    strict = usable is not None
     for share, reach in ((_LEFT_SHARE, _LEFT_REACH), *[_WINGS] * strict):
-        peak, source = _near(peaks, xy, reach)
+        peak, source = _close_pairs(peaks, xy, reach)
         new[peak[peaks.flux[peak] <= share * flux[source]]] = False
     if strict:
-        around = np.arange(-round(2 * peaks.full_width), round(2 * peaks.full_width) + 1)
-        new &= _windows(usable, peaks.xy[:, 1], peaks.xy[:, 0], around).all(axis=(1, 2))
+        steps = np.arange(-round(2 * peaks.full_width), round(2 * peaks.full_width) + 1)
+        new &= _windows(usable, peaks.xy[:, 1], peaks.xy[:, 0], steps).all(axis=(1, 2))
     return new

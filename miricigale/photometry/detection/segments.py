@@ -120,8 +120,8 @@ def dilate_segments(segmentation, rule, *, pixel_scale, mask=None):
     rule = dilation_rule(rule)
     labels = np.asarray(getattr(segmentation, "data", segmentation))
     if labels.ndim != 2 or labels.dtype.kind not in "iu":
-        found = f"{labels.dtype} of shape {labels.shape}"
-        raise argument_error("segmentation", "a two-dimensional image of integers", found)
+        got = f"{labels.dtype} of shape {labels.shape}"
+        raise argument_error("segmentation", "a two-dimensional image of integers", got)
     if mask is not None and np.shape(mask) != labels.shape:
         raise argument_error("mask", f"of the segmentation's shape {labels.shape}", np.shape(mask))
     grown = labels.copy()
@@ -136,20 +136,21 @@ def dilate_segments(segmentation, rule, *, pixel_scale, mask=None):
     distance, nearest = scipy.ndimage.distance_transform_edt(labels == 0, return_indices=True)
     owner = index[tuple(nearest)]
     # a single pixel would reach as far
-    free = (labels == 0) & (distance <= np.sqrt(missing / np.pi)[owner] + 1e-9)
+    is_free = (labels == 0) & (distance <= np.sqrt(missing / np.pi)[owner] + 1e-9)
     if mask is not None:
-        free &= ~np.asarray(mask, bool)
-    y, x = np.nonzero(free)
-    owner, distance = owner[y, x], distance[y, x]
+        is_free &= ~np.asarray(mask, bool)
+    y, x = np.nonzero(is_free)
+    owner = owner[y, x]
+    distance = distance[y, x]
     order = np.lexsort((distance, owner))
     first = np.searchsorted(owner[order], np.arange(len(names)))
     last = np.searchsorted(owner[order], np.arange(len(names)), side="right")
     limit = np.full(len(names), -1.0)
-    some = (last > first) & (missing > 0)
-    edge = first[some] + np.minimum(missing, last - first)[some] - 1
-    limit[some] = distance[order][edge]
-    taken = distance <= limit[owner]
-    grown[y[taken], x[taken]] = names[owner[taken]]
+    grows = (last > first) & (missing > 0)
+    edge = first[grows] + np.minimum(missing, last - first)[grows] - 1
+    limit[grows] = distance[order][edge]
+    is_taken = distance <= limit[owner]
+    grown[y[is_taken], x[is_taken]] = names[owner[is_taken]]
     return SegmentationImage(grown)
 
 

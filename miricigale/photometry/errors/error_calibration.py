@@ -66,7 +66,7 @@ class ErrorCalibration:
     meta: dict = dataclasses.field(default_factory=dict)
 
     def __repr__(self):
-        factors = ", ".join(f"{one:.2f}" for one in self.bins["factor"])
+        factors = ", ".join(f"{factor:.2f}" for factor in self.bins["factor"])
         return f"<ErrorCalibration {len(self.sources)} sources, factors {factors}>"
 
     @classmethod
@@ -174,15 +174,16 @@ def _members(snr):
     order = np.argsort(snr, kind="stable")
     number = np.searchsorted(_EDGES, snr[order], side="right")
     number[snr[order] <= 0] = -1
-    found, waiting = [], np.empty(0, int)
+    members = []
+    waiting = np.empty(0, int)
     for k in np.unique(number):
         waiting = np.concatenate([waiting, order[number == k]])
         if len(waiting) >= _LEAST:
-            found.append(waiting)
+            members.append(waiting)
             waiting = np.empty(0, int)
     if len(waiting):
-        found[-1:] = [np.concatenate([*found[-1:], waiting])]
-    return found
+        members[-1:] = [np.concatenate([*members[-1:], waiting])]
+    return members
 
 
 def _row(snr, pull, ratio, member):

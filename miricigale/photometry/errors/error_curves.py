@@ -65,7 +65,7 @@ class Analytic:
         ]
 
 
-def measured_curve(name, true, seen, size, statistic):
+def measured_curve(name, true, measured, size, statistic):
     """Errors of one band in bins of true flux, from arrays in uJy."""
     wanted = f"at least three measured sources in {name!r}"
     check_that(len(true) >= 3, "measured", wanted, f"{len(true)}")
@@ -73,7 +73,7 @@ def measured_curve(name, true, seen, size, statistic):
     edges = np.arange(0, max(len(true) // size, 1) * size + 1, size)
     edges[-1] = len(true)
     parts = [order[a:b] for a, b in itertools.pairwise(edges)][::-1]
-    flux, error = np.transpose([_scatter(true[part], seen[part]) for part in parts])
+    flux, error = np.transpose([_scatter(true[part], measured[part]) for part in parts])
     if statistic != "median_abs":
         error = _pooled(flux, error)
     return Binned(flux, error * STATISTICS[statistic], float(true.min()), float(true.max()))
@@ -90,7 +90,8 @@ def _pooled(flux, error):
     from scipy.optimize import isotonic_regression
 
     order = np.argsort(flux, kind="stable")
-    flux, error = flux[order], error[order]
+    flux = flux[order]
+    error = error[order]
     if np.all(error > 0):
         error = np.exp(isotonic_regression(np.log(error)).x)
         bright = flux > 0
@@ -101,7 +102,7 @@ def _pooled(flux, error):
     return back
 
 
-def _scatter(true, seen):
+def _scatter(true, measured):
     """
     Median true flux of a bin and median absolute deviation there.
 
@@ -110,9 +111,9 @@ def _scatter(true, seen):
     each flux, or the brightest of a wide bin would set the error of the faintest.
     """
     flux = np.median(true)
-    absolute = np.median(np.abs(seen - true))
+    absolute = np.median(np.abs(measured - true))
     if flux > 5 * absolute and np.all(true > 0):
-        return flux, flux * np.median(np.abs(seen / true - 1.0))
+        return flux, flux * np.median(np.abs(measured / true - 1.0))
     return flux, absolute
 
 
@@ -124,10 +125,10 @@ def limiting_flux(curve, n_sigma):
         return flux - n_sigma * float(curve.sigma(flux))
 
     grid = np.geomspace(1e-9, 1e9, 3601)
-    below = np.flatnonzero(grid < n_sigma * curve.sigma(grid))
-    if len(below) == 0:
+    undetected = np.flatnonzero(grid < n_sigma * curve.sigma(grid))
+    if len(undetected) == 0:
         return grid[0]
-    last = below[-1]
+    last = undetected[-1]
     if last == len(grid) - 1:
         return np.nan
     limit = brentq(excess, grid[last], grid[last + 1], rtol=1e-12)
@@ -154,27 +155,27 @@ def common_bands(truth, measured):
 def same_rows(truth, measured):
     """Rows of two tables that belong to the same source, by ``id`` or by place."""
     if "id" in truth.colnames and "id" in measured.colnames:
-        _, rows, others = np.intersect1d(
+        _, rows, measured_rows = np.intersect1d(
             np.asarray(truth["id"]), np.asarray(measured["id"]), return_indices=True
         )
-        return rows, others
+        return rows, measured_rows
     wanted = f"a table of {len(truth)} rows as 'truth', or ids in both"
     check_that(len(truth) == len(measured), "measured", wanted, len(measured))
     rows = np.arange(len(truth))
     return rows, rows
 
 
-def flux_table(photometry, filters, known):
+def flux_table(photometry, filters, model_bands):
     """A copy of a table with fluxes in uJy, and the bands: those of ``known`` that it has by default."""
     if filters is not None:
-        filters = [known_filter(name, known, "band of this error model") for name in filters]
-    names = known if filters is None else filters
+        filters = [known_filter(name, model_bands, "band of this error model") for name in filters]
+    names = model_bands if filters is None else filters
     if names and not set(names) & set(getattr(photometry, "colnames", ())):
         photometry = as_photometry(photometry, names)
     require_columns(photometry, [], "photometry")
     if filters is None:
-        filters = [name for name in known if name in photometry.colnames]
-    wanted = f"a table with at least one of the columns {list(known)}"
+        filters = [name for name in model_bands if name in photometry.colnames]
+    wanted = f"a table with at least one of the columns {list(model_bands)}"
     check_that(filters, "photometry", wanted, f"columns {photometry.colnames}")
     require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
     table = QTable(photometry, copy=True)

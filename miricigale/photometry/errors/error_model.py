@@ -190,10 +190,10 @@ class ErrorModel(Interactive):
         curves = {}
         for name in filters:
             true = to_array(truth[name], FNU, name)[rows_true]
-            seen = to_array(measured[name], FNU, name)[rows_measured]
+            fluxes = to_array(measured[name], FNU, name)[rows_measured]
             relative = _relative_noise(noise, name, len(measured))[rows_measured]
-            good = np.isfinite(true) & np.isfinite(seen) & np.isfinite(relative)
-            true, off = true[good], (seen - true)[good] / relative[good]
+            good = np.isfinite(true) & np.isfinite(fluxes) & np.isfinite(relative)
+            true, off = true[good], (fluxes - true)[good] / relative[good]
             curves[name] = measured_curve(name, true, true + off, int(bin_size), statistic)
         return cls(curves, provenance(source="tables", statistic=statistic, bin_size=bin_size))
 
@@ -277,8 +277,8 @@ class ErrorModel(Interactive):
 
         if isinstance(filter, Exposure):
             names = ("n_integrations", "frame_time", "n_frames", "subarray")
-            known = {name: getattr(filter, name) for name in names}
-            options = known | options
+            facts = {name: getattr(filter, name) for name in names}
+            options = facts | options
             time = filter.exposure_time if time is None else time
             filter = filter.filter
         check_that(time is not None, "time", "given, or an Exposure", "None")
@@ -451,7 +451,9 @@ class ErrorModel(Interactive):
         """
         from miricigale.plotting.comparison import plot_error_function
 
-        fluxes, sigmas, limits = {}, {}, {}
+        fluxes = {}
+        sigmas = {}
+        limits = {}
         for name in self.filters if filters is None else filters:
             limits[name] = self.limiting_flux(name).value
             middle = limits[name] if np.isfinite(limits[name]) else 1.0

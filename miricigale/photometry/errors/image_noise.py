@@ -26,7 +26,8 @@ from miricigale.utils.tables import described_columns
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
 
 #: Largest number of empty positions, and arcsec to the edge of a PSF that is fitted.
-_EMPTY, _REACH = 2000, 2.0
+_EMPTY = 2000
+_REACH = 2.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -97,8 +98,8 @@ class ImageErrors:
             If the file exists and ``overwrite`` is False.
         """
         planes = {
-            f"limit_{name}": one.to_value(FNU).astype(np.float32)
-            for name, one in self.limits.items()
+            f"limit_{name}": limit.to_value(FNU).astype(np.float32)
+            for name, limit in self.limits.items()
         }
         planes["correlation"] = self.correlation
         write_image(self.noise, path, planes=planes, overwrite=overwrite)
@@ -155,31 +156,38 @@ def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.
     [1.0, 1.0]
     """
     image = as_mosaic(image, "image")
-    arrays, rng = image_arrays(image, "image"), np.random.default_rng(check_seed(seed))
+    arrays = image_arrays(image, "image")
+    rng = np.random.default_rng(check_seed(seed))
     check_positive(n_sigma, "n_sigma")
-    scale, usable = pixel_scale(arrays.wcs), arrays.usable
-    free = sky_noise(arrays.flux / arrays.sigma, usable, significance=4.0)[2]
-    level = np.median((arrays.flux / arrays.area)[free])
+    scale = pixel_scale(arrays.wcs)
+    usable = arrays.usable
+    is_free = sky_noise(arrays.flux / arrays.sigma, usable, significance=4.0)[2]
+    level = np.median((arrays.flux / arrays.area)[is_free])
     flux = np.where(usable, arrays.flux - level * arrays.area, 0.0)
-    correlation = noise_correlation(flux, free, 1 / arrays.sigma)
-    m, variance = len(correlation) // 2, np.where(usable, arrays.sigma, 0.0) ** 2
+    correlation = noise_correlation(flux, is_free, 1 / arrays.sigma)
+    m = len(correlation) // 2
+    variance = np.where(usable, arrays.sigma, 0.0) ** 2
     # pixels beyond the image are not free
-    distance = scipy.ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1]
-    rows, limits = [], {}
+    distance = scipy.ndimage.distance_transform_edt(np.pad(is_free, 1))[1:-1, 1:-1]
+    rows = []
+    limits = {}
     for name, (weight, reach, inside) in _weights(diameters, psf, scale).items():
-        plain, ny, nx = weight**2, *weight.shape
+        square, ny, nx = weight**2, *weight.shape
         spread = weight * fftconvolve(weight, correlation)[m : m + ny, m : m + nx]
-        factor = np.sqrt(spread.sum() / plain.sum())
+        factor = np.sqrt(spread.sum() / square.sum())
         # pixels without data count as those around
-        stated = fftconvolve(variance, plain, "same")
-        stated *= plain.sum() / np.maximum(fftconvolve(usable.astype(float), plain, "same"), 1e-9)
-        stated = np.sqrt(np.where(usable, stated, np.nan))
-        error = factor * np.nanmedian(stated) * FNU
-        limits[name] = n_sigma * factor * stated * FNU
+        stated_error = fftconvolve(variance, square, "same")
+        stated_error *= square.sum() / np.maximum(
+            fftconvolve(usable.astype(float), square, "same"), 1e-9
+        )
+        stated_error = np.sqrt(np.where(usable, stated_error, np.nan))
+        error = factor * np.nanmedian(stated_error) * FNU
+        limits[name] = n_sigma * factor * stated_error * FNU
         at = np.argwhere(usable & (distance > reach + 1))
         at = tuple(at[rng.permutation(len(at))[:_EMPTY]].T)
-        pulls = fftconvolve(flux, weight[::-1, ::-1], "same")[at] / (factor * stated[at])
-        limit, scatter = n_sigma * error, mad_std(pulls) if pulls.size > 1 else np.nan
+        pulls = fftconvolve(flux, weight[::-1, ::-1], "same")[at] / (factor * stated_error[at])
+        limit = n_sigma * error
+        scatter = mad_std(pulls) if pulls.size > 1 else np.nan
         rows.append(
             {
                 "aperture": name,
@@ -194,14 +202,14 @@ def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.
             }
         )
     over = float(np.sqrt(correlation[m, m]))
-    kept = {k: image.meta[k] for k in ("filter", "source", "noise") if k in image.meta}
-    meta = provenance(n_sigma=n_sigma, noise_over_stated=round(over, 4), **kept)
+    facts = {k: image.meta[k] for k in ("filter", "source", "noise") if k in image.meta}
+    meta = provenance(n_sigma=n_sigma, noise_over_stated=round(over, 4), **facts)
     texts = declared("miricigale.photometry", "columns.toml")["errors"]
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     table = described_columns(columns, texts, meta)
     noise = np.where(usable, arrays.sigma / arrays.area * over, np.nan)
-    noise = Image(noise, unit=SURFACE_BRIGHTNESS, wcs=arrays.wcs, meta=kept)
-    return ImageErrors(noise, correlation, table, limits, int(np.count_nonzero(free)))
+    noise = Image(noise, unit=SURFACE_BRIGHTNESS, wcs=arrays.wcs, meta=facts)
+    return ImageErrors(noise, correlation, table, limits, int(np.count_nonzero(is_free)))
 
 
 def _weights(diameters, psf, scale):
@@ -209,12 +217,13 @@ def _weights(diameters, psf, scale):
     radii = to_array(diameters, ANGLE, "diameters", ndim=1) / 2 / scale
     check_positive(float(min(radii, default=1.0)), "diameters")
     half = int(np.ceil(max([*radii, 0 if psf is None else _REACH / scale])))
-    shape, found = (2 * half + 1,) * 2, {}
+    shape = (2 * half + 1,) * 2
+    apertures = {}
     light = np.full(shape, np.nan)
     if psf is not None:
         light = psf_image(psf, pixel_scale=scale * ANGLE, shape=shape[0])
-        found["psf"] = light / np.sum(light**2), psf.fwhm.to_value(ANGLE) / scale, 1.0
+        apertures["psf"] = light / np.sum(light**2), psf.fwhm.to_value(ANGLE) / scale, 1.0
     for radius in radii:
         weight = CircularAperture((half, half), radius).to_mask(method="exact").to_image(shape)
-        found[f"{2 * radius * scale:.3g}"] = weight, radius, float(np.sum(weight * light))
-    return found
+        apertures[f"{2 * radius * scale:.3g}"] = weight, radius, float(np.sum(weight * light))
+    return apertures

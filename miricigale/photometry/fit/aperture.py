@@ -17,11 +17,22 @@ from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, FNU, positive, to_array
 
-#: The paper's settings on its pixels: PHOT_AUTOPARAMS, BACK_SIZE and BACK_FILTERSIZE, width of the ring for
-#: the local background, diameter of the circle (arcsec); light of a point source in the AUTO ellipse and in the
-#: circle.
-_KRON, _BACKGROUND, _RING, _DIAMETER = (2.5, 3.5), (64, 6), 40, 1.86
-_AUTO_FRACTION, _APERTURE_FRACTION = 0.94, 0.8
+#: The paper's PHOT_AUTOPARAMS: factor on the Kron radius, and least radius of the ellipse.
+_KRON = (2.5, 3.5)
+
+#: The paper's BACK_SIZE (pixels) and BACK_FILTERSIZE (boxes).
+_BACKGROUND_BOX = 64
+_BACKGROUND_FILTER = 6
+
+#: Width (pixels) of the ring for the local background.
+_RING = 40
+
+#: Diameter of the circle (arcsec).
+_DIAMETER = 1.86
+
+#: Parts of a point source's light in the Kron ellipse and in the circle.
+_AUTO_FRACTION = 0.94
+_APERTURE_FRACTION = 0.8
 
 
 def aperture_photometry(image, sky, diameter=None):
@@ -71,7 +82,9 @@ def aperture_photometry(image, sky, diameter=None):
     arrays = image_arrays(as_mosaic(image), "image")
     if isinstance(sky, (PixelAperture, SkyAperture)):
         check_that(diameter is None, "diameter", "left out with an aperture", diameter)
-        aperture = sky.to_pixel(arrays.wcs) if isinstance(sky, SkyAperture) else sky
+        aperture = sky
+        if isinstance(sky, SkyAperture):
+            aperture = sky.to_pixel(arrays.wcs)
         flux, flux_err, coverage = aperture_sums(arrays, aperture)
         shape = type(sky).__name__
     else:
@@ -89,7 +102,7 @@ def aperture_photometry(image, sky, diameter=None):
 
 
 def circle_sums(arrays, xy, radius):
-    """Flux, error and usable fraction in circles, exact in the pixels that they cut."""
+    """Sum flux (uJy), its error and the usable fraction in circles, exact in the pixels that they cut."""
     n = len(xy)
     if n == 0:
         return np.empty(0), np.empty(0), np.empty(0)
@@ -97,15 +110,16 @@ def circle_sums(arrays, xy, radius):
 
 
 def aperture_sums(arrays, aperture):
-    """Flux, error and usable fraction in apertures of photutils in pixels, exact in the pixels that they cut."""
+    """Sum flux (uJy), its error and the usable fraction in apertures, exact in the pixels that they cut."""
     variance = np.where(arrays.usable, arrays.sigma, 0.0) ** 2
-    sums = [
-        np.atleast_1d(ApertureStats(image, aperture).sum)
-        for image in (arrays.flux, variance, arrays.usable.astype(float))
-    ]
-    coverage = np.nan_to_num(sums[2]) / aperture.area
+
+    def total(image):
+        return np.atleast_1d(ApertureStats(image, aperture).sum)
+
+    coverage = np.nan_to_num(total(arrays.usable.astype(float))) / aperture.area
     empty = coverage <= 0
-    flux, noise = (np.where(empty, np.nan, values) for values in sums[:2])
+    flux = np.where(empty, np.nan, total(arrays.flux))
+    noise = np.where(empty, np.nan, total(variance))
     return flux, np.sqrt(noise), coverage
 
 
@@ -166,53 +180,58 @@ def source_extractor_photometry(
     ratio = 1.0
     if stated_on is not None:
         ratio = float(to_array(stated_on, ANGLE, "stated_on")) / pixel_scale(image.wcs)
-    box = max(1, round(_BACKGROUND[0] * ratio))
+    box = max(1, round(_BACKGROUND_BOX * ratio))
     empty = ~arrays.usable if weighted else None
-    level, rms = sep_background(arrays.flux, empty, box, _BACKGROUND[1])
+    level, rms = sep_background(arrays.flux, empty, box, _BACKGROUND_FILTER)
     flux = arrays.flux - np.where(arrays.usable, level, 0.0)
     if not weighted:
         flux = arrays.flux - level
         sigma = np.full(flux.shape, np.median(rms[rms > 0]))
         arrays = dataclasses.replace(arrays, sigma=sigma, usable=sigma > 0)
     data = np.where(arrays.usable, flux, np.nan)
-    own = CCDData(data, unit=FNU, uncertainty=StdDevUncertainty(arrays.sigma), wcs=image.wcs)
-    segmentation, catalog = detect_sources(own, preset=preset, stated_on=stated_on)
+    subtracted = CCDData(data, unit=FNU, uncertainty=StdDevUncertainty(arrays.sigma), wcs=image.wcs)
+    segmentation, catalog = detect_sources(subtracted, preset=preset, stated_on=stated_on)
     values = [np.empty(0)] * 4
     if len(catalog):
         values = _measure(arrays, flux, segmentation, catalog, ratio)
     auto, auto_err, aper, aper_err = values
-    best, others = np.stack(values[:2]) / _AUTO_FRACTION, np.stack(values[2:]) / _APERTURE_FRACTION
-    best = np.where(np.nan_to_num(best[0], nan=-np.inf) > others[0], best, others)
+    # both brought to the total of a point source
+    ellipse = np.stack([auto, auto_err]) / _AUTO_FRACTION
+    circle = np.stack([aper, aper_err]) / _APERTURE_FRACTION
+    best, best_err = np.where(np.nan_to_num(ellipse[0], nan=-np.inf) > circle[0], ellipse, circle)
     for name, flux, error, text in (
         ("flux_auto", auto, auto_err, "Light in the Kron ellipse"),
         ("flux_aper", aper, aper_err, "Light in the circle"),
-        ("flux_best", *best, "Brighter of the two after correction to total"),
+        ("flux_best", best, best_err, "Brighter of the two after correction to total"),
     ):
-        catalog[name], catalog[f"{name}_err"] = flux * FNU, error * FNU
+        catalog[name] = flux * FNU
+        catalog[f"{name}_err"] = error * FNU
         catalog[name].info.description = text
         catalog[f"{name}_err"].info.description = "1-sigma error, if the noise is not correlated"
     return catalog
 
 
 def _measure(arrays, flux, segmentation, catalog, ratio):
-    """Light and errors in Kron ellipses and circles, less the level of rings around them."""
+    """Sum light and its errors (uJy) in Kron ellipses and circles, less the level of rings around them."""
     arrays = dataclasses.replace(
         arrays, flux=flux, sigma=np.where(arrays.usable, arrays.sigma, 0.0)
     )
-    factor, least = _KRON
+    factor, min_radius = _KRON
     sources = SourceCatalog(
         flux,
         segmentation,
         error=arrays.sigma,
         mask=~arrays.usable,
         local_bkg_width=round(_RING * ratio),
-        kron_params=(factor, least / factor, 0.0),
+        kron_params=(factor, min_radius / factor, 0.0),
     )
-    auto, auto_err = (np.atleast_1d(v) for v in (sources.kron_flux, sources.kron_flux_err))
+    auto = np.atleast_1d(sources.kron_flux)
+    auto_err = np.atleast_1d(sources.kron_flux_err)
     radius = _DIAMETER / 2 / pixel_scale(arrays.wcs)
     xy = np.stack([catalog["x_centroid"], catalog["y_centroid"]], axis=-1)
     aper, aper_err, coverage = circle_sums(arrays, xy, radius)
     # the mode, for faint sources within the rings raise the median
     mode = LocalBackground(radius, radius + _RING * ratio, bkg_estimator=SExtractorBackground())
-    ring = np.nan_to_num(np.atleast_1d(mode(arrays.flux, *xy.T, mask=~arrays.usable)))
+    x, y = xy.T
+    ring = np.nan_to_num(np.atleast_1d(mode(arrays.flux, x, y, mask=~arrays.usable)))
     return auto, auto_err, aper - ring * np.pi * radius**2 * coverage, aper_err

@@ -74,11 +74,11 @@ def measure_bands(images, kernels, templates, **options):
     check_that(not missing, "kernels", "one for each image", f"not in both: {missing}")
     results = {}
     for name, image in images.items():
-        one = kernels[name]
+        photometer = kernels[name]
         try:
-            if not isinstance(one, ForcedPhotometer):
-                one = ForcedPhotometer(one, **options)
-            results[name] = one.measure(image, templates=templates)
+            if not isinstance(photometer, ForcedPhotometer):
+                photometer = ForcedPhotometer(photometer, **options)
+            results[name] = photometer.measure(image, templates=templates)
         except (ValueError, TypeError) as err:
             err.add_note(f"in the band {name!r}")
             raise
@@ -106,34 +106,35 @@ def measure_prior(images, photometers, highres, segmentation, catalog):
     opened = {}
     for name, image in images.items():
         if are_exposures(image):
-            opened[name] = [as_mosaic(one) for one in image]
+            opened[name] = list(map(as_mosaic, image))
         else:
             opened[name] = own_pixels(as_mosaic(image))
-    images = opened
-    starred = {
-        name: with_stars(one, images[name], catalog, highres)
-        for name, one in photometers.items()
-        if one.psf_stars is not False and not one.bare
-    }
-    photometers = photometers | {name: one for name, (one, _) in starred.items()}
-    results = _measure_prior(images, photometers, highres, segmentation, catalog)
-    return results | {name: stars.noted(results[name]) for name, (_, stars) in starred.items()}
+    photometers = dict(photometers)
+    stars = {}
+    for name, photometer in photometers.items():
+        if photometer.psf_stars is not False and not photometer.bare:
+            photometers[name], stars[name] = with_stars(photometer, opened[name], catalog, highres)
+    results = _measure_prior(opened, photometers, highres, segmentation, catalog)
+    for name, band_stars in stars.items():
+        results[name] = band_stars.noted(results[name])
+    return results
 
 
 def _measure_prior(images, photometers, highres, segmentation, catalog):
-    """As `measure_prior`, without stars."""
+    """Measure as `measure_prior` does, without stars."""
     # without PSFs there are no wings
-    first = min(photometers.values(), key=lambda one: one.bare)
-    near = np.zeros(len(catalog), bool)
+    first = min(photometers.values(), key=lambda photometer: photometer.bare)
+    is_near = np.zeros(len(catalog), bool)
     for name, image in images.items():
         reach = len(photometers[name].mean_kernel.target)
-        for one in image if isinstance(image, list) else [image]:
-            xy = sky_pixels(catalog["sky"], one.wcs, one.shape, reach)
-            near |= np.isfinite(xy[:, 0])
-    templates = first._templates(highres, segmentation, catalog[near])
-    if not near.all():
-        parts = [templates, SourceTemplates.from_catalog(catalog[~near])]
-        order = np.argsort(np.concatenate([np.flatnonzero(near), np.flatnonzero(~near)]))
+        exposures = image if isinstance(image, list) else [image]
+        for exposure in exposures:
+            xy = sky_pixels(catalog["sky"], exposure.wcs, exposure.shape, reach)
+            is_near |= np.isfinite(xy[:, 0])
+    templates = first._templates(highres, segmentation, catalog[is_near])
+    if not is_near.all():
+        parts = [templates, SourceTemplates.from_catalog(catalog[~is_near])]
+        order = np.argsort(np.concatenate([np.flatnonzero(is_near), np.flatnonzero(~is_near)]))
         joined = SourceTemplates.concatenate(parts)[order]
         templates = dataclasses.replace(joined, meta=templates.meta)
     if first.bare:
@@ -142,28 +143,33 @@ def _measure_prior(images, photometers, highres, segmentation, catalog):
     results = measure_bands(images, photometers, templates)
     sky = SkyCoord([], [], unit="deg")
     for result in results.values():
-        new = [] if result.new_sources is None else result.new_sources["sky"].icrs
-        if len(new) and len(sky):
+        if result.new_sources is None or not len(result.new_sources):
+            continue
+        new = result.new_sources["sky"].icrs
+        if len(sky):
+            # within half the width of the PSF it is the same source
             new = new[new.match_to_catalog_sky(sky)[1] > result.psf_fwhm / 2]
-        sky = joined_sky([sky, new]) if len(new) else sky
+        sky = joined_sky([sky, new])
     if not len(sky):
         return results
     points = SourceTemplates.from_catalog(
         QTable({"id": new_ids(templates.id, len(sky)), "sky": sky})
     )
-    known = {"flags": int(ForcedFlags.NOT_IN_CATALOG)}
-    known |= {
-        k: v for k, v in (("flux", 0.0), ("components", 1)) if getattr(templates, k) is not None
-    }
-    points = dataclasses.replace(points, **{k: np.full(len(sky), v) for k, v in known.items()})
-    every = dataclasses.replace(
-        SourceTemplates.concatenate([templates, points]), meta=templates.meta
-    )
-    again = {name: one.replace(second_pass=False) for name, one in photometers.items()}
-    found = measure_bands(images, again, every)
-    for name, result in found.items():
+    columns = {"flags": np.full(len(sky), int(ForcedFlags.NOT_IN_CATALOG))}
+    if templates.flux is not None:
+        columns["flux"] = np.full(len(sky), 0.0)
+    if templates.components is not None:
+        columns["components"] = np.full(len(sky), 1)
+    points = dataclasses.replace(points, **columns)
+    joined = SourceTemplates.concatenate([templates, points])
+    joined = dataclasses.replace(joined, meta=templates.meta)
+    last_pass = {}
+    for name, photometer in photometers.items():
+        last_pass[name] = photometer.replace(second_pass=False)
+    last_results = measure_bands(images, last_pass, joined)
+    for name, result in last_results.items():
         result.meta["second_pass"] = results[name].meta["second_pass"]
-    return found
+    return last_results
 
 
 def join_bands(results):
@@ -205,45 +211,53 @@ def join_bands(results):
       2        2.0         3.0
     """
     check_that(results, "results", "at least one band", "none")
-    tables = {
-        name: one if isinstance(one, Table) else one.to_table() for name, one in results.items()
-    }
+    tables = {}
+    bands = {}
+    for name, result in results.items():
+        tables[name] = result if isinstance(result, Table) else result.to_table()
+        if tables[name].meta:
+            bands[name] = dict(tables[name].meta)
     rows = {}
-    for one in tables.values():
-        for k, key in enumerate(np.asarray(one["id"]).tolist()):
-            rows.setdefault(key, (one, k))
+    for table in tables.values():
+        for k, key in enumerate(np.asarray(table["id"]).tolist()):
+            rows.setdefault(key, (table, k))
     ids = list(rows)
-    sky = [one["sky"][k].icrs for one, k in rows.values()] if len(tables) > 1 else []
-    bands = {name: dict(one.meta) for name, one in tables.items() if one.meta}
-    joined = QTable(meta=provenance(stage="photometry") | ({"bands": bands} if bands else {}))
+    meta = provenance(stage="photometry")
+    if bands:
+        meta["bands"] = bands
+    joined = QTable(meta=meta)
     first = next(iter(tables.values()))
-    joined["id"] = np.array(ids, dtype=np.asarray(first["id"]).dtype if not ids else None)
-    same = all(np.array_equal(one["id"], first["id"]) for one in tables.values())
-    joined["sky"] = first["sky"] if same else SkyCoord(sky)
-    for name, one in tables.items():
-        at = {key: k for k, key in enumerate(np.asarray(one["id"]).tolist())}
-        index = np.array([at.get(key, -1) for key in ids], int)
-        for column in one.colnames:
+    joined["id"] = np.array(ids) if ids else np.asarray(first["id"])[:0]
+    if all(np.array_equal(table["id"], first["id"]) for table in tables.values()):
+        joined["sky"] = first["sky"]
+    else:
+        joined["sky"] = SkyCoord([table["sky"][k].icrs for table, k in rows.values()])
+    for name, table in tables.items():
+        row_of_id = {key: k for k, key in enumerate(np.asarray(table["id"]).tolist())}
+        index = np.array([row_of_id.get(key, -1) for key in ids], int)
+        for column in table.colnames:
             label = band_column(column, name)
             if label == column:
                 continue
-            joined[label] = spread_rows(one[column], index, column)
-            joined[label].info.description = one[column].info.description
+            joined[label] = spread_rows(table[column], index, column)
+            joined[label].info.description = table[column].info.description
     return joined
 
 
 def spread_rows(values, index, column):
     """
-    Rows of a column by number, filled for those that are missing (-1).
+    Take rows of a column by number, filled for those that are missing (-1).
 
     Missing numbers are NaN or 0, texts "none", and ``flags``, if that is the name of the column, ``NO_DATA``.
     """
     if np.all(index >= 0):
         return values[index].copy()
     kind = np.asarray(values).dtype.kind
-    empty = {"f": np.nan, "b": False}.get(kind, "none" if kind == "U" else 0)
+    empty = {"f": np.nan, "b": False, "U": "none"}.get(kind, 0)
     if column == "flags":
         empty = int(ForcedFlags.NO_DATA)
-    found = np.where(index >= 0, np.asarray(values)[index], empty)
+    spread = np.where(index >= 0, np.asarray(values)[index], empty)
     unit = getattr(values, "unit", None)
-    return found if unit is None else found * unit
+    if unit is None:
+        return spread
+    return spread * unit

@@ -16,7 +16,7 @@ from miricigale.utils.units import ANGLE, FNU, to_array
 
 def encircled_flux(image, sky, flux, radii):
     """
-    Light of point sources within radii, over what they should have.
+    Measure the light of point sources within radii, over their true flux.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ def encircled_flux(image, sky, flux, radii):
     true = to_array(flux, FNU, "flux", ndim=1)
     if len(true) != len(sky):
         raise argument_error("flux", f"{len(sky)} fluxes, one for each position", len(true))
-    if len(true) == 0 or not np.all(true > 0):
-        raise argument_error("flux", "positive fluxes", "none" if len(true) == 0 else true.min())
+    check_that(len(true) > 0, "flux", "positive fluxes", "none")
+    check_that(np.all(true > 0), "flux", "positive fluxes", true.min())
     radius = np.atleast_1d(to_array(radii, ANGLE, "radii"))
     scale = image_scale(image.wcs)
     xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
@@ -83,7 +83,7 @@ def encircled_flux(image, sky, flux, radii):
 
 def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
     """
-    The factor by which an image is to be multiplied to have the true flux scale.
+    Calculate the factor by which an image is multiplied to have the true flux scale.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
 
 def aperture_correction(psf, radius, *, pixel_scale=None):
     """
-    The factor from light in a circle to total light, for a point source.
+    Calculate the factor from light in a circle to total light, for a point source.
 
     Parameters
     ----------

@@ -14,7 +14,8 @@ from miricigale.utils.parallel import chunks
 #: Part of a template's light on pixels at the rim of the data from which its flux may be off by some per cent.
 _RIM_LIGHT = 0.1
 #: Errors by which a flux is above twice the image's light, or negative, where templates cancel.
-_ABOVE_LIGHT, _NEGATIVE = 3.0, 5.0
+_ABOVE_LIGHT = 3.0
+_NEGATIVE = 5.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,7 +32,7 @@ class Diagnostics:
     rim: np.ndarray  # (n,): Fraction of each row's light on pixels at the rim of the image's data.
     # (n,): The flux with which each row would have all of the image's light below its core, uJy; NaN where not
     # fitted, and for second components.
-    seen: np.ndarray
+    core_flux: np.ndarray
     poor: np.ndarray  # (n,): Whether chi2 is too large for noise.
     peaks: ResidualPeaks  # Light that no template explains.
 
@@ -44,46 +45,55 @@ def diagnose(fit, xy):
     if fit.settings.errors.correlated_noise and len(fit.rows):
         correlation = _correlation(fit, residual, model)
     # the image is its model and the residual
-    chi2, left, core, below, rim = _statistics(
+    chi2, residual_light, core, core_light, rim = _statistics(
         fit, residual, residual + fit.arrays.usable * model
     ).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        left = left / (fit.total * core)
-        seen = below / core
-    out = np.ones(len(chi2), bool)
-    out[fit.rows] = False
-    out |= ~fit.main
-    seen = np.where(out, np.nan, seen)
-    chi2, left = np.where(out, np.nan, chi2), np.where(out, np.nan, left)
+        residual_light = residual_light / (fit.total * core)
+        core_flux = core_light / core
+    is_out = np.ones(len(chi2), bool)
+    is_out[fit.rows] = False
+    is_out |= ~fit.main
+    core_flux = np.where(is_out, np.nan, core_flux)
+    chi2 = np.where(is_out, np.nan, chi2)
+    residual_light = np.where(is_out, np.nan, residual_light)
     # where the measured noise is above that of the uncertainty, it is the measure
-    lag = 0 if correlation is None else correlation.shape[0] // 2
-    variance = 1.0 if correlation is None else max(1.0, correlation[lag, lag])
+    variance = 1.0
+    if correlation is not None:
+        lag = correlation.shape[0] // 2
+        variance = max(1.0, correlation[lag, lag])
     peaks = residual_peaks(fit, residual, model, xy + fit.displacement(xy))
     poor = chi2 > POOR_CHI2 * variance
     if fit.free is not None:
         # what the high-resolution image shows is not what is fitted here
         poor[fit.rows] |= fit.free.strain > POOR_STRAIN
-    return Diagnostics(model, residual, correlation, chi2, left, rim, seen, poor, peaks)
+    return Diagnostics(
+        model, residual, correlation, chi2, residual_light, rim, core_flux, poor, peaks
+    )
 
 
 def _correlation(fit, residual, model):
-    """Measured correlation of the noise, or as the image states it where there is too little sky; or None."""
+    """Measure the correlation of the noise, or take that which the image states if there is too little sky."""
     usable = fit.arrays.usable
-    free = usable.copy()
+    is_free = usable.copy()
     for part in chunks(len(model), 256):
-        free[part] &= np.abs(model[part]) * fit.inverse_sigma[part] < 0.3
-    if np.count_nonzero(free) < max(400, 0.02 * np.count_nonzero(usable)):
-        free = usable
-    if np.count_nonzero(free) < 400:
-        stated = fit.arrays.noise_correction
-        return stated_correlation(stated) if stated > 1 else None
-    correlation = noise_correlation(residual, free, fit.inverse_sigma, executor=fit.bank.executor)
-    return correlation if correlation.any() else None
+        is_free[part] &= np.abs(model[part]) * fit.inverse_sigma[part] < 0.3
+    if np.count_nonzero(is_free) < max(400, 0.02 * np.count_nonzero(usable)):
+        is_free = usable
+    if np.count_nonzero(is_free) < 400:
+        if fit.arrays.noise_correction <= 1:
+            return None
+        return stated_correlation(fit.arrays.noise_correction)
+    executor = fit.bank.executor
+    correlation = noise_correlation(residual, is_free, fit.inverse_sigma, executor=executor)
+    if not correlation.any():
+        return None
+    return correlation
 
 
 def _statistics(fit, residual, light):
     """
-    What the images show where each template is, shape (n, 5).
+    Sum up the images where each template is, shape (n, 5).
 
     Chi2, residual and light of each template's core (see the kernel), the image's light below it, and the part of
     the template that is on the rim.
@@ -97,19 +107,21 @@ def _statistics(fit, residual, light):
 
             def measure(part, block=block):
                 rows = slice(block.first + part.start, block.first + part.stop)
-                stamps = block.some(part)
-                for image, found in zip((residual, light), out, strict=True):
-                    residual_statistics(*stamps, image, fit.inverse_sigma, found[rows])
-                rim_light[rows] = _light_on(rim, *stamps)
+                values, box, start = block.stamps_of(part)
+                for image, statistics in zip((residual, light), out, strict=True):
+                    residual_statistics(
+                        values, box, start, image, fit.inverse_sigma, statistics[rows]
+                    )
+                rim_light[rows] = _light_on(rim, values, box, start)
 
             fit.bank.map(measure, block.parts())
-    below = out[1, :, 1]
-    return np.column_stack([out[0], below, rim_light / fit.bank.full_light()])
+    core_light = out[1, :, 1]
+    return np.column_stack([out[0], core_light, rim_light / fit.bank.full_light()])
 
 
 def rim_pixels(usable):
     """
-    Pixels at the rim of the data: usable ones beside what is beyond the first and last usable pixels.
+    Find pixels at the rim of the data: usable ones next to pixels beyond the first and last usable ones.
 
     Those of a drizzled mosaic are covered in part, and show the brightness of that part as if it were that of the
     whole pixel: the light of a star that falls there is too large.
@@ -123,11 +135,11 @@ def rim_pixels(usable):
     -------
     rim : `~numpy.ndarray` of bool, shape (ny, nx)
     """
-    (left, right), (low, high) = _ends(usable)
+    (first, last), (lowest, highest) = _ends(usable)
     rows, columns = np.ogrid[: usable.shape[0], : usable.shape[1]]
-    beyond = (columns < left[rows]) | (columns > right[rows])
-    beyond |= (rows < low[columns]) | (rows > high[columns])
-    return usable & binary_dilation(beyond)
+    is_beyond = (columns < first[rows]) | (columns > last[rows])
+    is_beyond |= (rows < lowest[columns]) | (rows > highest[columns])
+    return usable & binary_dilation(is_beyond)
 
 
 def _light_on(mask, values, boxes, starts):
@@ -142,39 +154,39 @@ def _light_on(mask, values, boxes, starts):
 
 
 def _ends(usable):
-    """First and last usable pixel of each row, and of each column; none of a row without any."""
+    """Return the first and last usable pixel of each row, and of each column (n and -1 without any)."""
     ends = []
     for image in (usable, usable.T):
-        some = image.any(axis=1)
+        has_data = image.any(axis=1)
         n = image.shape[1]
         first = image.argmax(axis=1)
         last = n - 1 - image[:, ::-1].argmax(axis=1)
-        ends.append((np.where(some, first, n), np.where(some, last, -1)))
+        ends.append((np.where(has_data, first, n), np.where(has_data, last, -1)))
     return ends
 
 
 def _cut_by_rim(usable, boxes):
     """
-    Boxes (row, column, height, width; inside the image) whose unusable pixels are mostly beyond the image's data.
+    Find boxes (row, column, height, width) whose unusable pixels are mostly beyond the image's data.
 
     That is before the first or after the last usable pixel of a row or column: of a mosaic whose footprint is
     turned against its pixels, what is not exposed.
     """
-    found = np.zeros(len(boxes), bool)
+    is_cut = np.zeros(len(boxes), bool)
     if not len(boxes):
-        return found
-    (left, right), (low, high) = _ends(usable)
+        return is_cut
+    (first, last), (lowest, highest) = _ends(usable)
     for k, (y, x, ny, nx) in enumerate(boxes):
         rows, columns = np.ogrid[y : y + ny, x : x + nx]
-        beyond = (columns < left[rows]) | (columns > right[rows])
-        beyond |= (rows < low[columns]) | (rows > high[columns])
-        found[k] = np.sum(beyond) > 0.5 * np.sum(~usable[y : y + ny, x : x + nx])
-    return found
+        is_beyond = (columns < first[rows]) | (columns > last[rows])
+        is_beyond |= (rows < lowest[columns]) | (rows > highest[columns])
+        is_cut[k] = np.sum(is_beyond) > 0.5 * np.sum(~usable[y : y + ny, x : x + nx])
+    return is_cut
 
 
-def canceling(flux, error, seen):
+def canceling(flux, error, core_flux):
     """
-    Whether fluxes are more than the image can hold, by which those of neighbors must be negative, or are negative.
+    Find fluxes that are more than the image can hold, so that neighbors must be negative, or that are negative.
 
     Parameters
     ----------
@@ -189,18 +201,20 @@ def canceling(flux, error, seen):
         Those above twice the image's light by three errors, or negative by five.
     """
     with np.errstate(invalid="ignore"):
-        above = flux - 2.0 * np.maximum(seen, 0.0) > _ABOVE_LIGHT * error
-        return above | (flux < -_NEGATIVE * error)
+        is_above = flux - 2.0 * np.maximum(core_flux, 0.0) > _ABOVE_LIGHT * error
+        return is_above | (flux < -_NEGATIVE * error)
 
 
 def source_flags(fit, diagnostics, place, flux, blending):
     """
-    Flags, (n,), that follow from a fit, and the fraction of each template on usable pixels.
+    Return the flags, (n,), that follow from a fit, and the fraction of each template on usable pixels.
 
     ``place`` is the source of each row of the bank, ``flux`` those of all sources (NaN where not
     measured), ``blending`` each row's formal error over that of the source alone (NaN where not fitted).
     """
-    flags, inside, coverage = np.zeros(len(flux), int), np.zeros(len(flux)), np.zeros(len(flux))
+    flags = np.zeros(len(flux), int)
+    inside = np.zeros(len(flux))
+    coverage = np.zeros(len(flux))
     inside[place[fit.main]] = fit.light[fit.main, 0]
     coverage[place[fit.main]] = np.clip(fit.light[fit.main, 1], 0.0, 1.0)
     for rows, flag in (

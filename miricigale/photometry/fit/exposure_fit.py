@@ -7,7 +7,7 @@ import scipy.linalg
 import scipy.sparse
 
 from miricigale.photometry._core.stamps import add_model
-from miricigale.photometry.fit.template_fit import MIN_COVERAGE, duplicates, inner
+from miricigale.photometry.fit.template_fit import MIN_COVERAGE, duplicates, inner_products
 from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.photometry.images.fields import legendre_terms
 from miricigale.photometry.shapes.shapes import not_fitted
@@ -76,7 +76,9 @@ class ExposurePart:
     def correlation(self):
         """Correlation of the noise as the exposure states it (charge that pixels share), or None."""
         factor = self.arrays.noise_correction
-        return stated_correlation(factor) if factor > 1 else None
+        if factor <= 1:
+            return None
+        return stated_correlation(factor)
 
     def gather(self, n):
         """Matrix, (n, k), that sums the bank's rows by source."""
@@ -100,7 +102,8 @@ class ExposurePart:
         Templates that stay where they are in the bank of ``like``, another `ExposurePart`, are taken from there.
         """
         bank = self.bank.shifted(shift)
-        bank.reuse((self if like is None else like).bank)
+        same = self if like is None else like
+        bank.reuse(same.bank)
         return dataclasses.replace(self, bank=bank)
 
 
@@ -197,7 +200,7 @@ class ExposureFit:
                 places["shift"] = slice(places["sky"].stop, n_common + len(columns))
             n_common += len(columns)
             self.places.append(places)
-            white = [part.arrays.whitened(column) for column in columns]
+            white = list(map(part.arrays.whitened, columns))
             data = part.arrays.whitened(part.arrays.flux)
             square, projection, power, light = normal_matrix(
                 part.bank, part.inverse_sigma, [data, *white]
@@ -211,8 +214,8 @@ class ExposureFit:
             correction += gather @ (np.minimum(excess, _MAX_EXCESS) * square.diagonal())
             rhs += gather @ projection[:, 0]
             borders.append(gather @ projection[:, 1:])
-            corners.append([[inner(a, b) for b in white] for a in white])
-            corner_rhs += [inner(a, data) for a in white]
+            corners.append(inner_products(white, white))
+            corner_rhs.append(inner_products(white, [data])[:, 0])
             is_seen = light[:, 1] >= MIN_COVERAGE
             self.n_exposures[source[is_seen]] += 1
             self.noisy[source[is_seen & (excess <= _MAX_EXCESS)]] = False
@@ -230,7 +233,7 @@ class ExposureFit:
         if len(self.rows):
             border = np.concatenate(borders, axis=1)[self.rows]
             corner = scipy.linalg.block_diag(*corners)
-            self.fit = LinearFit(matrix, rhs[self.rows], border, corner, np.array(corner_rhs))
+            self.fit = LinearFit(matrix, rhs[self.rows], border, corner, np.concatenate(corner_rhs))
             self.flux[self.rows] = self.fit.flux
 
     @property
@@ -238,7 +241,8 @@ class ExposureFit:
         """The common parameters, shape (g,); zero where nothing was fitted."""
         if self.fit is None:
             return np.zeros(self.places[-1]["sky"].stop)
-        return (self.fit if self.free is None else self.free.fit).common
+        solution = self.fit if self.free is None else self.free.fit
+        return solution.common
 
     def cutouts(self):
         """The light of each source (`~miricigale.photometry.detection.cutouts.Cutout`), None for points."""
@@ -317,7 +321,7 @@ class ExposureFit:
             banks.append((bank, numbers))
             data = part.arrays.whitened(part.arrays.flux)
             columns = part.sky_columns(self.order)
-            white = [part.arrays.whitened(change) for change in columns]
+            white = list(map(part.arrays.whitened, columns))
             square, projection, _, _ = normal_matrix(bank, part.inverse_sigma, [data, *white])
             place = _selection(numbers, n_changes)
             squares = squares + place @ square @ place.T
@@ -378,15 +382,17 @@ class ExposureFit:
         corner = np.zeros((n_common, n_common))
         for k, part in enumerate(self.parts):
             correlation = part.correlation
-            correlation = np.ones((1, 1)) if correlation is None else correlation
-            white = [part.arrays.whitened(column) for column in part.sky_columns(self.order)]
+            if correlation is None:
+                # that of white noise
+                correlation = np.ones((1, 1))
+            white = list(map(part.arrays.whitened, part.sky_columns(self.order)))
             spread = [_spread(column, correlation) for column in white]
             sky = self.places[k]["sky"]
             gather = part.gather(len(self.xy))[self.rows]
             square, side = sandwich_matrix(part.bank, part.inverse_sigma, correlation, spread)
             middle = middle + gather @ square @ gather.T
             border[:, sky] = gather @ side
-            corner[sky, sky] = [[inner(a, b) for b in spread] for a in white]
+            corner[sky, sky] = inner_products(white, spread)
             if self.free is None:
                 continue
             bank, numbers = self.free.bank[k]

@@ -29,7 +29,7 @@ _SAME_ROLL = 0.05
 
 
 def are_exposures(image):
-    """Whether an image stands for several exposures: a list of them, and no list of the HDUs of one file."""
+    """Return whether an image stands for several exposures: a list, but not that of the HDUs of one file."""
     return isinstance(image, (list, tuple)) and not isinstance(image, fits.HDUList)
 
 
@@ -73,7 +73,7 @@ class ExposureKernels:
         for kernel in kernels:
             if not isinstance(kernel, (MatchingKernel, KernelField)):
                 raise argument_error("kernel", wanted, type(kernel).__name__)
-            mean = kernel.mean if isinstance(kernel, KernelField) else kernel
+            mean = _mean_kernel(kernel)
             if mean.source is None or mean.target is None:
                 raise argument_error("kernel", "kernels with their PSFs", "one without")
 
@@ -109,7 +109,8 @@ class ExposureKernels:
         scale = pixel_scale(highres.wcs) * ANGLE
         turn = grid_angle(highres.wcs, highres.shape)
         sharp = _sharp_psf(highres, highres_psf, scale, turn)
-        roll_fields, kernels = [], []
+        roll_fields = []
+        kernels = []
         for k, image in enumerate(images):
             facts = ImageFacts.of(image)
             wanted = "exposures of one of the imager's filters"
@@ -139,14 +140,18 @@ class ExposureKernels:
     @functools.cached_property
     def mean(self):
         """The mean `~miricigale.psf.MatchingKernel`."""
-        means = [
-            kernel.mean if isinstance(kernel, KernelField) else kernel for kernel in self.kernels
-        ]
-        return MatchingKernel.blend(means)
+        return MatchingKernel.blend(list(map(_mean_kernel, self.kernels)))
+
+
+def _mean_kernel(kernel):
+    """Return the kernel itself, or the mean of a field of kernels."""
+    if isinstance(kernel, KernelField):
+        return kernel.mean
+    return kernel
 
 
 def exposure_roll(image):
-    """Position angle (deg) of the detector's +y: as stated (``pa_aper``), or that of the coordinates."""
+    """Return the position angle (deg) of the detector's +y, as stated, or that of the coordinates."""
     pa_aper = image.meta.get("pa_aper")
     if pa_aper is None:
         # headers of files have that of an option

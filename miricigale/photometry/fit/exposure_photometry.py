@@ -15,7 +15,14 @@ from miricigale.photometry.fit.exposure_kernels import ExposureKernels
 from miricigale.photometry.fit.exposure_result import joint_result, plane_peaks
 from miricigale.photometry.fit.offsets import source_offsets
 from miricigale.photometry.fit.result_table import CatalogRows
-from miricigale.photometry.images.arrays import fit_arrays, local_maps, pixel_scale, sky_pixels
+from miricigale.photometry.images.arrays import (
+    fit_arrays,
+    lengths,
+    local_maps,
+    pixel_scale,
+    pixels_to_sky,
+    sky_pixels,
+)
 from miricigale.photometry.images.coadd import Plane
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.templates.placement import Placement
@@ -93,12 +100,13 @@ def measure_exposures(
         sources = templates
     if sources.components is not None and np.any(sources.components == 2):
         raise argument_error("components", "1 for exposures", "2 for some of the sources")
-    arrays = [fit_arrays(image, f"image[{k}]") for k, image in enumerate(images)]
-    placed = [
-        Placement.of(own_settings, exposure, sources.sky)
-        for own_settings, exposure in zip(settings, arrays, strict=True)
-    ]
-    near_rows = np.unique(np.concatenate([place.near for place in placed]))
+    arrays = []
+    placed = []
+    for k, image in enumerate(images):
+        exposure = fit_arrays(image, f"image[{k}]")
+        arrays.append(exposure)
+        placed.append(Placement.of(settings[k], exposure, sources.sky))
+    near_rows = np.unique(np.concatenate([place.near_rows for place in placed]))
     if len(sources.id) and not len(near_rows):
         msg = f"none of the {len(sources.id)} sources is on or near the exposures: nothing is measured"
         warn(msg, PhotometryWarning)
@@ -164,35 +172,35 @@ def _check_offered(photometer):
 
 def _plane(arrays):
     """The grid that exposures have in common: north up, with pixels of their mean size."""
-    shapes = [exposure.flux.shape for exposure in arrays]
     scale = np.mean([pixel_scale(exposure.wcs) for exposure in arrays])
+    grids = []
     sized = []
-    for exposure, shape in zip(arrays, shapes, strict=True):
+    for exposure in arrays:
+        shape = exposure.flux.shape
+        grids.append((exposure.wcs, shape))
         wcs = exposure.wcs
         if wcs.pixel_shape is None:
             wcs = wcs.deepcopy()
             wcs.pixel_shape = shape[::-1]
         sized.append(wcs)
     wcs = mosaic_wcs(sized, scale * ANGLE)
-    return Plane.over(
-        wcs, [(exposure.wcs, shape) for exposure, shape in zip(arrays, shapes, strict=True)]
-    )
+    return Plane.over(wcs, grids)
 
 
-def _catalog_rows(sources, templates, near, xy):
+def _catalog_rows(sources, templates, near_rows, xy):
     """The catalog as the fit and its result take it."""
     n = len(sources.id)
     flags = np.zeros(n, int)
     snr = np.full(n, np.nan)
     kinds = np.full(n, "none", "U6")
-    flags[near] = templates.flags
-    snr[near] = templates.snr
-    kinds[near] = templates.kind
+    flags[near_rows] = templates.flags
+    snr[near_rows] = templates.snr
+    kinds[near_rows] = templates.kind
     return CatalogRows(
         id=np.asarray(sources.id),
         sky=sources.sky,
         xy=xy,
-        near=near,
+        near_rows=near_rows,
         flags=flags,
         template=kinds,
         template_snr=snr,
@@ -232,22 +240,22 @@ class _Joint:
         order = photometer.background_order
         # an exposure always has a sky of its own
         self._order = 0 if order is None else order
-        self._n = len(catalog.near)
+        self._n = len(catalog.near_rows)
 
     def place(self, placed, templates, executor):
         """Make the templates of each exposure."""
         self._placed = placed
         self._grids = [place.grid(templates) for place in placed]
         number = np.full(len(self._catalog.id), -1)
-        number[self._catalog.near] = np.arange(self._n)
+        number[self._catalog.near_rows] = np.arange(self._n)
         # memory that is kept is that of all exposures
         memory = self._settings.memory
         memory = dataclasses.replace(memory, max_bytes=memory.max_bytes / len(placed))
         self._parts = []
         for place in placed:
-            rows = number[place.near]
+            rows = number[place.near_rows]
             placement = dataclasses.replace(place, settings=place.settings.replace(memory=memory))
-            bank = placement.bank(place.near, templates[rows], executor)
+            bank = placement.bank(place.near_rows, templates[rows], executor)
             self._parts.append(ExposurePart(place.arrays, place.settings, bank, rows))
         #: Pixels by which each exposure's templates are moved.
         self._shifts = np.zeros((len(placed), 2))
@@ -281,7 +289,7 @@ class _Joint:
         return fit, new_xy, evidence, offsets
 
     def _fit(self, parts, new_xy=None, gradients=None):
-        xy = self._catalog.xy[self._catalog.near]
+        xy = self._catalog.xy[self._catalog.near_rows]
         if new_xy is not None:
             xy = np.concatenate([xy, new_xy])
         return ExposureFit(parts, self._settings, xy, self._scale, self._order, gradients)
@@ -297,7 +305,7 @@ class _Joint:
             fixed |= np.isnan(steps[:, 0])
             shifts = self._shifts + np.where(fixed[:, None], 0.0, steps)
             scales = np.array([part.scale for part in fit.parts])
-            far = np.hypot(*shifts.T) * scales > limit
+            far = lengths(shifts) * scales > limit
             for k in np.flatnonzero(far & ~fixed):
                 value = np.round(shifts[k] * scales[k], 3)
                 msg = (
@@ -324,11 +332,14 @@ class _Joint:
         for k, part in enumerate(fit.parts):
             dy, dx = np.gradient(fit.model(k))
             derivatives = [-dx, -dy]
-            power = [
-                np.sum((image * part.inverse_sigma) ** 2, dtype=float) for image in derivatives
-            ]
-            # too little light to find a shift of less than a pixel
-            gradients.append(derivatives if min(power) > 1 else [])
+            power = np.inf
+            for image in derivatives:
+                white = image * part.inverse_sigma
+                power = min(power, np.sum(white**2, dtype=float))
+            if power <= 1:
+                # too little light to find a shift of less than a pixel
+                derivatives = []
+            gradients.append(derivatives)
         trial = self._fit(fit.parts, fit.xy[self._n :], gradients)
         variance = np.diag(trial.fit.common_covariance)
         steps = np.full((len(fit.parts), 2), np.nan)
@@ -357,7 +368,7 @@ class _Joint:
         """
         decide = self._settings.second_pass is None
         flux = np.full(len(self._catalog.id), np.nan)
-        flux[self._catalog.near] = fit.flux
+        flux[self._catalog.near_rows] = fit.flux
         xy = self._catalog.xy
         peaks, negative, usable = plane_peaks(fit, self._plane, xy)
         form = {"usable": usable} if decide else {}
@@ -392,7 +403,7 @@ class _Joint:
 
     def _added(self, new_xy, like):
         """The exposures with points at positions of the plane; templates that are those of ``like`` are kept."""
-        sky = self._plane.wcs.pixel_to_world(*new_xy.T).icrs
+        sky = pixels_to_sky(new_xy, self._plane.wcs).icrs
         added = []
         for k, (part, place, grid) in enumerate(
             zip(self._parts, self._placed, self._grids, strict=True)
@@ -442,12 +453,12 @@ class _Joint:
         if not len(xy):
             # which astropy cannot convert
             return np.empty((0, 2, 2))
-        middle = np.array(pixel_to_pixel(part.arrays.wcs, self._plane.wcs, *xy.T))
-        sides = []
-        for step in ([1.0, 0.0], [0.0, 1.0]):
-            moved = np.array(pixel_to_pixel(part.arrays.wcs, self._plane.wcs, *(xy + step).T))
-            sides.append((moved - middle).T)
-        return np.stack(sides, axis=-1)
+        wcs = part.arrays.wcs
+        x, y = xy.T
+        middle = np.array(pixel_to_pixel(wcs, self._plane.wcs, x, y))
+        right = np.array(pixel_to_pixel(wcs, self._plane.wcs, x + 1.0, y))
+        above = np.array(pixel_to_pixel(wcs, self._plane.wcs, x, y + 1.0))
+        return np.stack([(right - middle).T, (above - middle).T], axis=-1)
 
     def _settled(self, fit):
         """
@@ -467,15 +478,15 @@ class _Joint:
             good = (snr > _BRIGHT_SNR) & (neighbors < _ISOLATED) & ~fit.noisy & np.isfinite(error)
             good &= (fit.light > 0.9).all(axis=1) & (error < width / _BRIGHT_SNR * 2)
             measured = offsets + np.where(good[:, None], step, 0.0)
-            good &= np.hypot(*measured.T) < _LARGEST_OFFSET * width
+            good &= lengths(measured) < _LARGEST_OFFSET * width
             if np.count_nonzero(good) < _FEWEST_SOURCES:
                 break
             error = np.hypot(error, _OFFSET_FLOOR)
             common = np.median(measured[good], axis=0)
-            if np.hypot(*common) > _COMMON_OFFSET * np.sqrt(8 * np.log(2)) * width:
+            if np.hypot(common[0], common[1]) > _COMMON_OFFSET * np.sqrt(8 * np.log(2)) * width:
                 break
             # of two normal errors the median distance is 1.18
-            distance = np.median(np.hypot(*measured[good].T)) / 1.1774
+            distance = np.median(lengths(measured[good])) / 1.1774
             scatter = distance**2 - np.median(error[good]) ** 2
             if scatter <= _OFFSET_FLOOR**2:
                 break

@@ -1,6 +1,7 @@
 """From a fit of several exposures to its result: diagnostics, flags, errors, tables and images."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import scipy.sparse
@@ -17,6 +18,7 @@ from miricigale.photometry.fit.exposure_fit import gaussian_width
 from miricigale.photometry.fit.result_table import new_source_table
 from miricigale.photometry.fit.results import ForcedPhotometryResult, crowded
 from miricigale.photometry.fit.template_fit import BLOCK_CORE, BLOCK_HALO, psf_errors
+from miricigale.photometry.images.arrays import lengths
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
@@ -148,7 +150,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     images : list of `~astropy.nddata.CCDData`
         The exposures.
     catalog : `~miricigale.photometry.fit.result_table.CatalogRows`
-        The catalog; ``near`` lists the fit's sources.
+        The catalog; ``near_rows`` lists the fit's sources.
     new_xy : `~numpy.ndarray`, shape (m, 2)
         Positions of sources that it lacks, in the plane: the last of the fit's sources.
     evidence : dict or None
@@ -160,9 +162,9 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     """
     n = len(catalog.id)
     n_all = n + len(new_xy)
-    place = np.concatenate([catalog.near, np.arange(n, n_all)])
+    place = np.concatenate([catalog.near_rows, np.arange(n, n_all)])
     models, residuals, inverse = _images(fit)
-    chi2, residual_fraction, seen, poor, checks = _compared(fit, models, residuals)
+    chi2, residual_fraction, core_flux, poor, checks = _compared(fit, models, residuals)
     terms, common, blending = _covariances(fit)
     joint = scipy.sparse.csr_array((n_all, n_all))
     errors = {name: np.full(n_all, np.nan) for name in ("", "_noise", "_template", "_psf")}
@@ -175,12 +177,13 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
         spread = [(gather @ term @ gather.T).tocsr() for term in terms]
         joint = (spread[0] + spread[1] + spread[2]).tocsr()
         joint.sort_indices()
-        for name, term in zip(errors, (joint, *spread), strict=True):
+        # the total first, as its name is
+        for name, term in zip(errors, [joint, *spread], strict=True):
             errors[name][measured] = np.sqrt(np.maximum(term.diagonal()[measured], 0.0))
     xy = np.concatenate([catalog.xy, new_xy])
     peaks, _ = _peaks(fit, plane, xy, models, residuals, inverse)
     flags, coverage = _flags(fit, place, n_all, flux, blending, poor)
-    is_canceling = canceling(flux, errors[""], _spread_over(seen, place, n_all))
+    is_canceling = canceling(flux, errors[""], _spread_over(core_flux, place, n_all))
     flags[is_canceling] |= int(ForcedFlags.CANCELING)
     flags[:n] |= catalog.flags
     flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
@@ -205,7 +208,9 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     if len(fit.rows):
         background["background"] = np.sum(sky * weight) / np.sum(weight)
         background["background_err"] = np.sum(weight) ** -0.5
-    counted = {} if evidence is None else {"second_pass": evidence}
+    counted = {}
+    if evidence is not None:
+        counted["second_pass"] = evidence
     has_offset = np.isfinite(offsets[1])
     if has_offset.any():
         # along x and y of the plane, as for one image
@@ -242,9 +247,9 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
 
 def _spread_over(values, place, n):
     """Values of the fit's sources at their places among n; NaN elsewhere."""
-    found = np.full(n, np.nan)
-    found[place] = values
-    return found
+    spread = np.full(n, np.nan)
+    spread[place] = values
+    return spread
 
 
 def _compared(fit, models, residuals):
@@ -254,7 +259,7 @@ def _compared(fit, models, residuals):
     Then noise and correlation of each exposure.
     """
     n = len(fit.xy)
-    square, weight, light_left, below, core = np.zeros((5, n))
+    square, weight, light_left, core_light, core = np.zeros((5, n))
     checks = []
     for part, model, residual in zip(fit.parts, models, residuals, strict=True):
         area = part.arrays.areas()
@@ -266,17 +271,15 @@ def _compared(fit, models, residuals):
         light = residual_flux + part.arrays.usable * np.asarray(model * area, np.float32)
         for block in part.bank.blocks():
             rows = slice(block.first, block.last)
-            for image, found in ((residual_flux, statistics), (light, light_statistics)):
-                residual_statistics(*block.stamps, image, part.inverse_sigma, found[rows])
-            for row, (first, last) in enumerate(
-                zip(block.start[:-1], block.start[1:], strict=True)
-            ):
+            for image, sums in ((residual_flux, statistics), (light, light_statistics)):
+                residual_statistics(*block.stamps, image, part.inverse_sigma, sums[rows])
+            for row, (first, last) in enumerate(itertools.pairwise(block.start)):
                 row_light[block.first + row] = block.values[first:last].sum()
         good = np.isfinite(statistics[:, 0]) & (row_light > 0)
         np.add.at(square, source[good], (row_light * statistics[:, 0])[good])
         np.add.at(weight, source[good], row_light[good])
         np.add.at(light_left, source[good], statistics[good, 1])
-        np.add.at(below, source[good], light_statistics[good, 1])
+        np.add.at(core_light, source[good], light_statistics[good, 1])
         np.add.at(core, source[good], statistics[good, 2])
         checks.append(
             _noise_check(
@@ -286,27 +289,27 @@ def _compared(fit, models, residuals):
     with np.errstate(divide="ignore", invalid="ignore"):
         chi2 = square / weight
         light_left = light_left / (fit.flux * core)
-        seen = below / core
+        core_flux = core_light / core
     out = np.ones(n, bool)
     out[fit.rows] = False
     chi2[out] = np.nan
     light_left[out] = np.nan
-    seen[out] = np.nan
+    core_flux[out] = np.nan
     poor = chi2 > POOR_CHI2
     if fit.free is not None:
         poor[fit.rows] |= fit.free.strain > POOR_STRAIN
-    return chi2, light_left, seen, poor, checks
+    return chi2, light_left, core_flux, poor, checks
 
 
 def _noise_check(white, model, part):
     """Robust rms of a whitened residual where no source is, and the correlation of neighbors; NaN without sky."""
-    free = part.arrays.usable & (np.abs(model) < _FREE)
-    if np.count_nonzero(free) < _FEWEST_PIXELS:
+    is_free = part.arrays.usable & (np.abs(model) < _FREE)
+    if np.count_nonzero(is_free) < _FEWEST_PIXELS:
         return np.nan, np.nan
-    rms = float(mad_std(white[free]))
+    rms = float(mad_std(white[is_free]))
     if not rms > 0:
         return rms, np.nan
-    calm = free & (np.abs(white) < 5 * rms)
+    calm = is_free & (np.abs(white) < 5 * rms)
     products = []
     for first, second in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
         calm_pairs = calm[first] & calm[second]
@@ -334,8 +337,9 @@ def _covariances(fit):
             white = (solution.matrix - scipy.sparse.diags_array(changes.prior)).tocsr()
             fillings = [(white, solution.border, solution.corner)]
         n_common = len(solution.corner_rhs)
-        nothing = np.zeros((len(solution.rhs), n_common)), np.zeros((n_common, n_common))
-        fillings.append((changes.filling(fixed.matrix), *nothing))
+        no_border = np.zeros((len(solution.rhs), n_common))
+        no_corner = np.zeros((n_common, n_common))
+        fillings.append((changes.filling(fixed.matrix), no_border, no_corner))
     coo = fixed.matrix.tocoo()
     pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=solution.matrix.shape)
     covariances, all_blending = solution.covariances(
@@ -346,12 +350,12 @@ def _covariances(fit):
     blending[fit.rows] = all_blending[:n]
     template = scipy.sparse.csr_array((n, n))
     if changes is not None:
-        blending[fit.rows] *= np.sqrt(changes.alone())
+        blending[fit.rows] *= np.sqrt(changes.remaining_power())
         template, change_common = covariances[1]
         template = template[:n][:, :n]
         common = common + change_common
-    light = [light is not None and light.kind == "cutout" for light in fit.cutouts()]
-    error = psf_errors(fit, np.array(light, bool))[fit.rows]
+    is_image = [light is not None and light.kind == "cutout" for light in fit.cutouts()]
+    error = psf_errors(fit, np.array(is_image, bool))[fit.rows]
     coo = noise.tocoo()
     data = error[coo.row] * error[coo.col]
     psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
@@ -383,7 +387,7 @@ def _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
     """The `ExposureResults` of a fit."""
     table = QTable({"exposure": np.arange(len(images))})
     table["source"] = [str(image.meta.get("source", k)) for k, image in enumerate(images)]
-    table["n_sources"] = [_n_seen(part) for part in fit.parts]
+    table["n_sources"] = list(map(_n_seen, fit.parts))
     first = [places["sky"].start for places in fit.places]
     errors = np.full(len(fit.common), np.nan)
     if common is not None:
@@ -401,16 +405,15 @@ def _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
                 "times its stated errors, and so are the errors of fluxes"
             )
             warn(msg, PhotometryWarning)
-    model_images, residual_images = [], []
+    model_images = []
+    residual_images = []
     for k, part in enumerate(fit.parts):
         usable = part.arrays.usable
         sky = fit.sky(k) / part.arrays.areas()
         with np.errstate(divide="ignore"):
             sigma = np.where(usable, 1 / inverse[k], np.nan)
         options = {"unit": SURFACE_BRIGHTNESS, "wcs": part.arrays.wcs}
-        image_meta = {
-            key: images[k].meta[key] for key in ("filter", "source") if key in images[k].meta
-        }
+        image_meta = _selected(images[k].meta, ("filter", "source"))
         model_images.append(Image(models[k] + sky, meta=dict(image_meta), **options))
         residual = np.where(usable, residuals[k], np.nan)
         noise = StdDevUncertainty(sigma)
@@ -420,12 +423,17 @@ def _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
     return ExposureResults(table, tuple(model_images), tuple(residual_images))
 
 
+def _selected(meta, keys):
+    """Return those entries of a meta dictionary that have some keys."""
+    return {key: meta[key] for key in keys if key in meta}
+
+
 def _warn_of_offsets(fit, offsets):
     """Warn of exposures that lie off their templates, if sources are bright and no shift is fitted."""
     if fit.settings.max_shift is not None or not len(fit.rows):
         return
     snr = fit.fit.flux * np.sqrt(fit.fit.matrix.diagonal())
-    offset = np.hypot(*offsets[0].T)
+    offset = lengths(offsets[0])
     far = (offset > _OFFSET * fit.scale) & (offset > 3 * offsets[1])
     if far.any() and np.count_nonzero(snr > _BRIGHT) >= _FEWEST_BRIGHT:
         msg = (
@@ -451,7 +459,7 @@ def _plane_images(plane, models, residuals, inverse, meta):
     sigma = np.full(plane.shape, np.nan)
     sigma[usable] = weight[usable] ** -0.5
     residual[~usable] = np.nan
-    image_meta = {key: meta[key] for key in ("filter",) if key in meta}
+    image_meta = _selected(meta, ("filter",))
     options = {"unit": SURFACE_BRIGHTNESS, "wcs": plane.wcs}
     return (
         Image(model, meta=dict(image_meta), **options),

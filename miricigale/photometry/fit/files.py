@@ -31,6 +31,11 @@ def _sky_columns(sky):
     return {"ra": icrs.ra.deg, "dec": icrs.dec.deg}
 
 
+def _existing(thing, names):
+    """Return those attributes of an object, by name, that are not None."""
+    return {name: getattr(thing, name) for name in names if getattr(thing, name) is not None}
+
+
 def _columns(table):
     """Columns of a table that was read, without masks: what is not finite stays so."""
     return {name: native(np.asarray(table[name])) for name in table.colnames}
@@ -40,29 +45,50 @@ def _sky(columns):
     return SkyCoord(columns.pop("ra"), columns.pop("dec"), unit="deg")
 
 
+#: A layer of a template, as files have it.
+_LAYER = np.dtype(
+    [
+        ("row", int),
+        ("whole", bool),
+        ("corner", int, (2,)),
+        ("shape", int, (2,)),
+        ("noise", float),
+        ("convolved", bool),
+    ]
+)
+
+
 def _write_templates(templates, path, *, overwrite=False):
     names = ("sersic", "flags", "snr", "flux", "components")
-    table = {"id": ascii_ids(templates.id, "id"), **_sky_columns(templates.sky)}
-    table |= {k: getattr(templates, k) for k in names if getattr(templates, k) is not None}
-    table |= {f"fitted_{name}": templates.fitted[name] for name in FITTED.names}
+    table = {"id": ascii_ids(templates.id, "id")}
+    table |= _sky_columns(templates.sky) | _existing(templates, names)
+    for name in FITTED.names:
+        table[f"fitted_{name}"] = templates.fitted[name]
+    # rows of the table of layers: source, whether the layer is one of the whole galaxy, and its pixels
     layers = []
     for row, light in enumerate(templates.light):
         if light is None:
             continue
         layers += [(row, False, layer) for layer in light.layers]
-        if light.whole is not None:
-            layers += [(row, True, layer) for layer in light.whole.layers]
-    rows = {
-        "row": np.array([row for row, _, _ in layers], int),
-        "whole": np.array([whole for _, whole, _ in layers], bool),
-        "corner": np.array([layer.origin for *_, layer in layers], int).reshape(-1, 2),
-        "shape": np.array([layer.data.shape for *_, layer in layers], int).reshape(-1, 2),
-        "noise": np.array([layer.noise for *_, layer in layers], float),
-        "convolved": np.array([layer.convolved for *_, layer in layers], bool),
-    }
-    pixels = np.concatenate([layer.data.ravel() for *_, layer in layers] or [np.empty(0)])
-    arrays = {"pixels": pixels} | ({} if templates.psf is None else {"psf": templates.psf})
-    grid = None if templates.wcs is None else grid_text(templates.wcs)
+        if light.galaxy is not None:
+            layers += [(row, True, layer) for layer in light.galaxy.layers]
+    records = np.zeros(len(layers), _LAYER)
+    pixels = []
+    for record, (row, is_galaxy, layer) in zip(records, layers, strict=True):
+        record["row"] = row
+        record["whole"] = is_galaxy
+        record["corner"] = layer.origin
+        record["shape"] = layer.data.shape
+        record["noise"] = layer.noise
+        record["convolved"] = layer.convolved
+        pixels.append(layer.data.ravel())
+    rows = {name: records[name].copy() for name in _LAYER.names}
+    arrays = {"pixels": np.concatenate(pixels) if pixels else np.empty(0)}
+    if templates.psf is not None:
+        arrays["psf"] = templates.psf
+    grid = None
+    if templates.wcs is not None:
+        grid = grid_text(templates.wcs)
     write_parts(
         path, "source-templates-3", text={"meta": templates.meta, "grid": grid}, arrays=arrays,
         tables={"sources": Table(table), "layers": Table(rows)}, overwrite=overwrite,
@@ -72,35 +98,44 @@ def _write_templates(templates, path, *, overwrite=False):
 def _read_templates(path):
     with open_parts(path, ("source-templates-3",), wanted="templates of sources") as parts:
         text = parts.text
-        columns, rows = (_columns(parts.table(name)) for name in ("sources", "layers"))
-        pixels = parts.array("pixels") if "pixels" in parts else np.empty(0)
+        columns = _columns(parts.table("sources"))
+        rows = _columns(parts.table("layers"))
+        pixels = np.empty(0)
+        if "pixels" in parts:
+            pixels = parts.array("pixels")
         light = [None] * len(columns["id"])
         wholes = list(light)
         ends = np.cumsum(np.prod(rows["shape"], axis=1, dtype=int))
         # the last layer of a source first: each is what is added to the one before
         for k in range(len(ends) - 1, -1, -1):
-            h, w = (int(n) for n in rows["shape"][k])
-            row, origin = int(rows["row"][k]), tuple(int(c) for c in rows["corner"][k])
+            h, w = rows["shape"][k].tolist()
+            row = int(rows["row"][k])
+            origin = tuple(rows["corner"][k].tolist())
             data = pixels[ends[k] - h * w : ends[k]].reshape(h, w)
             form = {
                 "noise": float(rows["noise"][k]),
                 "convolved": bool(rows["convolved"][k]),
             }
             if rows["whole"][k]:
-                wholes[row] = Cutout(data, origin, rest=wholes[row], **form)
+                wholes[row] = Cutout(data, origin, correction=wholes[row], **form)
             else:
-                light[row] = Cutout(data, origin, rest=light[row], whole=wholes[row], **form)
+                light[row] = Cutout(data, origin, correction=light[row], galaxy=wholes[row], **form)
         fitted = not_fitted(len(light))
         for name in FITTED.names:
             fitted[name] = columns.pop(f"fitted_{name}")
-        grid = text["grid"]
+        wcs = None
+        if text["grid"] is not None:
+            wcs = text_grid(text["grid"])
+        psf = None
+        if "psf" in parts:
+            psf = parts.array("psf")
         return SourceTemplates(
             sky=_sky(columns),
             **columns,
             light=light,
             fitted=fitted,
-            wcs=None if grid is None else text_grid(grid),
-            psf=parts.array("psf") if "psf" in parts else None,
+            wcs=wcs,
+            psf=psf,
             meta=text["meta"],
         )
 
@@ -115,10 +150,6 @@ _QUANTITIES = ("background", "background_err", "shift", "shift_err", "psf_fwhm")
 _MATRICES = ("covariance", "joint_covariance")
 
 
-def _given(result, names):
-    return {k: getattr(result, k) for k in names if getattr(result, k) is not None}
-
-
 def _write_result(result, path, *, overwrite=False):
     residual = result.residual_image
     arrays = {
@@ -126,20 +157,23 @@ def _write_result(result, path, *, overwrite=False):
         "residual": residual.data,
         "sigma": residual.uncertainty.array,
         "mask": np.asarray(residual.mask),
-        **_given(result, ("noise_correlation",)),
+        **_existing(result, ("noise_correlation",)),
     }
-    for name, matrix in _given(result, _MATRICES).items():
-        arrays |= {f"{name}_{k}": getattr(matrix, k) for k in ("data", "indices", "indptr")}
+    for name, matrix in _existing(result, _MATRICES).items():
+        arrays[f"{name}_data"] = matrix.data
+        arrays[f"{name}_indices"] = matrix.indices
+        arrays[f"{name}_indptr"] = matrix.indptr
+    quantities = {}
+    for name, value in _existing(result, _QUANTITIES).items():
+        quantities[name] = value.value, value.unit.to_string()
     text = {
         "meta": result.meta,
         "image_meta": residual.meta,
         "wcs": grid_text(residual.wcs),
-        "quantities": {
-            k: (v.value, v.unit.to_string()) for k, v in _given(result, _QUANTITIES).items()
-        },
+        "quantities": quantities,
     }
     table = {"id": ascii_ids(result.id, "id"), **_sky_columns(result.sky)}
-    tables = {"sources": QTable({**table, **_given(result, _ROWS)})}
+    tables = {"sources": QTable({**table, **_existing(result, _ROWS)})}
     fields = {"background_field": result.background_field}
     if result.offset_map is not None:
         fields["offset_map"] = result.offset_map.field
@@ -160,32 +194,33 @@ def _read_result(path):
         text = parts.text
         wcs = text_grid(text["wcs"])
         columns = _table(parts, "sources")
-        found = {name: columns[name] for name in ("id", *_ROWS) if name in columns.colnames}
+        values = {name: columns[name] for name in ("id", *_ROWS) if name in columns.colnames}
         for name, (value, unit) in text["quantities"].items():
-            found[name] = value * u.Unit(unit)
+            values[name] = value * u.Unit(unit)
         n = len(columns)
         for name, size in zip(_MATRICES, (n, 2 * n), strict=True):
             if f"{name}_indptr" in parts:
-                arrays = [
-                    parts.array(f"{name}_{k}") if f"{name}_{k}" in parts else np.empty(0, kind)
-                    for k, kind in (("data", float), ("indices", np.int32), ("indptr", np.int32))
-                ]
-                found[name] = scipy.sparse.csr_array(tuple(arrays), shape=(size, size))
+                # arrays without an element are not in the file
+                arrays = []
+                for part, dtype in (("data", float), ("indices", np.int32), ("indptr", np.int32)):
+                    key = f"{name}_{part}"
+                    arrays.append(parts.array(key) if key in parts else np.empty(0, dtype))
+                values[name] = scipy.sparse.csr_array(tuple(arrays), shape=(size, size))
         if "noise_correlation" in parts:
-            found["noise_correlation"] = parts.array("noise_correlation")
+            values["noise_correlation"] = parts.array("noise_correlation")
         if "background_field" in text:
-            found["background_field"] = _field(text["background_field"])
+            values["background_field"] = _field(text["background_field"])
         if "offset_map" in text:
             field = _field(text["offset_map"])
-            found["offset_map"] = OffsetMap(_table(parts, "offsets"), field, wcs)
+            values["offset_map"] = OffsetMap(_table(parts, "offsets"), field, wcs)
         if "exposures" in parts:
-            found["exposures"] = ExposureResults(QTable(parts.table("exposures")))
+            values["exposures"] = ExposureResults(QTable(parts.table("exposures")))
         if "new" in parts:
-            found["new_sources"] = _table(parts, "new")
+            values["new_sources"] = _table(parts, "new")
         options = {"unit": SURFACE_BRIGHTNESS, "wcs": wcs}
         return ForcedPhotometryResult(
             sky=columns["sky"],
-            **found,
+            **values,
             model_image=Image(parts.array("model"), meta=dict(text["image_meta"]), **options),
             residual_image=Image(
                 parts.array("residual"),
@@ -203,8 +238,10 @@ def _table(parts, name):
     read = parts.table(name)
     columns = _columns(read)
     sky = _sky(columns)
-    units = {k: read[k].unit for k in columns}
-    table = QTable({k: v if units[k] is None else v * units[k] for k, v in columns.items()})
+    table = QTable()
+    for key, values in columns.items():
+        unit = read[key].unit
+        table[key] = values if unit is None else values * unit
     table.add_column(sky, name="sky", index=1)
     return table
 

@@ -11,9 +11,11 @@ from miricigale.photometry.fit.template_fit import TemplateFit
 from miricigale.photometry.images.arrays import local_maps
 from miricigale.utils.units import ANGLE
 
-#: How often positions of new sources are refined, and the errors by which the center of a profile
-#: differs from the catalog's position where it is taken instead.
-_REFINED, _ELSEWHERE = 2, 3.0
+#: How often positions of new sources are refined.
+_REFINED = 2
+
+#: Errors by which the center of a profile differs from the catalog's position where it is taken instead.
+_ELSEWHERE = 3.0
 
 #: Largest share of false ones with which new sources are fitted where the evidence decides.
 _FALSE_RATE = 0.1
@@ -28,7 +30,7 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
     arrays, bank, settings
         As for `~miricigale.photometry.fit.template_fit.TemplateFit`.
     catalog : `~miricigale.photometry.fit.result_table.CatalogRows`
-        The catalog; ``near`` lists the bank's sources.
+        The catalog; ``near_rows`` lists the bank's sources.
     grid_wcs : `~astropy.wcs.WCS`
         Of the grid on which templates are made.
 
@@ -46,10 +48,13 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
     if not settings.second_pass:
         # where the catalog is known to lack sources, these would move their neighbors
         fit = settled(fit, bank, catalog)
-    more = _More(bank, fit, catalog, grid_wcs)
+    added = _AddedPoints(bank, fit, catalog, grid_wcs)
     by_catalog = catalog.double is not None
-    double = np.flatnonzero(catalog.double[catalog.near]) if by_catalog else np.empty(0, int)
-    new_xy, poor = np.empty((0, 2)), np.empty(0, int)
+    double = np.empty(0, int)
+    if by_catalog:
+        double = np.flatnonzero(catalog.double[catalog.near_rows])
+    new_xy = np.empty((0, 2))
+    poor = np.empty(0, int)
     choose = settings.components == 2 and not by_catalog
     if choose:
         # before templates may change, which hides some of the light of a point in their middle
@@ -59,8 +64,8 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         # templates that may change absorb some of the light of their neighbors
         new_xy, evidence = _new_positions(fit, catalog)
     if len(new_xy) or len(double):
-        new_xy = more.refined(double, new_xy)
-        fit = more.fit(double, new_xy)
+        new_xy = added.refined(double, new_xy)
+        fit = added.fit(double, new_xy)
         if choose:
             # sources that are poorly fitted also with the new sources next to them
             poor = _poor(fit, catalog, new_xy)
@@ -68,36 +73,40 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         fit.free_templates(catalog.fitted)
     diagnostics = diagnose(fit, np.concatenate([catalog.xy, new_xy]))
     if len(poor):
-        fit, diagnostics = _split(fit, diagnostics, more, poor, new_xy)
+        fit, diagnostics = _split(fit, diagnostics, added, poor, new_xy)
     fit.evidence = evidence
     return fit, diagnostics, new_xy
 
 
 def _poor(fit, catalog, new_xy):
-    """Which of the catalog's sources in a bank are poorly fitted."""
+    """Find those of the catalog's sources in a bank that are poorly fitted."""
     diagnostics = diagnose(fit, np.concatenate([catalog.xy, new_xy]))
     source = fit.bank.order[diagnostics.poor]
-    return np.sort(source[source < len(catalog.near)])
+    return np.sort(source[source < len(catalog.near_rows)])
 
 
 def _new_positions(fit, catalog):
     """
-    Where the residual shows sources that the catalog lacks, in the catalog's frame, and the evidence for them.
+    Find sources that the catalog lacks on the residual, in the catalog's frame, and the evidence for them.
 
     The false ones are taken to be as many as the negative of the residual shows, and those of Gaussian noise.
     Where the evidence decides (``second_pass`` is None) there are none unless they are few.
     """
-    found, xy = diagnose(fit, catalog.xy), catalog.xy + fit.displacement(catalog.xy)
+    diagnostics = diagnose(fit, catalog.xy)
+    xy = catalog.xy + fit.displacement(catalog.xy)
     flux = np.full(len(xy), np.nan)
-    flux[catalog.near[fit.bank.order]] = fit.total
-    peaks, usable, decide = found.peaks, fit.arrays.usable, fit.settings.second_pass is None
+    flux[catalog.near_rows[fit.bank.order]] = fit.total
+    peaks = diagnostics.peaks
+    usable = fit.arrays.usable
+    decide = fit.settings.second_pass is None
     # a background that is not fitted is no source
-    residual = found.residual - usable * np.median(found.residual[usable])
+    residual = diagnostics.residual - usable * np.median(diagnostics.residual[usable])
     if decide:
-        peaks = residual_peaks(fit, residual, found.model, xy)
-    negative = residual_peaks(fit, -residual, found.model, xy)
-    form = {"usable": usable} if decide else {}
-    new, false = (new_sources(one, xy, flux, **form) for one in (peaks, negative))
+        peaks = residual_peaks(fit, residual, diagnostics.model, xy)
+    negative = residual_peaks(fit, -residual, diagnostics.model, xy)
+    searched = usable if decide else None
+    new = new_sources(peaks, xy, flux, usable=searched)
+    false = new_sources(negative, xy, flux, usable=searched)
     n_beams = np.count_nonzero(usable) / (4 * np.pi * fit.psf_width**2)
     n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
     rate = float(n_false / max(np.count_nonzero(new), 1))
@@ -107,83 +116,103 @@ def _new_positions(fit, catalog):
     return at - fit.displacement(at), evidence | {"fitted": bool(done and len(at))}
 
 
-def _split(fit, diagnostics, more, poor, new_xy):
+def _split(fit, diagnostics, added, poor, new_xy):
     """Fit with second components of those sources that are better fitted with them."""
 
     def chi2(fit, diagnostics):
-        found = np.empty(len(fit.host))
-        found[fit.bank.order] = diagnostics.chi2
-        return found[poor]
+        values = np.empty(len(fit.host))
+        values[fit.bank.order] = diagnostics.chi2
+        return values[poor]
 
-    split, chosen = (fit, diagnostics), poor
-    before = chi2(*split)
+    chosen = poor
+    before = chi2(fit, diagnostics)
+    xy = np.concatenate([added.catalog.xy, new_xy])
     for _ in range(2):
-        found = more.fit(chosen, new_xy)
-        found.free_templates(more.catalog.fitted)
-        split = found, diagnose(found, np.concatenate([more.catalog.xy, new_xy]))
-        better = poor[chi2(*split) < before]
-        if len(chosen) == len(better) or not len(better):
+        split_fit = added.fit(chosen, new_xy)
+        split_fit.free_templates(added.catalog.fitted)
+        split_diagnostics = diagnose(split_fit, xy)
+        better = poor[chi2(split_fit, split_diagnostics) < before]
+        if not len(better):
+            return fit, diagnostics
+        if len(chosen) == len(better):
             break
         chosen = better
-    return split if len(better) else (fit, diagnostics)
+    return split_fit, split_diagnostics
 
 
-class _More:
+class _AddedPoints:
     """Fits of a bank's sources with points that are added, templates moved as in a first fit."""
 
     def __init__(self, bank, first, catalog, grid_wcs):
-        self._bank, self.catalog, self._grid_wcs = bank, catalog, grid_wcs
-        self._first, self._made = first, first.bank
+        self._bank = bank
+        self.catalog = catalog
+        self._grid_wcs = grid_wcs
+        self._first = first
+        self._made = first.bank
 
     def fit(self, double, new_xy, search=None):
         """Fit with second components of some of the sources, and new sources after those."""
-        first, near = self._first, self.catalog.near
-        arrays, settings, own = first.arrays, first.settings, first.own
-        n = len(near)
+        first = self._first
+        near_rows = self.catalog.near_rows
+        arrays = first.arrays
+        settings = first.settings
+        source_shifts = first.source_shifts
+        n = len(near_rows)
         host = np.concatenate([np.arange(n), double, n + len(double) + np.arange(len(new_xy))])
-        all_xy = np.concatenate([self.catalog.xy[near], self._centers(double), new_xy])
+        all_xy = np.concatenate([self.catalog.xy[near_rows], self._centers(double), new_xy])
         xy = all_xy[n:]
         half = settings.mean_kernel.target.shape[0] // 2 + 1
         half = half * settings.mean_kernel.pixel_scale.to_value(ANGLE) / first.scale / 2
         poly = local_maps(xy, np.full(len(xy), half), arrays.wcs, self._grid_wcs)
         bank = self._bank.with_points(xy, poly)
         moved = np.array(first.displacement(all_xy))
-        moved[:n] += 0.0 if own is None else own
-        one = first.offset_map is None and own is None
+        if source_shifts is not None:
+            moved[:n] += source_shifts
+        is_single = first.offset_map is None and source_shifts is None
         # positions are refined without a shift
         shifted = first.shift is not None and search is None
         if search is None:
             # a shift that was rejected is not searched again
-            search = first.shift is not None and own is None
-        form = {"host": host, "moved": moved[0] if one else moved, "search": search}
-        fit = TemplateFit(arrays, bank, settings, like=self._made, **form)
+            search = first.shift is not None and source_shifts is None
+        if is_single:
+            moved = moved[0]
+        fit = TemplateFit(
+            arrays, bank, settings, like=self._made, host=host, moved=moved, search=search
+        )
         if shifted and not search:
             fit.include_shift(first.shift)
-        fit.offset_map, self._made = first.offset_map, fit.bank
+        fit.offset_map = first.offset_map
+        self._made = fit.bank
         return fit
 
     def _centers(self, double):
-        """Positions of sources: of the catalog, or of their profiles where those are surely elsewhere."""
-        xy, fitted = self.catalog.xy[self.catalog.near[double]], self.catalog.fitted[double]
+        """Return positions of sources: of the catalog, or of their profiles where those are surely elsewhere."""
+        xy = self.catalog.xy[self.catalog.near_rows[double]]
+        fitted = self.catalog.fitted[double]
         # what is fitted to a piece of a galaxy is the whole of it
-        whole = fitted["galaxy"] == 0
-        rows = np.flatnonzero(np.isfinite(fitted["parameters"][:, 0]) & whole)
+        is_whole = fitted["galaxy"] == 0
+        rows = np.flatnonzero(np.isfinite(fitted["parameters"][:, 0]) & is_whole)
         if len(rows):
             center = fitted["parameters"][rows, :2]
-            place = pixel_to_pixel(self._first.arrays.wcs, self._grid_wcs, *xy[rows].T)
+            image_wcs = self._first.arrays.wcs
+            x, y = xy[rows].T
+            place = pixel_to_pixel(image_wcs, self._grid_wcs, x, y)
             offset = center - np.stack(place, axis=1)
             inverse = np.linalg.pinv(fitted["covariance"][rows, 1:3, 1:3])
             far = np.einsum("ki,kij,kj->k", offset, inverse, offset) > _ELSEWHERE**2
             if far.any():
-                found = pixel_to_pixel(self._grid_wcs, self._first.arrays.wcs, *center[far].T)
-                xy[rows[far]] = np.stack(found, axis=1)
+                x, y = center[far].T
+                place = pixel_to_pixel(self._grid_wcs, image_wcs, x, y)
+                xy[rows[far]] = np.stack(place, axis=1)
         return xy
 
     def refined(self, double, new_xy):
-        """Positions of new sources after some fits of where they are."""
-        first_new = len(self.catalog.near) + len(double)
+        """Refine positions of new sources by some fits of where they are."""
+        first_new = len(self.catalog.near_rows) + len(double)
         new_xy = new_xy.copy()
-        for _ in range(_REFINED if len(new_xy) else 0):
+        if not len(new_xy):
+            return new_xy
+        for _ in range(_REFINED):
             fit = self.fit(double, new_xy, search=False)
             rows = fit.rows[fit.bank.order[fit.rows] >= first_new]
             model = fit.model()

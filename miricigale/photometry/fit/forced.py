@@ -231,19 +231,23 @@ class ForcedPhotometer(Interactive):
         if self.kernel is not None and highres_psf is not None:
             wanted = "given with 'psf', not with 'kernel'"
             raise argument_error("highres_psf", wanted, "a kernel too")
-        template, kernel = self.template, self.kernel
+        template = self.template
+        kernel = self.kernel
         check_choice(template, "template", ("auto", "cutout", "psf", "sersic"))
         if kernel is None and highres_psf is None:
             kernel = MatchingKernel.identity(psf)
-            template = "psf" if template == "auto" else template
+            if template == "auto":
+                template = "psf"
         elif kernel is None:
             kernel = MatchingKernel.from_psfs(highres_psf, psf)
         # the kernel that all have in common: the mean, with PSFs in any case
-        mean = kernel if isinstance(kernel, MatchingKernel) else kernel.mean
-        bare = mean.source is None or mean.target is None
-        changed = {"kernel": kernel, "template": template, "bare": bare, "mean_kernel": mean}
+        mean = kernel
+        if not isinstance(kernel, MatchingKernel):
+            mean = kernel.mean
+        is_bare = mean.source is None or mean.target is None
+        changed = {"kernel": kernel, "template": template, "bare": is_bare, "mean_kernel": mean}
         changed["n_threads"] = thread_count(self.n_threads)
-        if bare:
+        if is_bare:
             wanted = f"a MatchingKernel with its PSFs for template={template!r}"
             check_that(template in ("auto", "cutout"), "kernel", wanted, "one without")
             msg = (
@@ -325,8 +329,9 @@ class ForcedPhotometer(Interactive):
         if are_exposures(image):
             from miricigale.photometry.fit.exposure_photometry import measure_exposures
 
-            prior = (highres, segmentation, catalog)
-            return measure_exposures(self, image, *prior, templates=templates)
+            return measure_exposures(
+                self, image, highres, segmentation, catalog, templates=templates
+            )
         if isinstance(self.kernel, ExposureKernels):
             wanted = f"{len(self.kernel)} exposures, one for each kernel"
             raise argument_error("image", wanted, "one image")
@@ -334,40 +339,45 @@ class ForcedPhotometer(Interactive):
             highres, catalog = None, highres
         image = own_pixels(as_mosaic(image, "image"))
         arrays = fit_arrays(image, "image")
-        given = [one is not None for one in (highres, segmentation, catalog)]
+        has_prior = not (highres is None and segmentation is None and catalog is None)
         if templates is None:
             highres, segmentation, catalog = self._prior(image, highres, segmentation, catalog)
             sources = SourceTemplates.from_catalog(catalog)
             sources = dataclasses.replace(sources, sky=catalog["sky"])
-        elif any(given):
+        elif has_prior:
             raise argument_error("templates", "given alone with the image", "a catalog too")
         else:
             sources = templates
         if self.psf_stars is not False and not self.bare:
-            known = QTable({"id": sources.id, "sky": sources.sky})
-            one, stars = with_stars(self, image, known, highres, sources.wcs)
-            prior = (highres, segmentation, catalog) if templates is None else ()
-            return stars.noted(one.measure(image, *prior, templates=templates))
+            catalog_sources = QTable({"id": sources.id, "sky": sources.sky})
+            photometer, stars = with_stars(self, image, catalog_sources, highres, sources.wcs)
+            if templates is not None:
+                result = photometer.measure(image, templates=templates)
+            else:
+                result = photometer.measure(image, highres, segmentation, catalog)
+            return stars.noted(result)
         place = Placement.of(self, arrays, sources.sky)
-        if len(sources.id) and not len(place.near):
+        if len(sources.id) and not len(place.near_rows):
             msg = (
                 f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
             )
             warn(msg, PhotometryWarning)
         if templates is None:
-            templates = self._templates(highres, segmentation, catalog[place.near])
+            templates = self._templates(highres, segmentation, catalog[place.near_rows])
         else:
-            templates = templates[place.near]
+            templates = templates[place.near_rows]
         self._check_grid(templates)
         rows, templates = self._rows(sources, place, templates)
         meta = {"template": templates.meta.get("template", self.template)}
         name = image.meta.get("filter", image.meta.get("FILTER"))
-        meta |= {} if name is None else {"filter": str(name)}
-        meta |= {k: v for k, v in image.meta.items() if k == "repeated_pixels"}
+        if name is not None:
+            meta["filter"] = str(name)
+        if "repeated_pixels" in image.meta:
+            meta["repeated_pixels"] = image.meta["repeated_pixels"]
         with threads(self.n_threads) as executor, single_threaded():
-            bank = place.bank(rows.near, templates, executor)
-            found = fit_image(arrays, bank, self, rows, place.grid(templates))
-            result = package(*found, rows, meta)
+            bank = place.bank(rows.near_rows, templates, executor)
+            fit, diagnostics, new_xy = fit_image(arrays, bank, self, rows, place.grid(templates))
+            result = package(fit, diagnostics, new_xy, rows, meta)
         if self.background_order is None:
             warn_of_background(result, self.mean_kernel)
         return result
@@ -402,43 +412,51 @@ class ForcedPhotometer(Interactive):
         if len(flux) != len(templates):
             raise argument_error("flux", f"{len(templates)} fluxes, one for each source", len(flux))
         place = Placement.of(self, arrays, templates.sky)
-        near = templates[place.near]
-        self._check_grid(near)
+        near_templates = templates[place.near_rows]
+        self._check_grid(near_templates)
         model = np.zeros(arrays.flux.shape)
         with threads(self.n_threads) as executor, single_threaded():
-            bank = place.bank(place.near, near, executor)
-            values = flux[place.near][bank.order]
+            bank = place.bank(place.near_rows, near_templates, executor)
+            values = flux[place.near_rows][bank.order]
             for block in bank.blocks():
-                some = values[block.first : block.last]
-                add_model(model, block.values, block.box, block.start, some)
+                block_flux = values[block.first : block.last]
+                add_model(model, block.values, block.box, block.start, block_flux)
         return model / arrays.area * SURFACE_BRIGHTNESS
 
     def _rows(self, sources, place, templates):
-        """The catalog as the fit takes it, and the templates of its sources that are near."""
-        n, near = len(sources.id), place.near
-        flags, snr, kinds = np.zeros(n, int), np.full(n, np.nan), np.full(n, "none", "U6")
-        flags[near], snr[near] = templates.flags, templates.snr
+        """Return the catalog as the fit takes it, and the templates of its sources that are near."""
+        n = len(sources.id)
+        near_rows = place.near_rows
+        flags = np.zeros(n, int)
+        snr = np.full(n, np.nan)
+        kinds = np.full(n, "none", "U6")
+        flags[near_rows] = templates.flags
+        snr[near_rows] = templates.snr
         if self.bare:
             # there is no PSF for points
-            kept = np.flatnonzero(templates.kind != "point")
-            near, templates = near[kept], templates[kept]
-        kinds[near] = templates.kind
+            with_segment = np.flatnonzero(templates.kind != "point")
+            near_rows = near_rows[with_segment]
+            templates = templates[with_segment]
+        kinds[near_rows] = templates.kind
+        double = None
+        if sources.components is not None:
+            double = sources.components == 2
         rows = CatalogRows(
             id=np.asarray(sources.id),
             sky=sources.sky,
             xy=place.xy,
-            near=near,
+            near_rows=near_rows,
             flags=flags,
             template=kinds,
             template_snr=snr,
             fitted=templates.fitted,
             reference=sources.flux,
-            double=None if sources.components is None else sources.components == 2,
+            double=double,
         )
         return rows, templates
 
     def _prior(self, image, highres, segmentation, catalog):
-        """High-resolution image, segments and catalog, detected where cutouts need what was not given."""
+        """Return high-resolution image, segments and catalog; detect those that cutouts need and lack."""
         if highres is None and catalog is None:
             raise argument_error("catalog", "given without a high-resolution image", "None")
         if highres is not None:
@@ -453,16 +471,18 @@ class ForcedPhotometer(Interactive):
         if self.template in ("psf", "sersic") or highres is None:
             return highres, segmentation, catalog
         if segmentation is None:
-            return highres, *detected_prior(highres, catalog)
+            segments, sources = detected_prior(highres, catalog)
+            return highres, segments, sources
         if catalog is not None and not isinstance(segmentation, (str, os.PathLike)):
             # labels are those of the catalog, or by position
             return highres, segmentation, catalog
         if isinstance(segmentation, SegmentationImage):
             segmentation = segmentation.data
-        return highres, *read_prior(highres, segmentation=segmentation, catalog=catalog)
+        segments, sources = read_prior(highres, segmentation=segmentation, catalog=catalog)
+        return highres, segments, sources
 
     def _templates(self, highres, segmentation, catalog):
-        """The templates that the settings ask for."""
+        """Make the templates that the settings ask for."""
         if highres is None and segmentation is not None:
             raise argument_error("highres", "the image that the segments belong to", "None")
         for name, value in (("highres", highres), ("segmentation", segmentation)):
@@ -471,11 +491,13 @@ class ForcedPhotometer(Interactive):
         if self.template in ("psf", "sersic") or segmentation is None:
             kind = "sersic" if self.template == "sersic" else "psf"
             grid = None if highres is None else highres.wcs
-            found = SourceTemplates.from_catalog(catalog, template=kind, wcs=grid)
+            templates = SourceTemplates.from_catalog(catalog, template=kind, wcs=grid)
             if self.template != "auto":
-                return found
-            flags = np.full(len(found), int(ForcedFlags.NO_SEGMENT))
-            return dataclasses.replace(found, flags=flags, meta={**found.meta, "template": "auto"})
+                return templates
+            flags = np.full(len(templates), int(ForcedFlags.NO_SEGMENT))
+            return dataclasses.replace(
+                templates, flags=flags, meta={**templates.meta, "template": "auto"}
+            )
         return SourceTemplates.from_images(
             highres, segmentation, catalog, psf=self.mean_kernel.source, template=self.template,
             wings=self.wings, n_threads=self.n_threads,
@@ -504,10 +526,11 @@ class ForcedPhotometer(Interactive):
 
 
 def _as_kernels(kernel):
-    """Kernel of an image, or those of exposures, of anything that stands for them."""
+    """Make the kernel of an image, or those of exposures, of anything that stands for them."""
     if isinstance(kernel, ExposureKernels):
         return kernel
-    of_kernels = (MatchingKernel, KernelField)
-    if isinstance(kernel, (list, tuple)) and all(isinstance(each, of_kernels) for each in kernel):
-        return ExposureKernels(kernel)
+    if isinstance(kernel, (list, tuple)):
+        kinds = (MatchingKernel, KernelField)
+        if all(isinstance(member, kinds) for member in kernel):
+            return ExposureKernels(kernel)
     return as_kernel(kernel)

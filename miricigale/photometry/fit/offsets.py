@@ -8,23 +8,36 @@ from astropy.table import QTable
 
 from miricigale.photometry._core.stamps import offset_sums
 from miricigale.photometry.fit.template_fit import TemplateFit
+from miricigale.photometry.images.arrays import lengths
 from miricigale.photometry.images.fields import SmoothField, legendre_terms, n_terms
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
-#: Least signal-to-noise of sources whose offsets are measured, largest light of others relative to
-#: their own, both below their template, and least number of sources for each term of the map.
-_BRIGHT, _ISOLATED, _SOURCES = 20.0, 0.2, 3
+#: Least signal-to-noise of sources whose offsets are measured.
+_BRIGHT = 20.0
 
-#: Least error (pixels) of a measured offset, distance from the map in errors beyond
-#: which a source does not count, and change of the map (pixels) at which it is done.
-_FLOOR, _CLIP, _DONE = 0.01, 4.0, 5e-3
+#: Largest light of neighbors relative to a source's own, both below its template.
+_ISOLATED = 0.2
+
+#: Least number of sources for each term of the map.
+_SOURCES = 3
+
+#: Least error (pixels) of a measured offset.
+_FLOOR = 0.01
+
+#: Distance from the map, in errors, beyond which a source does not count.
+_CLIP = 4.0
+
+#: Change of the map (pixels) at which it is done.
+_DONE = 5e-3
 
 #: How often sources are moved by their own offsets, and how far at most in rms widths of the PSF; offset of all,
 #: in full widths at half maximum, of which there is a warning.
-_SETTLED, _OWN, _NOTICED = 3, 0.3, 0.05
+_SETTLED = 3
+_OWN = 0.3
+_NOTICED = 0.05
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -81,7 +94,8 @@ class OffsetMap:
         offset : `~astropy.units.Quantity`, shape (..., 2)
             (dx, dy) along the image's axes, in arcsec.
         """
-        return self.field(*self.wcs.world_to_pixel(sky)) * ANGLE
+        x, y = self.wcs.world_to_pixel(sky)
+        return self.field(x, y) * ANGLE
 
     def plot(self, ax=None, **kwargs):
         """
@@ -141,36 +155,45 @@ def source_offsets(fit, residual, model, rows):
 
         def measure(part, block=block, low=low):
             part = slice(low + part.start, low + part.stop)
-            own = rows[part] - block.first
-            light = block.values, block.box[own], block.start[own], fit.flux[rows[part]]
+            block_rows = rows[part] - block.first
+            light = (
+                block.values,
+                block.box[block_rows],
+                block.start[block_rows],
+                fit.flux[rows[part]],
+            )
             offset_sums(*light, at[part], half, model, residual, fit.inverse_sigma, out[part])
 
         fit.bank.map(measure, chunks(high - low, 256))
-    products, (rest, seen) = out[:, :16].reshape(-1, 4, 4), out[:, 16:].T
+    products = out[:, :16].reshape(-1, 4, 4)
+    (neighbor_light, n_pixels) = out[:, 16:].T
     scale = np.sqrt(products.diagonal(axis1=1, axis2=2))[:, :3]
     with np.errstate(divide="ignore", invalid="ignore"):
         normal = products[:, :3, :3] / (scale[:, :, None] * scale[:, None])
         normal[~(np.linalg.det(normal) > 1e-12)] = np.nan
-        inverse, found = np.linalg.inv(normal), products[:, :3, 3] / scale
-        step = np.einsum("kij,kj->ki", inverse, found)
-        left = np.maximum(products[:, 3, 3] - np.sum(step * found, axis=1), 0)
+        inverse = np.linalg.inv(normal)
+        projection = products[:, :3, 3] / scale
+        step = np.einsum("kij,kj->ki", inverse, projection)
+        chi2_left = np.maximum(products[:, 3, 3] - np.sum(step * projection, axis=1), 0)
         variance = np.mean((inverse.diagonal(axis1=1, axis2=2) / scale**2)[:, 1:], axis=1)
-        error = np.sqrt(variance * left / np.maximum(seen - 3, 1))
-        return (step / scale)[:, 1:], error, rest / scale[:, 0] ** 2
+        error = np.sqrt(variance * chi2_left / np.maximum(n_pixels - 3, 1))
+        return (step / scale)[:, 1:], error, neighbor_light / scale[:, 0] ** 2
 
 
 def fit_offsets(arrays, bank, settings, catalog):
     """
-    The `TemplateFit` of an image with templates at positions that follow a smooth map of offsets.
+    Fit an image with templates at positions that follow a smooth map of offsets (a `TemplateFit`).
 
     Where too few bright isolated sources are left, with one shift of the image, and a warning. Parameters
     are those of `~miricigale.photometry.fit.fit_loop.fit_image`.
     """
-    fit, moved = TemplateFit(arrays, bank, settings), 0.0
-    xy, limit = catalog.xy[catalog.near], settings.max_shift.value / fit.scale
+    fit = TemplateFit(arrays, bank, settings)
+    moved = 0.0
+    xy = catalog.xy[catalog.near_rows]
+    limit = settings.max_shift.value / fit.scale
     for _ in range(6):
         rows, offset, error = _bright_offsets(fit, catalog, moved)
-        good = np.hypot(*offset.T) < limit
+        good = lengths(offset) < limit
         order = settings.offset_order
         while order >= 0 and np.count_nonzero(good) < _SOURCES * n_terms(order):
             order -= 1
@@ -178,8 +201,9 @@ def fit_offsets(arrays, bank, settings, catalog):
             _too_few(0, good, "one shift is fitted to all sources instead")
             return TemplateFit(arrays, bank, settings, search=True)
         member = fit.bank.order[rows]
-        field, used = _robust_field(xy[member], offset, error, good, arrays.flux.shape, order)
-        change = field(*xy.T) - moved
+        field, is_used = _robust_field(xy[member], offset, error, good, arrays.flux.shape, order)
+        x, y = xy.T
+        change = field(x, y) - moved
         if np.abs(change).max(initial=0.0) < _DONE:
             break
         moved = moved + change
@@ -187,12 +211,12 @@ def fit_offsets(arrays, bank, settings, catalog):
         fit = TemplateFit(arrays, bank, settings, moved=moved)
     if order < settings.offset_order:
         _too_few(settings.offset_order, good, f"order {order} is taken")
-    near = catalog.near[member]
-    table = QTable({"id": catalog.id[near], "sky": catalog.sky[near]})
+    sources = catalog.near_rows[member]
+    table = QTable({"id": catalog.id[sources], "sky": catalog.sky[sources]})
     table["x_centroid"], table["y_centroid"] = xy[member].T
     table["dx"], table["dy"] = offset.T * fit.scale * ANGLE
     table["offset_err"] = error * fit.scale * ANGLE
-    table["used"] = used
+    table["used"] = is_used
     in_arcsec = SmoothField(field.coefficients * fit.scale, field.shape, order)
     fit.offset_map = OffsetMap(table, in_arcsec, arrays.wcs)
     return fit
@@ -207,7 +231,7 @@ def _too_few(order, good, instead):
 
 def settled(fit, bank, catalog):
     """
-    A fit with bright isolated sources moved to where the image shows them.
+    Move bright isolated sources to where the image shows them, and fit again.
 
     Registration and colors move sources against each other by some milliarcseconds, which bright ones show. Each
     goes by its own offset, as far as offsets scatter beyond their errors; nothing is done if they do not, or if
@@ -218,40 +242,56 @@ def settled(fit, bank, catalog):
     fit, bank
         A `TemplateFit`, and the templates before they were moved.
     catalog : `~miricigale.photometry.fit.result_table.CatalogRows`
-        The catalog; ``near`` lists the bank's sources.
+        The catalog; ``near_rows`` lists the bank's sources.
 
     Returns
     -------
     fit : `TemplateFit`
-        Its ``own``, (k, 2), are what each source was moved by (pixels), None if nothing was done.
+        Its ``source_shifts``, (k, 2), are what each source was moved by (pixels), None if nothing was done.
     """
-    xy, shape = catalog.xy[catalog.near], fit.arrays.flux.shape
+    xy = catalog.xy[catalog.near_rows]
+    shape = fit.arrays.flux.shape
     common = np.array(fit.displacement(xy))
-    own, first = np.zeros_like(common), fit
+    source_shifts = np.zeros_like(common)
+    first = fit
     for _ in range(_SETTLED):
-        rows, offset, error = _bright_offsets(fit, catalog, common + own)
-        found = offset - common[fit.bank.order[rows]]
+        rows, offset, error = _bright_offsets(fit, catalog, common + source_shifts)
+        deviation = offset - common[fit.bank.order[rows]]
         # what is farther off is another source
-        good = np.hypot(*found.T) < _OWN * fit.psf_width
-        member, found, error = fit.bank.order[rows][good], found[good], error[good]
+        good = lengths(deviation) < _OWN * fit.psf_width
+        member = fit.bank.order[rows][good]
+        deviation = deviation[good]
+        error = error[good]
         if len(member) <= _SOURCES:
             break
-        order = max(k for k in range(4) if k == 0 or len(member) > _SOURCES**2 * n_terms(k))
-        smooth, _ = _robust_field(xy[member], found, error, good[good], shape, order)
-        smooth = smooth(*xy[member].T)
+        # the largest order, up to 3, that the sources allow
+        order = 0
+        while order < 3 and len(member) > _SOURCES**2 * n_terms(order + 1):
+            order += 1
+        smooth, _ = _robust_field(xy[member], deviation, error, good[good], shape, order)
+        x, y = xy[member].T
+        smooth = smooth(x, y)
         if np.abs(smooth).max() > _NOTICED * np.sqrt(8 * np.log(2)) * fit.psf_width:
             break
         # of two normal errors the median distance is 1.18
-        scatter = (np.median(np.hypot(*found.T)) / 1.1774) ** 2 - np.median(error) ** 2
+        scatter = (np.median(lengths(deviation)) / 1.1774) ** 2 - np.median(error) ** 2
         if scatter <= _FLOOR**2:
             break
-        new = np.zeros_like(own)
-        new[member] = found * (scatter / (scatter + error**2))[:, None]
-        change, own = np.abs(new - own).max(), new
+        new = np.zeros_like(source_shifts)
+        new[member] = deviation * (scatter / (scatter + error**2))[:, None]
+        change = np.abs(new - source_shifts).max()
+        source_shifts = new
         fit = TemplateFit(
-            fit.arrays, bank, fit.settings, moved=common + own, like=fit.bank, search=False
+            fit.arrays,
+            bank,
+            fit.settings,
+            moved=common + source_shifts,
+            like=fit.bank,
+            search=False,
         )
-        fit.shift, fit.offset_map, fit.own = first.shift, first.offset_map, own
+        fit.shift = first.shift
+        fit.offset_map = first.offset_map
+        fit.source_shifts = source_shifts
         if change < _DONE:
             break
     if fit is not first and first.shift is not None:
@@ -260,7 +300,7 @@ def settled(fit, bank, catalog):
 
 
 def _bright_offsets(fit, catalog, moved):
-    """Rows, offsets from the catalog (pixels) and errors of bright isolated sources."""
+    """Measure offsets of bright isolated sources from the catalog: rows, offsets (pixels) and errors."""
     if not len(fit.rows):
         return np.empty(0, int), np.empty((0, 2)), np.empty(0)
     moved = np.broadcast_to(moved, (len(fit.bank.order), 2))
@@ -268,22 +308,23 @@ def _bright_offsets(fit, catalog, moved):
     residual = fit.residual(model)
     snr = np.zeros(len(fit.bank.order))
     snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
-    source = catalog.near[fit.bank.order]
+    source = catalog.near_rows[fit.bank.order]
     bad = int(ForcedFlags.SHARED_SEGMENT | ForcedFlags.NOISY_SEGMENT)
-    whole = (fit.light > 0.9).all(axis=1) & (catalog.flags[source] & bad == 0)
-    rows = np.flatnonzero(whole & ~fit.noisy & (snr > _BRIGHT))
-    step, error, others = source_offsets(fit, residual, model, rows)
+    is_whole = (fit.light > 0.9).all(axis=1) & (catalog.flags[source] & bad == 0)
+    rows = np.flatnonzero(is_whole & ~fit.noisy & (snr > _BRIGHT))
+    step, error, neighbors = source_offsets(fit, residual, model, rows)
     with np.errstate(invalid="ignore"):
         # where residuals are larger than the stated noise the latter overstates the significance
-        keep = np.isfinite(error) & (others < _ISOLATED) & (error < fit.psf_width / _BRIGHT * 2)
+        keep = np.isfinite(error) & (neighbors < _ISOLATED) & (error < fit.psf_width / _BRIGHT * 2)
     rows = rows[keep]
     offset = moved[fit.bank.order[rows]] + step[keep]
     return rows, offset, np.hypot(error[keep], _FLOOR)
 
 
 def _robust_field(xy, offset, error, good, shape, order):
-    """Polynomial through offsets that some of the sources do not follow, and which ones do."""
-    terms = np.stack(legendre_terms(*xy.T, shape, order), axis=-1)
+    """Fit a polynomial through offsets that some of the sources do not follow; return it and which ones do."""
+    x, y = xy.T
+    terms = np.stack(legendre_terms(x, y, shape, order), axis=-1)
 
     def weighted(rows, total):
         return terms[rows] / total[rows, None], offset[rows] / total[rows, None]
@@ -294,14 +335,15 @@ def _robust_field(xy, offset, error, good, shape, order):
     def misfit(flat):
         return (a @ flat.reshape(start.shape) - b).ravel()
 
-    found = scipy.optimize.least_squares(misfit, start.ravel(), loss="soft_l1")
-    coefficients = found.x.reshape(start.shape)
+    solution = scipy.optimize.least_squares(misfit, start.ravel(), loss="soft_l1")
+    coefficients = solution.x.reshape(start.shape)
     for _ in range(5):
-        distance = np.hypot(*(offset - terms @ coefficients).T)
+        distance = lengths(offset - terms @ coefficients)
         # galaxies differ from band to band: what scatters beyond the errors (of two normal
         # errors the median distance is 1.18) is added to them
         scatter = (np.median(distance[good]) / 1.1774) ** 2 - np.median(error[good]) ** 2
         total = np.hypot(error, np.sqrt(max(scatter, 0.0)))
-        used = good & (distance < _CLIP * total)
-        coefficients = np.linalg.lstsq(*weighted(used, total))[0]
-    return SmoothField(coefficients, shape, order), used
+        is_used = good & (distance < _CLIP * total)
+        matrix, right = weighted(is_used, total)
+        coefficients = np.linalg.lstsq(matrix, right)[0]
+    return SmoothField(coefficients, shape, order), is_used

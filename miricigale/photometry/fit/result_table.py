@@ -14,6 +14,7 @@ from miricigale.photometry.detection.residual_sources import unexplained_neighbo
 from miricigale.photometry.fit.diagnostics import canceling, source_flags
 from miricigale.photometry.fit.results import ForcedPhotometryResult, crowded
 from miricigale.photometry.fit.template_fit import fit_covariances
+from miricigale.photometry.images.arrays import pixels_to_sky
 from miricigale.photometry.images.fields import SmoothField
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.utils.exceptions import PhotometryWarning, warn
@@ -24,8 +25,15 @@ from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
 #: Names of the errors of a flux after ``flux_err``: their sum, and its terms.
 _TERMS = ("", "_noise", "_template", "_psf")
 
-#: Least offset (pixels) that is warned of, with so many sources above so many sigma; relative error of templates.
-_OFFSET, _FEWEST, _BRIGHT, _TEMPLATE = 0.1, 5, 10.0, 0.1
+#: Least offset (pixels) that is warned of.
+_WARNED_OFFSET = 0.1
+
+#: Fewest bright sources, and their signal-to-noise, with which offsets are warned of.
+_FEWEST_BRIGHT = 5
+_BRIGHT_SNR = 10.0
+
+#: Relative error of templates.
+_TEMPLATE_ERROR = 0.1
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,7 +47,9 @@ class CatalogRows:
     template: np.ndarray
     template_snr: np.ndarray
     xy: np.ndarray  # (n, 2): Positions on the image; NaN far outside.
-    near: np.ndarray  # (k,): The sources that have a template, in the order of the bank's sources.
+    near_rows: (
+        np.ndarray
+    )  # (k,): The sources that have a template, in the order of the bank's sources.
     fitted: np.ndarray  # (k,): What is known of the shapes of these.
     #: Fluxes by which crowded sources are found; None for those that are measured.
     reference: np.ndarray | None = None
@@ -55,39 +65,46 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     returns, ``catalog`` are the `CatalogRows`, ``meta`` is provenance: the ``template``, and the
     ``filter`` if that is known.
     """
-    n, n_columns = len(catalog.sky), len(fit.columns)
+    n = len(catalog.sky)
+    n_columns = len(fit.columns)
     n_all = n + len(new_xy)
     # sources that were added have the last numbers, after second components
     owner = np.full(len(fit.host), -1)
-    owner[: len(catalog.near)] = catalog.near
+    owner[: len(catalog.near_rows)] = catalog.near_rows
     owner[len(owner) - len(new_xy) :] = np.arange(n, n_all)
-    place, main = owner[fit.host[fit.bank.order]], fit.main
+    place = owner[fit.host[fit.bank.order]]
+    main = fit.main
     common = np.full((n_columns, n_columns), np.nan)
     blending = np.full(len(place), np.nan)
-    flux, flux_err = np.full(n_all, np.nan), np.full((4, n_all), np.nan)
-    chi2, left = np.full(n_all, np.nan), np.full(n_all, np.nan)
+    flux = np.full(n_all, np.nan)
+    flux_err = np.full((4, n_all), np.nan)
+    chi2 = np.full(n_all, np.nan)
+    residual_fraction = np.full(n_all, np.nan)
     joint = scipy.sparse.csr_array((2 * n_all, 2 * n_all))
     if len(fit.rows):
         *covariances, common, blending[fit.rows] = fit_covariances(fit, diagnostics.correlation)
-        terms = [_by_source(one, place[fit.rows], main[fit.rows], n_all) for one in covariances]
+        terms = [
+            _by_source(covariance, place[fit.rows], main[fit.rows], n_all)
+            for covariance in covariances
+        ]
         joint = terms[0] + terms[1] + terms[2]
         measured = fit.rows[main[fit.rows]]
         flux[place[measured]] = fit.total[measured]
-        for error, one in zip(flux_err, (joint, *terms), strict=True):
-            error[place[measured]] = np.sqrt(np.maximum(one.diagonal()[place[measured]], 0.0))
+        for error, term in zip(flux_err, (joint, *terms), strict=True):
+            error[place[measured]] = np.sqrt(np.maximum(term.diagonal()[place[measured]], 0.0))
     flags, coverage = source_flags(fit, diagnostics, place, flux, blending)
     flags[:n] |= catalog.flags
     flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
     xy = np.concatenate([catalog.xy, new_xy])
-    near = unexplained_neighbors(diagnostics.peaks, xy + fit.displacement(xy), flux)
-    flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
-    seen = np.full(n_all, np.nan)
-    seen[place[main]] = diagnostics.seen[main]
-    flags[canceling(flux, flux_err[0], seen)] |= int(ForcedFlags.CANCELING)
+    has_neighbor = unexplained_neighbors(diagnostics.peaks, xy + fit.displacement(xy), flux)
+    flags[has_neighbor & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    core_flux = np.full(n_all, np.nan)
+    core_flux[place[main]] = diagnostics.core_flux[main]
+    flags[canceling(flux, flux_err[0], core_flux)] |= int(ForcedFlags.CANCELING)
     chi2[place[main]] = diagnostics.chi2[main]
-    left[place[main]] = diagnostics.residual_fraction[main]
+    residual_fraction[place[main]] = diagnostics.residual_fraction[main]
     columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage, "chi2": chi2}
-    columns["residual_fraction"] = left
+    columns["residual_fraction"] = residual_fraction
     for name, error in zip(_TERMS, flux_err, strict=True):
         columns[f"flux_err{name}"] = error * FNU
     new = None
@@ -96,6 +113,12 @@ def package(fit, diagnostics, new_xy, catalog, meta):
         rows = {name: columns[name][n:] for name in names}
         new = new_source_table(catalog, new_xy, fit.arrays.wcs, rows)
     reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
+    image_meta = {}
+    if "filter" in meta:
+        image_meta["filter"] = meta["filter"]
+    evidence = {}
+    if fit.evidence is not None:
+        evidence["second_pass"] = fit.evidence
     return ForcedPhotometryResult(
         id=np.array(catalog.id),
         sky=catalog.sky,
@@ -114,12 +137,12 @@ def package(fit, diagnostics, new_xy, catalog, meta):
             pixel_scale=round(fit.scale, 6),
             correlated_noise=diagnostics.correlation is not None,
             measured_noise=fit.arrays.measured_noise,
-            **_registration(fit, diagnostics, common, np.sum(flux > _BRIGHT * flux_err[0])),
-            **({} if fit.evidence is None else {"second_pass": fit.evidence}),
+            **_registration(fit, diagnostics, common, np.sum(flux > _BRIGHT_SNR * flux_err[0])),
+            **evidence,
         ),
         **_components(fit, catalog, joint, place, n_all),
         **_common(fit, common),
-        **_images(fit, diagnostics, {k: v for k, v in meta.items() if k == "filter"}),
+        **_images(fit, diagnostics, image_meta),
     )
 
 
@@ -137,26 +160,35 @@ def _registration(fit, diagnostics, common, n_bright):
         table = fit.offset_map.sources[fit.offset_map.sources["used"]]
         values = np.stack([table["dx"].value, table["dy"].value])
         return _offset_meta(values.mean(axis=1), values.std(axis=1) / np.sqrt(len(table)))
-    model, sums = diagnostics.model, []
+    model = diagnostics.model
+    sums = []
     for part in chunks(len(model), int(np.clip(len(model) // 16, 4, 256))):
         # a row more on both sides for the gradient
-        first, last = max(part.start - 1, 0), min(part.stop + 1, len(model))
-        own, weight = slice(part.start - first, part.stop - first), fit.inverse_sigma[part]
+        first = max(part.start - 1, 0)
+        last = min(part.stop + 1, len(model))
+        inner = slice(part.start - first, part.stop - first)
+        weight = fit.inverse_sigma[part]
         # templates have errors too: the brightest shall not decide alone
-        weight = weight / np.hypot(1.0, _TEMPLATE * model[part] * weight)
-        columns = [-one[own] * weight for one in np.gradient(model[first:last])[::-1]]
-        columns = np.stack([*columns, diagnostics.residual[part] * weight]).reshape(3, -1)
+        weight = weight / np.hypot(1.0, _TEMPLATE_ERROR * model[part] * weight)
+        # columns of a fit of a shift: derivatives of the model to x and y, and the residual
+        slope_y, slope_x = np.gradient(model[first:last])
+        columns = [-slope_x[inner], -slope_y[inner], diagnostics.residual[part]]
+        columns = (np.stack(columns) * weight).reshape(3, -1)
         sums.append(columns @ columns.T)
     sums = np.array(sums, float)
     # of all strips, and of all but each
-    every = np.concatenate([[sums.sum(axis=0)], sums.sum(axis=0) - sums])
-    normal = every[:, :2, :2]
+    sums_of_strips = np.concatenate([[sums.sum(axis=0)], sums.sum(axis=0) - sums])
+    normal = sums_of_strips[:, :2, :2]
     if np.linalg.det(normal).min() <= 0:
         return {}
-    found = np.linalg.solve(normal, every[:, :2, 2:])[..., 0]
-    offset, without = found[0], found[1:]
+    offsets = np.linalg.solve(normal, sums_of_strips[:, :2, 2:])[..., 0]
+    offset = offsets[0]
+    without = offsets[1:]
     error = np.sqrt((len(sums) - 1) * np.var(without, axis=0))
-    far = np.any((np.abs(offset) > _OFFSET) & (np.abs(offset) > 3 * error)) and n_bright >= _FEWEST
+    far = (
+        np.any((np.abs(offset) > _WARNED_OFFSET) & (np.abs(offset) > 3 * error))
+        and n_bright >= _FEWEST_BRIGHT
+    )
     # a shift that was asked for and is too large has a warning of its own
     if far and fit.settings.max_shift is None:
         x, y = offset * fit.scale
@@ -171,23 +203,24 @@ def _offset_meta(offset, error):
 
 
 def _by_source(covariance, place, main, n):
-    """Covariance of sources' total fluxes, and after them of their second components, (2 n, 2 n)."""
+    """Return the covariance of sources' total fluxes, and after them of their second components, (2 n, 2 n)."""
     k = np.arange(len(place))
     rows = np.concatenate([place, n + place[~main]])
     gather = scipy.sparse.coo_array(
         (np.ones(len(rows)), (rows, np.concatenate([k, k[~main]]))), shape=(2 * n, len(k))
     ).tocsr()
-    found = (gather @ covariance @ gather.T).tocsr()
-    found.sort_indices()
-    return found
+    total = (gather @ covariance @ gather.T).tocsr()
+    total.sort_indices()
+    return total
 
 
 def _components(fit, catalog, joint, place, n_all):
-    """Fluxes of points on top of templates, if any were asked for."""
+    """Return fluxes of points on top of templates, if any were asked for."""
     if catalog.double is None and fit.settings.components == 1:
         return {}
     n = len(catalog.sky)
-    flux, error = np.full(n, np.nan), np.full(n, np.nan)
+    flux = np.full(n, np.nan)
+    error = np.full(n, np.nan)
     second = fit.pairs[:, 1]
     flux[place[second]] = fit.flux[second]
     error[place[second]] = np.sqrt(joint.diagonal()[n_all + place[second]])
@@ -200,19 +233,25 @@ def _components(fit, catalog, joint, place, n_all):
 
 
 def new_ids(ids, n):
-    """Ids of ``n`` sources, (n,), that are not among ``ids``, and of their kind."""
+    """Make ids of ``n`` sources, (n,), that are not among ``ids``, and of their kind."""
     if ids.dtype.kind in "iu":
         return int(ids.max(initial=0)) + 1 + np.arange(n)
-    known = set(ids.tolist())
-    names = (f"new-{k}" for k in itertools.count(1))
-    new = list(itertools.islice((name for name in names if name not in known), n))
-    return np.array(new) if n else ids[:0]
+    taken_ids = set(ids.tolist())
+    if n == 0:
+        return ids[:0]
+    new = []
+    for k in itertools.count(1):
+        name = f"new-{k}"
+        if name not in taken_ids:
+            new.append(name)
+        if len(new) == n:
+            return np.array(new)
 
 
 def new_source_table(catalog, xy, wcs, columns):
-    """Table of sources at pixels (x, y), (m, 2), that a catalog (`CatalogRows`) lacks, with their columns."""
+    """Make the table of sources at pixels (x, y), (m, 2), that a catalog (`CatalogRows`) lacks."""
     table = QTable({"id": new_ids(np.asarray(catalog.id), len(xy))})
-    table["sky"] = wcs.pixel_to_world(*xy.T).transform_to(catalog.sky.frame)
+    table["sky"] = pixels_to_sky(xy, wcs).transform_to(catalog.sky.frame)
     table["x_centroid"], table["y_centroid"] = xy.T
     for name, values in columns.items():
         table[name] = values
@@ -221,34 +260,37 @@ def new_source_table(catalog, xy, wcs, columns):
 
 
 def _common(fit, covariance):
-    """Parameters of the whole image with their errors."""
-    found = {}
-    order, shape = fit.settings.background_order, fit.arrays.flux.shape
+    """Return parameters of the whole image with their errors."""
+    parameters = {}
+    order = fit.settings.background_order
+    shape = fit.arrays.flux.shape
     if order is not None and fit.fit is not None:
         terms = fit.common[fit.places["background"]]
         errors = _common_errors(fit, covariance, "background")
-        found["background"] = terms[0] * SURFACE_BRIGHTNESS
-        found["background_err"] = errors[0] * SURFACE_BRIGHTNESS
-        found["background_field"] = SmoothField(terms, shape, order)
+        parameters["background"] = terms[0] * SURFACE_BRIGHTNESS
+        parameters["background_err"] = errors[0] * SURFACE_BRIGHTNESS
+        parameters["background_field"] = SmoothField(terms, shape, order)
     if fit.shift is not None:
-        found["shift"] = fit.shift * ANGLE
-        found["shift_err"] = _common_errors(fit, covariance, "shift") * fit.scale * ANGLE
+        parameters["shift"] = fit.shift * ANGLE
+        parameters["shift_err"] = _common_errors(fit, covariance, "shift") * fit.scale * ANGLE
     if fit.offset_map is not None:
-        found["offset_map"] = fit.offset_map
-    return found
+        parameters["offset_map"] = fit.offset_map
+    return parameters
 
 
 def _common_errors(fit, covariance, name):
-    """Errors of the common parameters of a name."""
+    """Return errors of the common parameters of a name."""
     return np.sqrt(np.diag(covariance)[fit.places[name]])
 
 
 def _images(fit, diagnostics, meta):
     arrays = fit.arrays
     # images can be large: what the fit needs no longer becomes the result
-    model, residual = diagnostics.model, diagnostics.residual
+    model = diagnostics.model
+    residual = diagnostics.residual
     fit.add_background(model)
-    sigma, area = arrays.inverse_sigma, arrays.areas(out=arrays.flux)
+    sigma = arrays.inverse_sigma
+    area = arrays.areas(out=arrays.flux)
     for image in (residual, sigma):
         image[~arrays.usable] = np.nan
     np.divide(1, sigma, out=sigma)

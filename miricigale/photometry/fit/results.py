@@ -37,10 +37,12 @@ _FLUXES = ("flux", "flux_err", "flux_err_noise", "flux_err_template", "flux_err_
 
 
 def band_column(key, band):
-    """What a column is called in a table of the band, if one is given: ``<band>_flags`` for ``flags``."""
+    """Return a column's name in a table of a band, if one is given: ``<band>_flags`` for ``flags``."""
     if band is None or key in ("id", "sky"):
         return key
-    return f"{band}{key[4:]}" if key in _FLUXES else f"{band}_{key}"
+    if key in _FLUXES:
+        return key.replace("flux", band, 1)
+    return f"{band}_{key}"
 
 
 def crowded(sky, flux, *, radius=2 * u.arcsec):
@@ -76,15 +78,16 @@ def crowded(sky, flux, *, radius=2 * u.arcsec):
     >>> crowded(sky, [1.0, 9.0, 5.0] * u.uJy)
     array([ True, False, False])
     """
-    found = np.zeros(len(sky), bool)
-    known = np.flatnonzero(np.isfinite(sky.spherical.lon) & np.isfinite(sky.spherical.lat))
-    if len(known) > 1:
+    is_crowded = np.zeros(len(sky), bool)
+    placed = np.flatnonzero(np.isfinite(sky.spherical.lon) & np.isfinite(sky.spherical.lat))
+    if len(placed) > 1:
         flux = floats(flux)
-        i, j, _, _ = sky[known].search_around_sky(sky[known], radius)
-        i, j = known[i], known[j]
+        i, j, _, _ = sky[placed].search_around_sky(sky[placed], radius)
+        i = placed[i]
+        j = placed[j]
         limit = np.maximum(flux[i], 0.0) * 10**-0.4
-        found[i[(i != j) & (flux[j] > limit)]] = True
-    return found
+        is_crowded[i[(i != j) & (flux[j] > limit)]] = True
+    return is_crowded
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -267,10 +270,8 @@ class ForcedPhotometryResult(Tabular):
         usable = ~image.mask
         square = np.where(usable, image.data / image.uncertainty.array, 0.0) ** 2
         width = self.psf_fwhm.to_value(ANGLE) / pixel_scale(image.wcs) / np.sqrt(8 * np.log(2))
-        total, weight = (
-            scipy.ndimage.gaussian_filter(one, width, mode="constant")
-            for one in (square, usable.astype(float))
-        )
+        total = scipy.ndimage.gaussian_filter(square, width, mode="constant")
+        weight = scipy.ndimage.gaussian_filter(usable.astype(float), width, mode="constant")
         chi2 = np.divide(total, weight, out=np.full(total.shape, np.nan), where=usable)
         return Image(chi2, unit="", wcs=image.wcs, mask=~usable, meta=dict(image.meta))
 
@@ -304,7 +305,7 @@ class ForcedPhotometryResult(Tabular):
 
     def upper_limit(self, confidence=0.95):
         """
-        Fluxes that the true ones, which are not negative, are below with some confidence.
+        Calculate upper limits of the fluxes (uJy) with some confidence, given that true fluxes are not negative.
 
         Parameters
         ----------
@@ -331,7 +332,7 @@ class ForcedPhotometryResult(Tabular):
         return self.flux - ndtri((1 - confidence) * ndtr(self.snr)) * self.flux_err
 
     def _row(self, key):
-        """Row of the source of an id."""
+        """Return the row of the source of an id."""
         if not np.any(self.id == key):
             msg = f"no source with the id {key!r}"
             raise KeyError(msg)
@@ -339,7 +340,7 @@ class ForcedPhotometryResult(Tabular):
 
     def correlation(self, first, second):
         """
-        Correlation of the errors of two sources, given by id.
+        Return the correlation of the errors of two sources, given by id.
 
         Returns
         -------
@@ -403,11 +404,13 @@ class ForcedPhotometryResult(Tabular):
         table : `~astropy.table.QTable`
             With units, descriptions, and provenance in ``meta``.
         """
-        texts, columns = declared("miricigale.photometry", "columns.toml")["forced"], {}
+        texts = declared("miricigale.photometry", "columns.toml")["forced"]
+        columns = {}
         facts = {"flags": ForcedFlags.describe(), "confidence": confidence}
         for key, text in texts.items():
-            wanted = key == "upper" and confidence is not None
-            values = self.upper_limit(confidence) if wanted else getattr(self, key, None)
+            values = getattr(self, key, None)
+            if key == "upper" and confidence is not None:
+                values = self.upper_limit(confidence)
             if values is not None:
                 columns[band_column(key, name)] = values, text.format(**facts)
         return described_table(columns, dict(self.meta))
@@ -453,8 +456,8 @@ class ForcedPhotometryResult(Tabular):
             That of `~miricigale.evaluation.associate`, the photometry being the first catalog: a row for each
             source and for each row of the catalog that has none, with what is ambiguous named.
         """
-        own = QTable({"id": self.id, "sky": self.sky})
-        return associate(own, read_catalog(catalog)["id", "sky"], radius=radius)
+        positions = QTable({"id": self.id, "sky": self.sky})
+        return associate(positions, read_catalog(catalog)["id", "sky"], radius=radius)
 
     def plot(self, ax=None, **kwargs):
         """
@@ -473,7 +476,8 @@ class ForcedPhotometryResult(Tabular):
         """
         from miricigale.plotting.images import plot_model_residual
 
-        model, residual = self.model_image.data, self.residual_image
+        model = self.model_image.data
+        residual = self.residual_image
         scale = pixel_scale(residual.wcs)
         return plot_model_residual(residual.data + model, model, ax=ax, pixel_scale=scale, **kwargs)
 
@@ -513,7 +517,9 @@ class ForcedPhotometryResult(Tabular):
         # NaN is on no image
         inside = -0.5 <= place[0] < nx - 0.5 and -0.5 <= place[1] < ny - 0.5
         check_that(inside, "key", "a source on the image", repr(key))
-        x, y = (round(float(value)) for value in place)
+        x = round(float(place[0]))
+        y = round(float(place[1]))
         part = np.s_[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1]
-        model, residual = self.model_image.data[part], self.residual_image.data[part]
+        model = self.model_image.data[part]
+        residual = self.residual_image.data[part]
         return plot_model_residual(residual + model, model, ax=ax, pixel_scale=scale, **kwargs)

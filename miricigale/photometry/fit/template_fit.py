@@ -25,7 +25,7 @@ BLOCK_HALO = 6.0
 
 def fit_covariances(fit, correlation):
     """
-    Covariances of a `TemplateFit`, with the correlation of the noise; None if that is white.
+    Calculate the covariances of a `TemplateFit`, with the correlation of the noise; None if that is white.
 
     Returns
     -------
@@ -37,48 +37,65 @@ def fit_covariances(fit, correlation):
     blending : `~numpy.ndarray`, shape (n,)
         Formal error over that of the source alone.
     """
-    n, g, plain, free = len(fit.rows), len(fit.columns), fit.fit, fit.free
-    solution, xy = plain, fit.bank.xy[fit.rows]
-    fillings = [None if correlation is None else _sandwich(fit, correlation)]
-    if free is not None:
-        solution, xy = free.fit, np.concatenate([xy, free.xy])
+    n = len(fit.rows)
+    g = len(fit.columns)
+    fixed = fit.fit
+    changes = fit.free
+    solution = fixed
+    xy = fit.bank.xy[fit.rows]
+    fillings = [None]
+    if correlation is not None:
+        fillings = [_sandwich(fit, correlation)]
+    if changes is not None:
+        solution = changes.fit
+        xy = np.concatenate([xy, changes.xy])
         if correlation is None:
-            white = (solution.matrix - scipy.sparse.diags_array(free.prior)).tocsr()
+            white = (solution.matrix - scipy.sparse.diags_array(changes.prior)).tocsr()
             fillings = [(white, solution.border, solution.corner)]
-        nothing = np.zeros((len(solution.rhs), g)), np.zeros((g, g))
-        fillings.append((free.filling(plain.matrix), *nothing))
-    coo = plain.matrix.tocoo()
+        no_border = np.zeros((len(solution.rhs), g))
+        no_corner = np.zeros((g, g))
+        fillings.append((changes.filling(fixed.matrix), no_border, no_corner))
+    coo = fixed.matrix.tocoo()
     pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=solution.matrix.shape)
-    found, blending = solution.covariances(
+    covariances, blending = solution.covariances(
         xy, fillings, core=BLOCK_CORE / fit.scale, halo=BLOCK_HALO / fit.scale, pattern=pattern
     )
-    noise, common = found[0]
-    noise, blending = noise[:n][:, :n], blending[:n]
+    noise, common = covariances[0]
+    noise = noise[:n][:, :n]
+    blending = blending[:n]
     template = scipy.sparse.csr_array((n, n))
-    if free is not None:
-        blending = blending * np.sqrt(free.alone())
-        template, more = found[1]
-        template, common = template[:n][:, :n], common + more
+    if changes is not None:
+        blending = blending * np.sqrt(changes.remaining_power())
+        template, change_common = covariances[1]
+        template = template[:n][:, :n]
+        common = common + change_common
     if len(fit.pairs):
         # that of the sum of two components
         first, second = np.searchsorted(fit.rows, fit.pairs.T)
-        filling = plain.matrix if fillings[0] is None else fillings[0][0]
-        alone = np.sqrt(filling.diagonal()[:n]) / plain.matrix.diagonal()
-        both = np.array([noise[i, j] for i, j in zip(first, second, strict=True)])
+        middle = fixed.matrix
+        if fillings[0] is not None:
+            middle = fillings[0][0]
+        formal_error = np.sqrt(middle.diagonal()[:n]) / fixed.matrix.diagonal()
+        cross_terms = matrix_elements(noise, first, second)
         variance = noise.diagonal()
-        blending[first] = np.sqrt(variance[first] + variance[second] + 2 * both) / alone[first]
+        blending[first] = (
+            np.sqrt(variance[first] + variance[second] + 2 * cross_terms) / formal_error[first]
+        )
         blending[second] = blending[first]
     parts = fit.bank.parts(np.arange(len(fit.flux)))
-    image = np.array([one is not None and one.kind == "cutout" for one in parts], bool)
-    coo, error = noise.tocoo(), psf_errors(fit, image)[fit.rows]
+    image = np.array([cutout is not None and cutout.kind == "cutout" for cutout in parts], bool)
+    # errors of fluxes by the PSF are fully correlated
+    coo = noise.tocoo()
+    error = psf_errors(fit, image)[fit.rows]
     data = error[coo.row] * error[coo.col]
     psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
     return noise, template, psf, common, blending
 
 
 def psf_errors(fit, image):
-    """Errors of the fluxes of all rows by that of the PSF; ``image``, (n,), says whose template is one."""
-    settings, kernel = fit.settings.errors, fit.settings.mean_kernel
+    """Return flux errors (uJy) of all rows due to that of the PSF; ``image``, (n,), says whose template is one."""
+    settings = fit.settings.errors
+    kernel = fit.settings.mean_kernel
     fraction = settings.psf_error
     if fraction is None:
         if settings.size_scatter is None:
@@ -89,27 +106,28 @@ def psf_errors(fit, image):
 
 
 def _sandwich(fit, correlation):
-    """What correlated noise does to the right-hand side: matrix, border and corner."""
+    """Return the covariance of the right-hand side by correlated noise: matrix, border and corner."""
     keep = fit.rows
-    white = [fit.arrays.whitened(column) for column in fit.columns]
+    white = list(map(fit.arrays.whitened, fit.columns))
     spread = [_spread(fit, image, correlation) for image in white]
     middle, border = sandwich_matrix(fit.bank, fit.inverse_sigma, correlation, spread)
-    middle, border = middle[keep][:, keep], border[keep]
+    middle = middle[keep][:, keep]
+    border = border[keep]
     if fit.free is not None:
         middle, border = fit.free.sandwich(fit, correlation, middle, border, spread)
-    corner = np.array([[inner(a, b) for b in spread] for a in white])
-    return middle, border, corner.reshape(len(white), len(white))
+    return middle, border, inner_products(white, spread)
 
 
 def _spread(fit, image, correlation):
-    """An image convolved with the noise correlation."""
-    kernel, lag = correlation.astype(image.dtype), correlation.shape[0] // 2
+    """Convolve an image with the noise correlation."""
+    kernel = correlation.astype(image.dtype)
+    lag = correlation.shape[0] // 2
     out = fit.arrays.new()
 
     def convolve(part):
         rows = slice(max(part.start - lag, 0), part.stop + lag)
-        found = oaconvolve(image[rows], kernel, mode="same")
-        out[part] = found[part.start - rows.start :][: part.stop - part.start]
+        convolved = oaconvolve(image[rows], kernel, mode="same")
+        out[part] = convolved[part.start - rows.start :][: part.stop - part.start]
 
     fit.bank.map(convolve, chunks(len(image), 512))
     return out
@@ -172,21 +190,25 @@ class TemplateFit:
         In arcsec, shape (2,), and the `OffsetMap` by which templates are moved; None without.
     evidence
         For a second pass (dict), where that was asked for; None otherwise.
-    own : `~numpy.ndarray`, shape (n, 2)
+    source_shifts : `~numpy.ndarray`, shape (n, 2)
         Pixels by which each source of the bank is moved beyond that; None without.
     """
 
     def __init__(self, arrays, bank, settings, *, host=None, moved=None, like=None, search=None):
-        self.arrays, self.settings = arrays, settings
+        self.arrays = arrays
+        self.settings = settings
         self.host = np.arange(len(bank.order)) if host is None else host
         self.scale = pixel_scale(arrays.wcs)
         self.inverse_sigma = arrays.inverse_sigma
-        self._background = (
-            self._background_columns() if settings.background_order is not None else []
-        )
-        self.shift = self.offset_map = self.free = self.own = self.evidence = None
-        moved = np.zeros(2) if moved is None else moved
-        self.bank = bank.shifted(moved) if np.any(moved) else bank
+        self._background = []
+        if settings.background_order is not None:
+            self._background = self._background_columns()
+        self.shift = self.offset_map = self.free = self.source_shifts = self.evidence = None
+        if moved is None:
+            moved = np.zeros(2)
+        self.bank = bank
+        if np.any(moved):
+            self.bank = bank.shifted(moved)
         if like is not None:
             self.bank.reuse(like)
         self._solve(self.bank, [])
@@ -196,14 +218,17 @@ class TemplateFit:
             self._find_shift(bank, moved)
 
     def _background_columns(self):
-        area, order = self.arrays.areas(), self.settings.background_order
+        area = self.arrays.areas()
+        order = self.settings.background_order
         if order == 0:
             return [area]
         y, x = np.ogrid[: area.shape[0], : area.shape[1]]
         terms = legendre_terms(x, y, area.shape, order)
-        return [
-            np.multiply(area, term, out=self.arrays.new(), casting="same_kind") for term in terms
-        ]
+        columns = []
+        for term in terms:
+            column = self.arrays.new()
+            columns.append(np.multiply(area, term, out=column, casting="same_kind"))
+        return columns
 
     def _solve(self, bank, gradients):
         """Fit fluxes and common parameters with the templates of a bank."""
@@ -215,10 +240,11 @@ class TemplateFit:
         if gradients:
             self.places["shift"] = slice(len(self.columns), len(self.columns) + len(gradients))
             self.columns += gradients
-        white = [self.arrays.whitened(column) for column in self.columns]
+        white = list(map(self.arrays.whitened, self.columns))
         data = self.arrays.whitened(self.arrays.flux)
         matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
-        self.light, self.power = light / bank.full_light()[:, None], power
+        self.light = light / bank.full_light()[:, None]
+        self.power = power
         diagonal = matrix.diagonal()
         rows = (self.light[:, 1] >= MIN_COVERAGE) & (diagonal > 0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -230,12 +256,13 @@ class TemplateFit:
         self._find_pairs(matrix, rows & ~self.degenerate)
         self.rows = np.flatnonzero(rows & ~self.degenerate & ~self.inseparable)
         matrix = matrix[self.rows][:, self.rows]
-        g = len(white)
-        corner = np.array([[inner(a, b) for b in white] for a in white]).reshape(g, g)
-        corner_rhs = np.array([inner(a, data) for a in white])
-        self.fit, self.flux = None, np.zeros(len(bank.order))
+        corner = inner_products(white, white)
+        corner_rhs = inner_products(white, [data])[:, 0]
+        self.fit = None
+        self.flux = np.zeros(len(bank.order))
         if len(self.rows):
-            rhs, border = projection[self.rows, 0], projection[self.rows, 1:]
+            rhs = projection[self.rows, 0]
+            border = projection[self.rows, 1:]
             self.fit = LinearFit(matrix, rhs, border, corner, corner_rhs)
             self.flux[self.rows] = self.fit.flux
 
@@ -249,16 +276,16 @@ class TemplateFit:
         """
         if self.fit is None or self.settings.errors.size_scatter is None:
             return
-        known = not_fitted(len(self.bank.order))
-        known[: len(fitted)] = fitted
+        shapes = not_fitted(len(self.bank.order))
+        shapes[: len(fitted)] = fitted
         # a point on top of a template leaves open how it is shaped, not whether it is a point
         hosts = self.host[self.bank.order[self.pairs[:, 1]]]
-        known["point"][hosts] = 0.0
+        shapes["point"][hosts] = 0.0
         # positions move no flux to first order, unless there are two components
-        lone = np.setdiff1d(np.arange(len(known)), hosts)
-        known["covariance"][lone, 1:3] = 0.0
-        known["covariance"][lone, :, 1:3] = 0.0
-        self.free = free_templates(self, known[self.bank.order[self.rows]])
+        lone = np.setdiff1d(np.arange(len(shapes)), hosts)
+        shapes["covariance"][lone, 1:3] = 0.0
+        shapes["covariance"][lone, :, 1:3] = 0.0
+        self.free = free_templates(self, shapes[self.bank.order[self.rows]])
         if self.free is not None:
             self.flux[self.rows] = self.free.flux
 
@@ -269,31 +296,31 @@ class TemplateFit:
         second = np.flatnonzero(self.host[order] != order)
         first = row[self.host[order[second]]]
         power = matrix.diagonal()
-        overlap = np.array([matrix[i, j] for i, j in zip(first, second, strict=True)])
-        apart = overlap**2 < _SEPARABLE * power[first] * power[second]
-        apart &= rows[first] & rows[second]
+        overlap = matrix_elements(matrix, first, second)
+        is_separable = overlap**2 < _SEPARABLE * power[first] * power[second]
+        is_separable &= rows[first] & rows[second]
         self.inseparable = np.zeros(len(order), bool)
-        self.inseparable[second[~apart]] = True
+        self.inseparable[second[~is_separable]] = True
         self.degenerate[second] = False
-        self.pairs = np.stack([first, second], axis=1)[apart]
+        self.pairs = np.stack([first, second], axis=1)[is_separable]
 
-    def _find_shift(self, plain, shift):
+    def _find_shift(self, unshifted, shift):
         limit = self.settings.max_shift.value / self.scale
         for _ in range(8):
-            step = self._fit_step(plain.shifted(shift))
-            found = shift + step
-            if np.hypot(*found) > limit:
+            step = self._fit_step(unshifted.shifted(shift))
+            total = shift + step
+            if np.hypot(total[0], total[1]) > limit:
                 msg = (
-                    f"a shift of {np.round(found * self.scale, 3)} arcsec is beyond 'max_shift' "
+                    f"a shift of {np.round(total * self.scale, 3)} arcsec is beyond 'max_shift' "
                     f"{self.settings.max_shift}: measured without a shift"
                 )
                 warn(msg, PhotometryWarning)
-                self._solve(plain, [])
+                self._solve(unshifted, [])
                 return
-            if np.hypot(*step) < 1e-3:
+            if np.hypot(step[0], step[1]) < 1e-3:
                 break
             shift = shift + np.clip(step, -1.0, 1.0)
-        self.shift = found * self.scale
+        self.shift = total * self.scale
 
     def _fit_step(self, bank):
         """Fit with the templates of a bank and a small step of all of them: the step (x, y) in pixels."""
@@ -314,10 +341,13 @@ class TemplateFit:
             self.shift = shift + self._fit_step(self.bank) * self.scale
 
     def displacement(self, xy):
-        """Positions of templates less those of the catalog, (x, y) in pixels."""
+        """Return positions of templates less those of the catalog, (x, y) in pixels."""
         if self.offset_map is not None:
-            return self.offset_map.field(*xy.T) / self.scale
-        shift = np.zeros(2) if self.shift is None else self.shift / self.scale
+            x, y = xy.T
+            return self.offset_map.field(x, y) / self.scale
+        shift = np.zeros(2)
+        if self.shift is not None:
+            shift = self.shift / self.scale
         return np.broadcast_to(shift, xy.shape)
 
     @property
@@ -343,7 +373,8 @@ class TemplateFit:
     @property
     def common(self):
         """The common parameters, shape (g,)."""
-        return (self.fit if self.free is None else self.free.fit).common
+        solution = self.fit if self.free is None else self.free.fit
+        return solution.common
 
     def add_background(self, image, factor=1.0):
         """Add the fitted background, in uJy per pixel, times a factor to an image in place."""
@@ -354,7 +385,7 @@ class TemplateFit:
             image += np.float32(factor * value) * column
 
     def model(self):
-        """The sources' model in uJy per pixel, without background."""
+        """Draw the sources' model in uJy per pixel, without background."""
         image = self.arrays.new()
         layers = [(self.bank, self.flux)]
         if self.free is not None:
@@ -368,24 +399,41 @@ class TemplateFit:
         return image
 
     def residual(self, model):
-        """Image less a model of its sources and less the background, zero where not usable."""
-        found = np.subtract(self.arrays.flux, model, out=self.arrays.new())
-        self.add_background(found, -1.0)
-        found *= self.arrays.usable
-        return found
+        """Subtract a model of the sources, and the background, from the image; zero where not usable."""
+        residual = np.subtract(self.arrays.flux, model, out=self.arrays.new())
+        self.add_background(residual, -1.0)
+        residual *= self.arrays.usable
+        return residual
 
 
-def inner(one, other):
-    """Sum of the products of two images, in double precision."""
-    return float(np.einsum("ij,ij->", one, other, dtype=float, casting="same_kind"))
+def inner(first, second):
+    """Sum the products of two images, in double precision."""
+    return float(np.einsum("ij,ij->", first, second, dtype=float, casting="same_kind"))
+
+
+def inner_products(left, right):
+    """Sum the products of each of some images with each of others, shape (n, m)."""
+    products = np.empty((len(left), len(right)))
+    for i, first in enumerate(left):
+        for j, second in enumerate(right):
+            products[i, j] = inner(first, second)
+    return products
+
+
+def matrix_elements(matrix, rows, columns):
+    """Return elements of a sparse matrix, shape (n,)."""
+    elements = np.zeros(len(rows))
+    for k, (row, column) in enumerate(zip(rows, columns, strict=True)):
+        elements[k] = matrix[row, column]
+    return elements
 
 
 def duplicates(matrix, rows, order):
-    """Templates that equal another one's; the first in the catalog is kept."""
+    """Find templates that equal another one's; the first in the catalog is kept."""
     coo = matrix.tocoo()
     scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
-    same = coo.data > (1 - 1e-6) * scale[coo.row] * scale[coo.col]
-    same &= rows[coo.row] & rows[coo.col] & (order[coo.row] > order[coo.col])
-    found = np.zeros(len(rows), bool)
-    found[coo.row[same]] = True
-    return found
+    is_same = coo.data > (1 - 1e-6) * scale[coo.row] * scale[coo.col]
+    is_same &= rows[coo.row] & rows[coo.col] & (order[coo.row] > order[coo.col])
+    is_duplicate = np.zeros(len(rows), bool)
+    is_duplicate[coo.row[is_same]] = True
+    return is_duplicate

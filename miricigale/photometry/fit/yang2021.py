@@ -14,7 +14,8 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 
 #: The grid of images and templates, and the width of the PSF stamps.
-_PIXEL, _STAMP = 0.06 * u.arcsec, 3.0 * u.arcsec
+_PIXEL = 0.06 * u.arcsec
+_STAMP = 3.0 * u.arcsec
 
 
 class Yang2021Photometer:
@@ -94,8 +95,8 @@ class Yang2021Photometer:
         self._n_threads = n_threads
 
     def __repr__(self):
-        known = f"scaling={self.scaling:.4f}, aperture={self.aperture:.4f}"
-        return f"<Yang2021Photometer {known}, {self.kernel!r}>"
+        factors = f"scaling={self.scaling:.4f}, aperture={self.aperture:.4f}"
+        return f"<Yang2021Photometer {factors}, {self.kernel!r}>"
 
     def measure(self, image, highres, segmentation, catalog):
         """
@@ -120,11 +121,20 @@ class Yang2021Photometer:
             If the image is not on the pixels of ``highres`` (of the same or another extent).
         """
         _require_same_pixels(image, highres)
-        given = highres, segmentation, catalog
-        options = {"template": "cutout", "wings": False, "n_threads": self._n_threads}
-        templates = SourceTemplates.from_images(*given, psf=self.kernel.source, **options)
+        templates = SourceTemplates.from_images(
+            highres,
+            segmentation,
+            catalog,
+            psf=self.kernel.source,
+            template="cutout",
+            wings=False,
+            n_threads=self._n_threads,
+        )
         # T-PHOT takes templates as they are: nothing is taken off for their noise
-        light = [one and dataclasses.replace(one, noise=0.0) for one in templates.light]
+        light = [None] * len(templates)
+        for k, cutout in enumerate(templates.light):
+            if cutout is not None:
+                light[k] = dataclasses.replace(cutout, noise=0.0)
         templates = dataclasses.replace(templates, light=light)
         scaled = image.multiply(self.scaling, handle_meta="first_found")
         result = self._photometer.measure(scaled, templates=templates)
@@ -139,9 +149,10 @@ class Yang2021Photometer:
 def _require_same_pixels(image, highres):
     """Check that pixels of two images coincide, up to a whole number of them."""
     ny, nx = image.shape
-    x, y = np.array([0.0, nx - 1.0, 0.0]), np.array([0.0, 0.0, ny - 1.0])
+    x = np.array([0.0, nx - 1.0, 0.0])
+    y = np.array([0.0, 0.0, ny - 1.0])
     offsets = np.stack(pixel_to_pixel(image.wcs, highres.wcs, x, y)) - [x, y]
-    whole = np.rint(offsets[:, :1])
-    if not np.all(np.abs(offsets - whole) < 0.02):
+    whole_pixels = np.rint(offsets[:, :1])
+    if not np.all(np.abs(offsets - whole_pixels) < 0.02):
         wanted = "on the pixels of 'highres', up to a shift of whole ones"
         raise argument_error("image", wanted, f"offsets of {np.round(offsets, 2).tolist()} pixels")

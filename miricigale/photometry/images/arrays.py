@@ -93,24 +93,25 @@ def image_arrays(image, name, dtype=float):
     `~miricigale.utils.exceptions.PhotometryWarning`
         If areas that are exactly 0 are taken as without data.
     """
-    *given, usable = _checked(image, name)
+    *scaled, usable = _checked(image, name)
     area = _areas(image.wcs, np.empty(usable.shape, dtype))
     # in place, for images can be large
-    flux, sigma = (np.multiply(*one, dtype=dtype, casting="same_kind") for one in given)
+    flux, sigma = (np.multiply(*values, dtype=dtype, casting="same_kind") for values in scaled)
     # a surface brightness, and not the flux in each pixel
     if not image.unit.is_equivalent(FNU):
         flux *= area
         sigma *= area
-    flux[~usable], sigma[~usable] = 0.0, np.inf
+    flux[~usable] = 0.0
+    sigma[~usable] = np.inf
     return ImageArrays(flux, sigma, usable, area, image.wcs)
 
 
 def fit_arrays(image, name):
     """Take a `~astropy.nddata.CCDData` apart for a fit of templates; see `image_arrays`."""
-    one = image_arrays(image, name, np.float32)
-    inverse = np.divide(np.float32(1), one.sigma, out=one.sigma)
+    arrays = image_arrays(image, name, np.float32)
+    inverse = np.divide(np.float32(1), arrays.sigma, out=arrays.sigma)
     facts = image.uncertainty is None, ImageFacts.of(image).noise_correction
-    return FitArrays(one.flux, inverse, one.usable, one.wcs, *facts)
+    return FitArrays(arrays.flux, inverse, arrays.usable, arrays.wcs, *facts)
 
 
 def _checked(image, name):
@@ -135,9 +136,9 @@ def _checked(image, name):
         negative = np.count_nonzero(np.asarray(image.uncertainty.array)[usable] < 0)
         wanted = "an image with uncertainties of 0 (no data) or more"
         check_that(not negative, name, wanted, f"{negative} pixels below 0")
-        given = image.uncertainty.represent_as(StdDevUncertainty)
-        scale = factor if given.unit is None else (1 * given.unit).to_value(unit)
-        noise = np.asarray(given.array), float(scale)
+        sigma = image.uncertainty.represent_as(StdDevUncertainty)
+        scale = factor if sigma.unit is None else (1 * sigma.unit).to_value(unit)
+        noise = np.asarray(sigma.array), float(scale)
     usable &= np.isfinite(noise[0]) & (noise[0] > 0)
     mask_filled(data, usable, f"'{name}'")
     check_that(usable.any(), name, "an image with usable pixels", "none (masked, NaN or no noise)")
@@ -149,11 +150,22 @@ def pixel_scale(wcs):
     return float(np.sqrt(np.prod(proj_plane_pixel_scales(wcs.celestial))) * 3600.0)
 
 
-def same_grid(one, other):
+def lengths(vectors):
+    """Return the lengths of vectors (x, y), shape (n, 2)."""
+    return np.hypot(vectors[:, 0], vectors[:, 1])
+
+
+def pixels_to_sky(xy, wcs):
+    """Return the coordinates of pixels (x, y), shape (n, 2)."""
+    return wcs.pixel_to_world(xy[:, 0], xy[:, 1])
+
+
+def same_grid(first, second):
     """Whether two WCSs put a square of pixels at the same places (to 1e-3 pixel)."""
-    x, y = np.array([0.0, 1000.0, 0.0, 1000.0]), np.array([0.0, 0.0, 1000.0, 1000.0])
-    found = other.world_to_pixel(one.pixel_to_world(x, y))
-    return bool(np.all(np.abs(np.array(found) - [x, y]) < 1e-3))
+    x = np.array([0.0, 1000.0, 0.0, 1000.0])
+    y = np.array([0.0, 0.0, 1000.0, 1000.0])
+    place = second.world_to_pixel(first.pixel_to_world(x, y))
+    return bool(np.all(np.abs(np.array(place) - [x, y]) < 1e-3))
 
 
 def fine_wcs(image_wcs, shape, scale):
@@ -172,9 +184,9 @@ def sky_pixels(sky, wcs, shape, margin):
     ny, nx = shape
     middle = wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2)
     radius = 1.05 * (np.hypot(nx, ny) / 2 + margin) * pixel_scale(wcs)
-    near = sky.separation(middle).arcsec < radius
-    if near.any():
-        xy[near] = np.stack(wcs.world_to_pixel(sky[near]), axis=-1)
+    is_near = sky.separation(middle).arcsec < radius
+    if is_near.any():
+        xy[is_near] = np.stack(wcs.world_to_pixel(sky[is_near]), axis=-1)
     low = -0.5 - margin
     x, y = xy.T
     # a NaN fails every comparison

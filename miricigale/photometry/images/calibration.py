@@ -34,15 +34,15 @@ def parsed_unit(text):
     flux = flux_unit(text) if text else None
     if isinstance(flux, u.UnitBase):
         return flux
-    plain = text
+    replaced = text
     for pattern, name in _COUNTS:
-        plain = re.sub(pattern, name, plain, flags=re.IGNORECASE)
+        replaced = re.sub(pattern, name, replaced, flags=re.IGNORECASE)
     # S alone would be siemens
-    for one in (plain, text) if text else ():
+    for name in (replaced, text) if text else ():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", u.UnitsWarning)
             with contextlib.suppress(TypeError, ValueError):
-                unit = u.Unit(one)
+                unit = u.Unit(name)
                 pixels = dict(zip(unit.bases, unit.powers, strict=True)).get(u.pix, 0)
                 return unit / u.pix**pixels
     return None
@@ -79,34 +79,45 @@ def calibration(path, text, zero_point, keywords):
         zero = ab_quantity(zero_point).to(u.ABmag)
         check_that(np.isfinite(zero), "zero_point", "a finite AB magnitude", zero_point)
         return zero.to(u.MJy), f"zero point {zero.value:g} AB"
-    what = f"must state the unit of its pixels ('unit' or 'zero_point'); what it states is {text!r}"
-    check_data(unit is not None and not unit.is_equivalent(u.dimensionless_unscaled), path, what)
-    time, said = 1.0, ""
+    problem = (
+        f"must state the unit of its pixels ('unit' or 'zero_point'); what it states is {text!r}"
+    )
+    check_data(unit is not None and not unit.is_equivalent(u.dimensionless_unscaled), path, problem)
+    time = 1.0
+    said = ""
     if any(unit.is_equivalent(base) for base in _BASES):
         time = keywords["EXPTIME"]
-        what = "no rate, and its header no EXPTIME: counts need 'zero_point'"
-        check_data(time and time > 0, path, f"has pixels in {unit}, {what}")
-        unit, said = unit / u.s, f", EXPTIME {time:g} s"
+        problem = "no rate, and its header no EXPTIME: counts need 'zero_point'"
+        check_data(time and time > 0, path, f"has pixels in {unit}, {problem}")
+        unit = unit / u.s
+        said = f", EXPTIME {time:g} s"
     rate = next((base / u.s for base in _BASES if unit.is_equivalent(base / u.s)), None)
-    what = "and wanted is a surface brightness, a flux, counts or a rate of counts"
-    check_data(rate is not None, path, f"has pixels in {unit}, {what}")
+    problem = "and wanted is a surface brightness, a flux, counts or a rate of counts"
+    check_data(rate is not None, path, f"has pixels in {unit}, {problem}")
     scale = unit.to(rate) / time
-    found = _header_calibrations(keywords)
-    what = "has both PHOTMJSR and PHOTFLAM" if found else "has neither PHOTMJSR nor PHOTFLAM"
-    check_data(len(found) == 1, path, f"has pixels in {unit}, its header {what}: give 'zero_point'")
-    name, factor = found[0]
+    calibrations = _header_calibrations(keywords)
+    problem = (
+        "has both PHOTMJSR and PHOTFLAM" if calibrations else "has neither PHOTMJSR nor PHOTFLAM"
+    )
+    check_data(
+        len(calibrations) == 1,
+        path,
+        f"has pixels in {unit}, its header {problem}: give 'zero_point'",
+    )
+    name, factor = calibrations[0]
     return factor * scale, name + said
 
 
 def _header_calibrations(keywords):
     """Brightness or flux of one count a second, by each calibration that a header has."""
-    found = []
+    calibrations = []
     value = keywords["PHOTMJSR"]
     if value:
-        found.append((f"PHOTMJSR {value:.6g}", float(value) * SURFACE_BRIGHTNESS))
-    value, pivot = keywords["PHOTFLAM"], keywords["PHOTPLAM"]
+        calibrations.append((f"PHOTMJSR {value:.6g}", float(value) * SURFACE_BRIGHTNESS))
+    value = keywords["PHOTFLAM"]
+    pivot = keywords["PHOTPLAM"]
     if value and pivot:
         flam = float(value) * u.erg / (u.s * u.cm**2 * u.AA)
         flux = flam.to(u.MJy, u.spectral_density(float(pivot) * u.AA))
-        found.append((f"PHOTFLAM {value:.6g}, PHOTPLAM {pivot:.6g}", flux))
-    return found
+        calibrations.append((f"PHOTFLAM {value:.6g}, PHOTPLAM {pivot:.6g}", flux))
+    return calibrations

@@ -46,8 +46,8 @@ def grid_text(wcs):
     header = {c.keyword: c.value for c in cards if c.keyword not in ("COMMENT", "HISTORY", "")}
     text = json.dumps({"header": header, **exact})
     x = y = np.array([0.0, 1000.0])
-    again = text_grid(text).pixel_to_world_values(x, y)
-    if not np.allclose(again, wcs.pixel_to_world_values(x, y), rtol=0, atol=1e-9):
+    restored = text_grid(text).pixel_to_world_values(x, y)
+    if not np.allclose(restored, wcs.pixel_to_world_values(x, y), rtol=0, atol=1e-9):
         raise argument_error("wcs", "one that a FITS header can hold", f"{wcs!r}")
     return text
 
@@ -116,8 +116,8 @@ def extension_index(hdus, extension, path):
     try:
         return hdus.index_of(wanted)
     except (KeyError, IndexError):
-        known = [hdu.name if hdu.ver == 1 else f"{hdu.name},{hdu.ver}" for hdu in hdus]
-        raise data_error(path, f"has no such extension, only {known}") from None
+        names = [hdu.name if hdu.ver == 1 else f"{hdu.name},{hdu.ver}" for hdu in hdus]
+        raise data_error(path, f"has no such extension, only {names}") from None
 
 
 def find_image(hdus, extension, path, names, *, no_images=()):
@@ -156,14 +156,14 @@ def find_image(hdus, extension, path, names, *, no_images=()):
     if not named:
         _check_no_cube(hdus, path, names)
         images = [k for k in images if hdus[k].name not in no_images]
-    found = named or images[:1]
+    candidates = named or images[:1]
     shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
-    check_data(found, path, f"has no two-dimensional image, only {shapes}")
-    name = hdus[found[0]].name
-    count = len(found)
-    what = f"has {count} extensions {name}; say which as {path}[{name},2] or {path}[NUMBER]"
-    check_data(count <= 1, path, what)
-    return found[0]
+    check_data(candidates, path, f"has no two-dimensional image, only {shapes}")
+    name = hdus[candidates[0]].name
+    count = len(candidates)
+    problem = f"has {count} extensions {name}; say which as {path}[{name},2] or {path}[NUMBER]"
+    check_data(count <= 1, path, problem)
+    return candidates[0]
 
 
 def _check_no_cube(hdus, path, names):
@@ -191,11 +191,13 @@ def open_map(path, wanted, role, names, image):
     with open_image(path, wanted) as (hdus, extension):
         hdu = hdus[find_image(hdus, extension, path, names)]
         own_shape = plane_shape(hdu)
-        what = f"({role}) has the shape {own_shape}, {image_path} {shape}: not on the same pixels"
-        check_data(own_shape == shape, path, what)
-        own = image_wcs(hdu.header, hdus)
-        if own is not None:
-            check_same_grid(own, wcs, shape, path, image_path)
+        problem = (
+            f"({role}) has the shape {own_shape}, {image_path} {shape}: not on the same pixels"
+        )
+        check_data(own_shape == shape, path, problem)
+        map_wcs = image_wcs(hdu.header, hdus)
+        if map_wcs is not None:
+            check_same_grid(map_wcs, wcs, shape, path, image_path)
         yield hdu
 
 
@@ -221,10 +223,12 @@ def cut_wcs(wcs, section, path):
         If they have distortions by tables, which cannot be cut.
     """
     cut = wcs.slice(section)
-    y, x = (np.array([0.0, one.stop - one.start - 1.0]) for one in section)
-    there = wcs.pixel_to_world(x + section[1].start, y + section[0].start)
-    what = "has coordinates with tables of distortion, and cannot be read in parts"
-    check_data(np.all(cut.pixel_to_world(x, y).separation(there) < 1e-4 * u.arcsec), path, what)
+    y, x = (np.array([0.0, axis.stop - axis.start - 1.0]) for axis in section)
+    corners = wcs.pixel_to_world(x + section[1].start, y + section[0].start)
+    problem = "has coordinates with tables of distortion, and cannot be read in parts"
+    check_data(
+        np.all(cut.pixel_to_world(x, y).separation(corners) < 1e-4 * u.arcsec), path, problem
+    )
     return cut
 
 
@@ -244,9 +248,9 @@ def check_same_grid(wcs, reference, shape, path, reference_path):
     ny, nx = shape
     x = np.array([0, nx - 1, 0, nx - 1, (nx - 1) / 2])
     y = np.array([0, 0, ny - 1, ny - 1, (ny - 1) / 2])
-    there = pixel_to_pixel(reference, wcs, x, y)
-    distance = np.hypot(there[0] - x, there[1] - y)
+    place = pixel_to_pixel(reference, wcs, x, y)
+    distance = np.hypot(place[0] - x, place[1] - y)
     if not np.all(distance <= 0.1):
         far = np.nanmax(distance) if np.isfinite(distance).any() else np.inf
-        what = f"is not on the pixels of {reference_path}: by their coordinates up to {far:.4g} pixels apart"
-        raise data_error(path, what)
+        problem = f"is not on the pixels of {reference_path}: by their coordinates up to {far:.4g} pixels apart"
+        raise data_error(path, problem)

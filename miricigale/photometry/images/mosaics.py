@@ -196,10 +196,8 @@ class MosaicFile:
     def __post_init__(self):
         if self.filter is not None:
             object.__setattr__(self, "filter", find_filter(str(self.filter)) or str(self.filter))
-        given = [name for name in NOISE_MAPS if getattr(self, name) is not None]
-        check_that(
-            len(given) <= 1, ", ".join(NOISE_MAPS), "at most one of them", " and ".join(given)
-        )
+        maps = [name for name in NOISE_MAPS if getattr(self, name) is not None]
+        check_that(len(maps) <= 1, ", ".join(NOISE_MAPS), "at most one of them", " and ".join(maps))
         if self.background_box is not None and not self.background_box >= 1:
             raise argument_error("background_box", "at least 1 pixel", self.background_box)
 
@@ -217,13 +215,14 @@ class MosaicFile:
         """
         with open_image(self.path, "an image") as (hdus, extension):
             index = find_image(hdus, extension, self.path, ("SCI",), no_images=PLANES)
-            header, first = hdus[index].header, hdus[0].header
+            header = hdus[index].header
+            first = hdus[0].header
             wcs = image_wcs(header, hdus)
             shape = plane_shape(hdus[index])
         check_data(wcs is not None, self.path, "has no celestial coordinates (WCS) in its header")
         if self.section is not None:
             wcs = cut_wcs(wcs, self.section, self.path)
-            shape = tuple(one.stop - one.start for one in self.section)
+            shape = tuple(axis.stop - axis.start for axis in self.section)
 
         def get(key):
             return header.get(key, first.get(key))
@@ -237,33 +236,33 @@ class MosaicFile:
         good = self.filter is None or name in (None, self.filter)
         check_that(good, "filter", f"{name!r}, the filter in {self.path}", repr(self.filter))
         # a mosaic of our own has a list of angles
-        stated = {
+        values = {
             "filter": self.filter or name,
             "pa_aper": get("PA_APER"),
             "subarray": get("SUBARRAY"),
         }
-        stated = {key: meta.get(key) if value is None else value for key, value in stated.items()}
+        values = {key: meta.get(key) if value is None else value for key, value in values.items()}
         return MosaicHeader(
             index=index,
             shape=shape,
             wcs=wcs,
-            filter=stated["filter"],
-            pa_aper=self._checked_angle(stated["pa_aper"]),
+            filter=values["filter"],
+            pa_aper=self._checked_angle(values["pa_aper"]),
             unit=_unit_of(header) if self.unit is None else str(self.unit),
             exposure=is_exposure(get),
             keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM", "EXPTIME")},
-            meta={**meta, **{key: value for key, value in stated.items() if value is not None}},
+            meta={**meta, **{key: value for key, value in values.items() if value is not None}},
         )
 
-    def _checked_angle(self, stated):
+    def _checked_angle(self, header_angle):
         """The position angle that was given or that the header states (deg, or None), which must agree."""
-        stated = None if stated is None else np.asarray(stated, float) * u.deg
+        header_angle = None if header_angle is None else np.asarray(header_angle, float) * u.deg
         if self.pa_aper is None:
-            return stated
+            return header_angle
         angle = float(to_array(self.pa_aper, u.deg, "pa_aper", finite=True)) * u.deg
-        apart = 0.0 if stated is None else (angle - stated).to_value(u.deg)
-        if np.max(np.abs((apart + 180) % 360 - 180)) > 1:
-            wanted = f"PA_APER of {self.path}, {np.round(stated.value, 2)} deg"
+        difference = 0.0 if header_angle is None else (angle - header_angle).to_value(u.deg)
+        if np.max(np.abs((difference + 180) % 360 - 180)) > 1:
+            wanted = f"PA_APER of {self.path}, {np.round(header_angle.value, 2)} deg"
             raise argument_error("pa_aper", wanted, angle)
         return angle
 
@@ -341,8 +340,8 @@ class MosaicFile:
             meta["n_filled"] = filled
         if self.section is not None and not usable.any():
             return None
-        what = "has no usable pixel: all are masked, not finite or without weight"
-        check_data(usable.any(), self.path, what)
+        problem = "has no usable pixel: all are masked, not finite or without weight"
+        check_data(usable.any(), self.path, problem)
         data *= factor
         if added is not None:
             data += added
@@ -368,8 +367,8 @@ class MosaicFile:
                 warn(msg, PhotometryWarning)
             meta["noise_scale"] = float(f"{scale:.6g}")
         if kind == "weight":
-            what = "has weights of unknown scale, for its sky is constant"
-            check_data(scale > 0, self.path, what)
+            problem = "has weights of unknown scale, for its sky is constant"
+            check_data(scale > 0, self.path, problem)
             meta["weight_scale"] = meta["noise_scale"]
             sigma *= sigma.dtype.type(scale)
         meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
@@ -386,15 +385,15 @@ class MosaicFile:
     def _noise_map(self, hdus, header, usable):
         """Kind, values and place of the map of the noise; the kind is None if there is none."""
         # a unit given by the caller holds for the map too
-        stated = "" if self.unit is not None else header.unit
+        stated_unit = "" if self.unit is not None else header.unit
         for kind, names in NOISE_MAPS.items():
             path = getattr(self, kind)
             if path is None:
                 continue
-            whole = self.replace(section=None).header
-            image = whole.shape, whole.wcs, self.path
-            what = f"a map of the {kind.replace('_', ' ')}", f"the {kind} of {self.path}"
-            with open_map(path, *what, names, image) as hdu:
+            whole_header = self.replace(section=None).header
+            image = whole_header.shape, whole_header.wcs, self.path
+            roles = f"a map of the {kind.replace('_', ' ')}", f"the {kind} of {self.path}"
+            with open_map(path, *roles, names, image) as hdu:
                 own_kind = noise_kind(hdu)
                 # inverse variances are weights too
                 is_other = own_kind not in (None, kind) and {own_kind, kind} != {
@@ -406,10 +405,10 @@ class MosaicFile:
                     wanted = f"a map of the {kind.replace('_', ' ')}"
                     got = f"{path}, whose extension is {said}: give it as '{own_kind}'"
                     raise argument_error(kind, wanted, got)
-                return kind, self._in_unit(hdu, kind, stated, path), str(path)
-        return self._own_noise_map(hdus, header, usable, stated)
+                return kind, self._in_unit(hdu, kind, stated_unit, path), str(path)
+        return self._own_noise_map(hdus, header, usable, stated_unit)
 
-    def _own_noise_map(self, hdus, header, usable, stated):
+    def _own_noise_map(self, hdus, header, usable, stated_unit):
         """As `_noise_map`, of the image's own file."""
         shape = plane_shape(hdus[header.index])
         empty = []
@@ -418,7 +417,7 @@ class MosaicFile:
                 empty.append(f"{hdu.name} (no data)")
                 continue
             check_plane(hdu, shape, self.path, f"a map of the {kind.replace('_', ' ')}")
-            values = self._in_unit(hdu, kind, stated, f"{self.path}[{hdu.name}]")
+            values = self._in_unit(hdu, kind, stated_unit, f"{self.path}[{hdu.name}]")
             if not self._has_noise(values, usable, hdu):
                 empty.append(f"{hdu.name} (nowhere finite and above 0)")
                 continue
@@ -429,28 +428,28 @@ class MosaicFile:
         parts = [companion(hdus, header.index, name) for name in VARIANCE_PARTS]
         parts = [hdu for hdu in parts if hdu is not None and plane_shape(hdu) == shape]
         if parts:
-            planes = [self._in_unit(hdu, "variance", stated, self.path) for hdu in parts]
+            planes = [self._in_unit(hdu, "variance", stated_unit, self.path) for hdu in parts]
             total = np.sum([np.where(np.isfinite(plane), plane, 0) for plane in planes], axis=0)
             if self._has_noise(total, usable, None):
                 names = " + ".join(hdu.name for hdu in parts)
                 return "variance", total.astype(planes[0].dtype), f"extensions {names}"
         if any("nowhere" in text for text in empty):
-            what = f"holds no noise in {', '.join(empty)}, and no other map of it"
+            problem = f"holds no noise in {', '.join(empty)}, and no other map of it"
             raise data_error(
-                self.path, f"{what}: give 'error', 'variance' or 'weight', or remove it"
+                self.path, f"{problem}: give 'error', 'variance' or 'weight', or remove it"
             )
         return None, None, None
 
     def _has_noise(self, values, usable, hdu):
         """Whether a map of the noise has a value above 0 (or one below, which is refused later)."""
-        where = np.isfinite(values) & (values != 0)
-        if np.any(where):
+        has_value = np.isfinite(values) & (values != 0)
+        if np.any(has_value):
             return True
         if self.section is None or hdu is None or not np.any(usable):
             # a part without data says nothing of the map
             return self.section is not None
-        whole = plane_data(hdu)
-        return bool(np.any(np.isfinite(whole) & (whole != 0)))
+        plane = plane_data(hdu)
+        return bool(np.any(np.isfinite(plane) & (plane != 0)))
 
     def _marked_good(self, hdus, index, meta):
         """Pixels that no extension of marks or weights excludes; notes the scheme of the bits in ``meta``."""
@@ -484,7 +483,8 @@ class MosaicFile:
         values = _native(plane_data(hdu, self.section))
         text = _unit_of(hdu.header)
         power = _POWERS.get(kind)
-        have, wanted = parsed_unit(text), parsed_unit(unit)
+        have = parsed_unit(text)
+        wanted = parsed_unit(unit)
         # headers of many variance maps state the unit of the image itself
         if None in (power, have, wanted) or have in (wanted, wanted**power):
             return values
@@ -492,8 +492,8 @@ class MosaicFile:
             factor = have.to(wanted**power)
         except u.UnitConversionError:
             role = kind.replace("_", " ")
-            what = f"(the {role}) is in {text!r}, the image in {unit!r}: give 'unit' if a header is wrong"
-            raise data_error(path, what) from None
+            problem = f"(the {role}) is in {text!r}, the image in {unit!r}: give 'unit' if a header is wrong"
+            raise data_error(path, problem) from None
         _log.info("%s: from %s to %s", path, have, wanted**power)
         return values * values.dtype.type(factor)
 

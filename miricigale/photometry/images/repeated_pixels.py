@@ -36,32 +36,33 @@ def own_pixels(image):
         return image
     ends = [_first_lines(lines) for lines in (data, data.T)]
     n = np.diff(ends[0])[0]
-    if n == 1 or any(np.any(np.diff(one) != n) for one in ends):
+    if n == 1 or any(np.any(np.diff(lines) != n) for lines in ends):
         return image
     msg = f"the image has each of its pixels {n} x {n} times: it is measured on the pixels that it had before"
     warn(msg, PhotometryWarning)
-    first = [one[0] % n for one in ends]
+    first = [lines[0] % n for lines in ends]
     part = tuple(
         slice(k, k + (size - k) // n * n, n) for k, size in zip(first, data.shape, strict=True)
     )
     # a flux in a pixel is that of all its copies
     factor = n**2 if image.unit.is_equivalent(u.Jy) else 1
-    more = {"unit": image.unit, "wcs": image.wcs.slice(part)}
-    more["meta"] = {**image.meta, "repeated_pixels": int(n)}
+    parts = {"unit": image.unit, "wcs": image.wcs.slice(part)}
+    parts["meta"] = {**image.meta, "repeated_pixels": int(n)}
     if image.mask is not None:
-        more["mask"] = image.mask[part]
+        parts["mask"] = image.mask[part]
     if image.uncertainty is not None:
         noise = image.uncertainty.represent_as(StdDevUncertainty).array[part]
-        more["uncertainty"] = StdDevUncertainty(noise * factor)
-    return Image(data[part] * factor, **more)
+        parts["uncertainty"] = StdDevUncertainty(noise * factor)
+    return Image(data[part] * factor, **parts)
 
 
 def _first_lines(lines):
     """Numbers of the lines, from 1 on, with other values than the one before."""
-    some = np.asarray(lines[:, :: max(1, lines.shape[1] // 256)], float)
-    step, size = np.abs(np.diff(some, axis=0)), np.abs(some[1:])
+    sampled = np.asarray(lines[:, :: max(1, lines.shape[1] // 256)], float)
+    step = np.abs(np.diff(sampled, axis=0))
+    size = np.abs(sampled[1:])
     # a solid angle that changes by 1e-6 may have been divided out
     with np.errstate(invalid="ignore"):
         alike = np.sum(step <= 1e-5 * size, axis=1, where=size > 0)
-        known = np.sum(np.isfinite(step) & (size > 0), axis=1)
-    return np.flatnonzero(alike < 0.9 * np.maximum(known, 1)) + 1
+        n_known = np.sum(np.isfinite(step) & (size > 0), axis=1)
+    return np.flatnonzero(alike < 0.9 * np.maximum(n_known, 1)) + 1

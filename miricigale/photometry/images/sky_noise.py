@@ -11,7 +11,8 @@ from miricigale.utils.units import FNU
 _FILLED = 25
 
 #: Of what is no sky: the Gaussian that smooths, and the rim (pixels).
-_WIDTH, _RIM = 2.0, 3
+_WIDTH = 2.0
+_RIM = 3
 
 
 def weight_scale(data, weight, *, mask=None):
@@ -45,7 +46,8 @@ def weight_scale(data, weight, *, mask=None):
     >>> round(weight_scale(data, weight), 2)
     0.59
     """
-    data, weight = np.asarray(data, float), np.asarray(weight, float)
+    data = np.asarray(data, float)
+    weight = np.asarray(weight, float)
     if data.ndim != 2 or data.shape != weight.shape:
         raise argument_error("weight", f"of the image's shape {data.shape}", weight.shape)
     usable = np.isfinite(data) & np.isfinite(weight) & (weight > 0)
@@ -72,21 +74,21 @@ def filled_areas(values, usable):
     large = np.bincount(labels.ravel(), minlength=n + 1) >= _FILLED
     large[0] = False
     filled = large[labels]
-    beside = scipy.ndimage.binary_dilation(filled, iterations=2) & usable & (values != 0)
-    others = usable & (values != 0)
-    if np.count_nonzero(beside) < 8:
+    is_beside = scipy.ndimage.binary_dilation(filled, iterations=2) & usable & (values != 0)
+    is_other = usable & (values != 0)
+    if np.count_nonzero(is_beside) < 8:
         return np.zeros_like(usable)
-    noise = [np.median(np.abs(values[where])) for where in (beside, others)]
+    noise = [np.median(np.abs(values[members])) for members in (is_beside, is_other)]
     return filled if noise[0] > 0.1 * noise[1] else np.zeros_like(usable)
 
 
-def mask_filled(values, usable, what):
+def mask_filled(values, usable, name):
     """Take `filled_areas` off the usable pixels, in place, with a warning; their number."""
     filled = filled_areas(values, usable)
     n = int(np.count_nonzero(filled))
     if n:
         msg = (
-            f"{what} has {n} pixels in areas that are exactly 0, though not masked, beside pixels with "
+            f"{name} has {n} pixels in areas that are exactly 0, though not masked, beside pixels with "
             "noise: they are taken as without data"
         )
         warn(msg, PhotometryWarning)
@@ -124,19 +126,19 @@ def sky_noise(values, usable, *, significance=3.5):
     # as a mean of the usable pixels
     smooth = smooth / np.maximum(weight, 0.05)
     structure = scipy.ndimage.generate_binary_structure(2, 1)
-    free = usable
+    is_free = usable
     for _ in range(12):
-        level, rms = _median_rms(smooth[free])
+        level, rms = _median_rms(smooth[is_free])
         bright = usable & (np.abs(smooth - level) > significance * rms)
         bright = scipy.ndimage.binary_dilation(bright, structure, iterations=_RIM)
-        found = usable & ~bright
+        is_sky = usable & ~bright
         # an image that is full of light is measured as it is
-        if np.count_nonzero(found) < max(100, 0.02 * np.count_nonzero(usable)):
+        if np.count_nonzero(is_sky) < max(100, 0.02 * np.count_nonzero(usable)):
             break
-        if np.array_equal(found, free):
+        if np.array_equal(is_sky, is_free):
             break
-        free = found
-    return *_median_rms(values[free]), free
+        is_free = is_sky
+    return *_median_rms(values[is_free]), is_free
 
 
 def _median_rms(values):
@@ -158,20 +160,22 @@ def warn_of_background(result, kernel):
     """
     residual = result.residual_image
     # rows of large images are as good as all
-    some = np.s_[:: max(1, residual.data.size // 10_000_000)]
-    sigma, data = residual.uncertainty.array[some], residual.data[some]
+    step = np.s_[:: max(1, residual.data.size // 10_000_000)]
+    sigma = residual.uncertainty.array[step]
+    data = residual.data[step]
     with np.errstate(invalid="ignore"):
-        free = ~residual.mask[some] & (np.abs(result.model_image.data[some]) < 0.3 * sigma)
+        is_free = ~residual.mask[step] & (np.abs(result.model_image.data[step]) < 0.3 * sigma)
     error = result.flux_err[np.isfinite(result.flux_err)]
-    if np.count_nonzero(free) < 400 or not len(error):
+    if np.count_nonzero(is_free) < 400 or not len(error):
         return
-    level = float(_median(data[free])) * residual.unit
+    level = float(_median(data[is_free])) * residual.unit
     # solid angle over which a fit of the PSF adds up a constant
     target = kernel.target
     area = target.sum() ** 2 / np.sum(target**2) * kernel.pixel_scale**2
-    added, error = (level * area).to(FNU), np.median(error)
+    added = (level * area).to(FNU)
+    error = np.median(error)
     # the errors of an image without noise are those of its model
-    if abs(added) > error and abs(level.value) > 0.05 * _median(sigma[free]):
+    if abs(added) > error and abs(level.value) > 0.05 * _median(sigma[is_free]):
         msg = (
             f"'image' has a background of {level:.3g} between the sources, which is not fitted and adds about "
             f"{added:.3g} to fluxes whose median error is {error:.3g}: subtract it, or give 'background_order'"
@@ -186,10 +190,10 @@ def warn_of_sky(arrays, segments):
     If, that is, the median beyond the segments is more than 0.03 of the light of the median segment of
     signal-to-noise above 5.
     """
-    free = arrays.usable & (segments == 0)
-    if np.count_nonzero(free) < 400:
+    is_free = arrays.usable & (segments == 0)
+    if np.count_nonzero(is_free) < 400:
         return
-    level = _median(arrays.flux[free])
+    level = _median(arrays.flux[is_free])
     member = arrays.usable & (segments > 0)
     label = segments[member]
     light, variance = (
@@ -201,7 +205,7 @@ def warn_of_sky(arrays, segments):
     part = float(np.median((level * np.bincount(label))[good] / light[good]))
     if abs(part) > 0.03:
         msg = (
-            f"'highres' has a sky of {level / _median(arrays.sigma[free]):.3g} times its noise, "
+            f"'highres' has a sky of {level / _median(arrays.sigma[is_free]):.3g} times its noise, "
             f"{part:.0%} of the light of the median segment: it goes into the templates; subtract it"
         )
         warn(msg, PhotometryWarning)

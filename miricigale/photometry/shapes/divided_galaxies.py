@@ -15,7 +15,9 @@ _PART_OF_CLAIM = 0.2
 
 #: Smoothed brightness on the border of two segments above which one of them is no source of its own: in units of
 #: the noise, and of its peak; and standard deviations by which noise alone makes a peak higher.
-_BORDER_SNR, _PART_OF_PEAK, _PEAK_NOISE = 5.0, 0.95, 2.0
+_BORDER_SNR = 5.0
+_PART_OF_PEAK = 0.95
+_PEAK_NOISE = 2.0
 
 #: Least chi^2 of a profile on other sources' segments: less is no more than noise.
 _SEEN = 25.0
@@ -24,7 +26,7 @@ _SEEN = 25.0
 _NEGLIGIBLE = 1e-7
 
 
-def continued_groups(models, sources, segments, variance, others, smooth):
+def continued_groups(models, sources, segments, variance, is_source, smooth):
     """
     Find segments that are continued by others: the smoothed image has no peak inside of them.
 
@@ -34,14 +36,14 @@ def continued_groups(models, sources, segments, variance, others, smooth):
     Parameters
     ----------
     models : list
-        For each source its model, with ``around`` (slices) and ``image`` (its light there); None without.
+        For each source its model, with ``stamp`` (slices) and ``image`` (its light there); None without.
     sources : list of tuple
         Label and position (x, y) of each.
     segments : object
         With ``labels``, shape (ny, nx), and ``totals``, the light of each label.
     variance : `~numpy.ndarray`, shape (ny, nx)
         Of the pixels, infinite where not usable.
-    others : bool `~numpy.ndarray`
+    is_source : bool `~numpy.ndarray`
         For each label whether it is a source and no peak of the noise.
     smooth : tuple
         The smoothed image, shape (ny, nx), and its noise over that of the pixels.
@@ -51,14 +53,15 @@ def continued_groups(models, sources, segments, variance, others, smooth):
     groups : list of list of int
         Numbers of the sources of each galaxy, two at least, ascending.
     """
+    smooth_image, gain = smooth
 
     def links(model, label):
-        return _Piece(model, label, segments, variance, others).continued(*smooth)
+        return _Piece(model, label, segments, variance, is_source).continued(smooth_image, gain)
 
-    return _groups(models, sources, others, links)
+    return _groups(models, sources, is_source, links)
 
 
-def claimed_groups(models, sources, segments, variance, others, smooth):
+def claimed_groups(models, sources, segments, variance, is_source, smooth):
     """
     Find sources whose profiles claim the light of others.
 
@@ -70,87 +73,93 @@ def claimed_groups(models, sources, segments, variance, others, smooth):
     """
 
     def links(model, label):
-        return _Piece(model, label, segments, variance, others).claimed()
+        return _Piece(model, label, segments, variance, is_source).claimed()
 
-    return _groups(models, sources, others, links)
+    return _groups(models, sources, is_source, links)
 
 
-def _groups(models, sources, others, links):
-    """Sources that are linked by labels, which ``links(model, label)`` lists."""
-    rows = {
-        int(label): k
-        for k, ((label, _), model) in enumerate(zip(sources, models, strict=True))
-        if model is not None and others[label]
-    }
+def _groups(models, sources, is_source, links):
+    """Group sources that are linked by labels, which ``links(model, label)`` lists."""
+    rows = {}
+    for k, (label, _) in enumerate(sources):
+        if models[k] is not None and is_source[label]:
+            rows[int(label)] = k
     groups = {k: [k] for k in rows.values()}
     for label, k in rows.items():
-        for other in links(models[k], label):
-            if other not in rows:
+        for linked in links(models[k], label):
+            if linked not in rows:
                 continue
-            group, more = groups[k], groups[rows[other]]
-            if group is not more:
-                group.extend(more)
-                groups.update(dict.fromkeys(more, group))
+            group = groups[k]
+            linked_group = groups[rows[linked]]
+            if group is not linked_group:
+                group.extend(linked_group)
+                groups.update(dict.fromkeys(linked_group, group))
     return [sorted(group) for k, group in groups.items() if len(group) > 1 and min(group) == k]
 
 
-def reaching_over(models, sources, segments, variance, others, smooth):
+def reaching_over(models, sources, segments, variance, is_source, smooth):
     """
-    Numbers of the sources whose profiles have more light on others' segments than on their own and on the sky.
+    Find the sources whose profiles have more light on others' segments than on their own and on the sky.
 
     Parameters are those of `continued_groups`.
     """
-    found = set()
+    reaching = set()
     for k, ((label, _), model) in enumerate(zip(sources, models, strict=True)):
-        if model is not None and _Piece(model, label, segments, variance, others).reaches_over:
-            found.add(k)
-    return found
+        if model is not None and _Piece(model, label, segments, variance, is_source).reaches_over:
+            reaching.add(k)
+    return reaching
 
 
 class _Piece:
     """A source that may be a piece of a galaxy, on its stamp."""
 
-    def __init__(self, model, label, segments, variance, others):
-        self._model, self._n_labels = model, len(segments.totals)
-        self._labels, self._variance = segments.labels[model.around], variance[model.around]
+    def __init__(self, model, label, segments, variance, is_source):
+        self._model = model
+        self._n_labels = len(segments.totals)
+        self._labels = segments.labels[model.stamp]
+        self._variance = variance[model.stamp]
         self._own = self._labels == label
-        self._foreign = others[self._labels] & ~self._own
+        self._foreign = is_source[self._labels] & ~self._own
         grown = scipy.ndimage.binary_dilation(self._own, iterations=_TOUCHING)
         self._touching = np.unique(self._labels[grown & self._foreign])
 
     @property
     def reaches_over(self):
         """Whether more light of the model is on the segments of others than elsewhere, and is seen there."""
-        image, foreign = self._model.image, self._foreign
+        image = self._model.image
+        foreign = self._foreign
         if image[foreign].sum() <= image[~foreign].sum():
             return False
         return np.sum((image**2 / self._variance)[foreign]) >= _SEEN
 
     def claimed(self):
-        """Labels of the segments that the light of the model says to be of the same galaxy."""
+        """Return labels of the segments that belong to the same galaxy by the light of the model."""
         if not self.reaches_over:
             return []
-        labels, image = self._labels[self._foreign], self._model.image[self._foreign]
-        claims, touching = np.bincount(labels, image, self._n_labels), self._touching
+        labels = self._labels[self._foreign]
+        image = self._model.image[self._foreign]
+        claims = np.bincount(labels, image, self._n_labels)
+        touching = self._touching
         return touching[claims[touching] > _PART_OF_CLAIM * claims.sum()].tolist()
 
     def continued(self, smooth, gain):
-        """Labels of the segments on whose border the smoothed image is as bright as anywhere in this one."""
-        light = smooth[self._model.around]
+        """Return labels of the segments on whose border the smoothed image is as bright as anywhere here."""
+        light = smooth[self._model.stamp]
         usable = self._own & np.isfinite(self._variance)
         if not usable.any():
             return []
         peak = np.argmax(np.where(usable, light, -np.inf))
-        noise, highest = gain * np.sqrt(self._variance.flat[peak]), light.flat[peak]
+        noise = gain * np.sqrt(self._variance.flat[peak])
+        highest = light.flat[peak]
         # noise of noiseless images is that of the numbers
         enough = max(_PART_OF_PEAK * highest, _BORDER_SNR * noise)
         enough = min(enough, max(highest - _PEAK_NOISE * noise, _BORDER_SNR * noise))
-        found = []
-        for other in self._touching.tolist():
-            border = usable & scipy.ndimage.binary_dilation(self._labels == other)
+        brighter = []
+        for neighbor in self._touching.tolist():
+            border = usable & scipy.ndimage.binary_dilation(self._labels == neighbor)
             if border.any() and light[border].max() > enough:
-                found.append(other)
-        return found
+                brighter.append(neighbor)
+        return brighter
 
 
 def divided(image, origin, labels, members, core, variance):
@@ -187,7 +196,9 @@ def divided(image, origin, labels, members, core, variance):
         ~inside, return_distances=False, return_indices=True
     )
     cells = labels[tuple(nearest)]
-    lights = np.maximum([image[cells == label].sum() for label in members], 0.0)
+    lights = np.zeros(len(members))
+    for k, label in enumerate(members):
+        lights[k] = max(image[cells == label].sum(), 0.0)
     # what the galaxy has beyond the rectangle counts for all pieces alike
     shares = lights / lights.sum()
     pieces = []
@@ -195,12 +206,13 @@ def divided(image, origin, labels, members, core, variance):
         if not share > 0:
             pieces.append(None)
             continue
-        own = cells == label
-        seen = own & (np.abs(image) > _NEGLIGIBLE * share)
-        box = scipy.ndimage.find_objects(seen.astype(int))[0]
-        first = tuple(int(o + s.start) for o, s in zip(origin, box, strict=True))
-        noise = float(variance[own & core].sum()) / share**2
-        pieces.append(Cutout(np.where(own, image, 0.0)[box] / share, first, noise=noise))
+        cell = cells == label
+        is_visible = cell & (np.abs(image) > _NEGLIGIBLE * share)
+        box = scipy.ndimage.find_objects(is_visible.astype(int))[0]
+        rows, columns = box
+        first = int(origin[0] + rows.start), int(origin[1] + columns.start)
+        noise = float(variance[cell & core].sum()) / share**2
+        pieces.append(Cutout(np.where(cell, image, 0.0)[box] / share, first, noise=noise))
     return pieces, shares
 
 
@@ -219,22 +231,23 @@ def padded(array, place, corner, shape, fill):
     fill : scalar
         Value of pixels beyond it.
     """
-    found = np.full(shape, fill, array.dtype)
-    here, there = [], []
+    copy = np.full(shape, fill, array.dtype)
+    source = []
+    target = []
     for begin, n, first, size in zip(place, array.shape, corner, shape, strict=True):
         low = max(begin, first)
         high = max(min(begin + n, first + size), low)
-        there.append(slice(low - first, high - first))
-        here.append(slice(low - begin, high - begin))
-    found[tuple(there)] = array[tuple(here)]
-    return found
+        target.append(slice(low - first, high - first))
+        source.append(slice(low - begin, high - begin))
+    copy[tuple(target)] = array[tuple(source)]
+    return copy
 
 
-def joined_groups(groups, more):
-    """Groups of row numbers, of which further groups of leaders (their first rows) belong together."""
+def joined_groups(groups, leader_groups):
+    """Join groups of row numbers whose leaders (their first rows) belong together, as further groups say."""
     of_leader = {group[0]: group for group in groups}
     joined = []
-    for leaders in more:
+    for leaders in leader_groups:
         parts = [of_leader.pop(leader, [leader]) for leader in leaders]
-        joined.append(sorted(itertools.chain(*parts)))
-    return [*of_leader.values(), *joined]
+        joined.append(sorted(itertools.chain.from_iterable(parts)))
+    return list(of_leader.values()) + joined

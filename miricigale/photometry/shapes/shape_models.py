@@ -22,7 +22,9 @@ class ShapeModels:
         self._psf = floats(psf)
         #: Half-width of the PSF (pixels).
         self.reach = self._psf.shape[0] / 2
-        self._transforms, self._plans, self._responses = {}, {}, {}
+        self._transforms = {}
+        self._plans = {}
+        self._responses = {}
 
     def _transform(self, size):
         if size not in self._transforms:
@@ -36,21 +38,21 @@ class ShapeModels:
         return self._transforms[size]
 
     def _response(self, size):
-        """What light that is integrated over pixels is multiplied with: samples of the PSF are integrated too."""
+        """Return the transform for light integrated over pixels; samples of the PSF are integrated already."""
         if size not in self._responses:
             response = self._transform(size) / box_response((size, size), np.eye(2))
             self._responses[size] = response.astype(np.complex64)
         return self._responses[size]
 
     def plan(self, size):
-        """The `~miricigale.photometry._core.shape_fits.Plan` of squares of a size."""
+        """Return the `~miricigale.photometry._core.shape_fits.Plan` of squares of a size (pixels)."""
         if size not in self._plans:
             self._plans[size] = make_plan(size, self._transform(_period((size,))), _PASSED)
         return self._plans[size]
 
     def profiles(self, shape, parameters, derivatives=0):
         """
-        A Sersic profile of unit light, and its derivatives.
+        Draw a Sersic profile of unit light, and its derivatives.
 
         Parameters
         ----------
@@ -66,10 +68,15 @@ class ShapeModels:
         images : `~numpy.ndarray`, shape (1 + derivatives, *shape)
             The model and its derivatives to the first parameters, in single precision.
         """
-        plan, parameters = self.plan(max(shape)), np.asarray(parameters, float)
-        curves = np.empty((5 if derivatives else 1, len(plan.kx)), np.float32)
+        plan = self.plan(max(shape))
+        parameters = np.asarray(parameters, float)
+        x, y = parameters[:2]
+        # derivatives to the four parameters of the shape are curves, those to the place are not
+        n_curves = 5 if derivatives else 1
+        n_moved = 2 if derivatives else 0
+        curves = np.empty((n_curves, len(plan.kx)), np.float32)
         fill_curves(plan.kx, plan.ky, parameters[2:], profile_table(), curves)
-        images = draw_curves(plan, curves, *parameters[:2], 2 if derivatives else 0)
+        images = draw_curves(plan, curves, x, y, n_moved)
         return np.ascontiguousarray(images.swapaxes(0, 1)[:, : shape[0], : shape[1]])
 
     def convolve(self, images, origin, shape):
@@ -81,17 +88,19 @@ class ShapeModels:
         size = _period(shape)
         rims = [(size - n) // 2 for n in shape]
         padded = np.zeros((len(images), size, size), np.float32)
-        to, of = [slice(None)], [slice(None)]
+        to = [slice(None)]
+        of = [slice(None)]
         for rim, begin, n in zip(rims, origin, images.shape[1:], strict=True):
-            low, high = max(begin + rim, 0), min(begin + rim + n, size)
+            low = max(begin + rim, 0)
+            high = min(begin + rim + n, size)
             to.append(slice(low, high))
             of.append(slice(low - begin - rim, high - begin - rim))
         padded[tuple(to)] = images[tuple(of)]
         spectra = scipy.fft.rfft2(padded) * self._response(size)
-        found = scipy.fft.irfft2(spectra, s=(size, size), overwrite_x=True)
-        return found[:, rims[0] : rims[0] + shape[0], rims[1] : rims[1] + shape[1]]
+        convolved = scipy.fft.irfft2(spectra, s=(size, size), overwrite_x=True)
+        return convolved[:, rims[0] : rims[0] + shape[0], rims[1] : rims[1] + shape[1]]
 
 
 def _period(shape):
-    """Size of the transform: light that leaves the period on one side comes in on the other."""
+    """Return the size of the transform: light that leaves the period on one side comes in on the other."""
     return scipy.fft.next_fast_len(int(_PERIOD * max(shape)), True)

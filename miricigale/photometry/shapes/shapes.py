@@ -24,7 +24,8 @@ _CENTER = np.diag([_OFFSET**-2] * 2)
 
 #: Nodes that a shape's probability is summed over, and the width of their density over that of the
 #: normal distribution about the best shape.
-_NODES, _WIDER = 32, 1.4
+_NODES = 32
+_WIDER = 1.4
 
 #: What is kept of the profile fitted to a source: its parameters with x and y on the whole image, the
 #: covariance of ln flux and parameters, the probability of a point, and the profile's part of the
@@ -45,7 +46,8 @@ FITTED = np.dtype(
 POINT_SIZE = -30.0
 
 #: Largest number of steps, and the gain in chi^2 below which the fit ends.
-_STEPS, _GAIN = 25, 0.1
+_STEPS = 25
+_GAIN = 0.1
 
 #: Excess of chi^2 over twice the evidence of the profile that rules a point out at once.
 _FAR_BELOW = 200.0
@@ -54,7 +56,9 @@ _FAR_BELOW = 200.0
 _STARTS = (-0.9, 0.0, 0.9)
 
 #: Half-width (pixels) of the stamps, least and most, and in half-light radii.
-_HALF, _MOST, _REACH = 16, 48, 4.0
+_HALF = 16
+_MOST = 48
+_REACH = 4.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -79,8 +83,8 @@ class Shape:
         return np.exp(self.parameters[2] + eta / 2), np.exp(-eta), 0.5 * np.arctan2(g2, g1)
 
     def moved(self, shift):
-        """The same at another place (x, y)."""
-        return dataclasses.replace(self, parameters=self.parameters + [*shift, 0, 0, 0, 0])
+        """Return a copy whose centers are moved by (x, y) pixels."""
+        return dataclasses.replace(self, parameters=self.parameters + center_change(shift))
 
     def drawn(self, light, farthest):
         """The profile on its grid (a `Cutout`), before the PSF, up to a semi-major axis (pixels) at most."""
@@ -92,17 +96,21 @@ class Shape:
         )  # fmt: skip
         return Cutout(stamp, origin, convolved=False)
 
-    def among(self, odds, point):
-        """The mean of the nodes, with their probabilities and that of a point."""
-        odds = odds / odds.sum() if odds.sum() > 0 else np.full(len(odds), 1.0 / len(odds))
+    def mean_shape(self, odds, point):
+        """Return the mean shape of the nodes, given their probabilities and that of a point."""
+        if odds.sum() > 0:
+            odds = odds / odds.sum()
+        else:
+            odds = np.full(len(odds), 1.0 / len(odds))
         mean = odds @ self.nodes[:, 1:]
         off = self.nodes[:, 1:] - mean
-        found = (off * odds[:, None]).T @ off
+        shape_covariance = (off * odds[:, None]).T @ off
         # noise of the flux of each shape
-        found[0, 0] += 1.0 / np.linalg.inv(self.covariance)[0, 0]
-        covariance, keep = np.zeros((7, 7)), [0, 3, 4, 5, 6]
+        shape_covariance[0, 0] += 1.0 / np.linalg.inv(self.covariance)[0, 0]
+        covariance = np.zeros((7, 7))
+        keep = [0, 3, 4, 5, 6]
         covariance[1:3, 1:3] = self.covariance[1:3, 1:3]
-        covariance[np.ix_(keep, keep)] = found
+        covariance[np.ix_(keep, keep)] = shape_covariance
         return dataclasses.replace(
             self,
             flux=float(np.exp(mean[0])),
@@ -115,19 +123,31 @@ class Shape:
         """Semi-major axis (pixels) of the ellipse through each pixel of an image at an origin (y, x)."""
         _, axis_ratio, angle = self.axes
         y, x = np.indices(size)
-        x, y = x + origin[1] - self.parameters[0], y + origin[0] - self.parameters[1]
+        x = x + origin[1] - self.parameters[0]
+        y = y + origin[0] - self.parameters[1]
         along = x * np.cos(angle) + y * np.sin(angle)
         across = y * np.cos(angle) - x * np.sin(angle)
         return np.hypot(along, across / axis_ratio)
 
 
+def center_change(shift):
+    """Return the change of a profile's six parameters by a shift (x, y) of its center."""
+    return np.append(shift, np.zeros(4))
+
+
+def major_radius(parameters):
+    """Return the half-light radius (pixels) along the major axis of a profile's six parameters."""
+    return np.exp(parameters[2] + 0.5 * np.hypot(parameters[4], parameters[5]))
+
+
 def not_fitted(n):
-    """Records (`FITTED`) of n sources of whose shape nothing is known."""
-    found = np.empty(n, FITTED)
+    """Make records (`FITTED`) of n sources of whose shape nothing is known."""
+    records = np.empty(n, FITTED)
     for name in FITTED.names:
-        found[name] = np.nan
-    found["galaxy"], found["share"] = 0.0, 1.0
-    return found
+        records[name] = np.nan
+    records["galaxy"] = 0.0
+    records["share"] = 1.0
+    return records
 
 
 @cached
@@ -141,7 +161,7 @@ def normal_nodes():
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Beside:
+class Neighbors:
     """Sources whose light was fitted together with that of another one."""
 
     flux: np.ndarray  # (m,)
@@ -150,8 +170,8 @@ class Beside:
     root: np.ndarray
 
     def moved(self, shift):
-        """The same at another place (x, y)."""
-        return dataclasses.replace(self, parameters=self.parameters + [*shift, 0, 0, 0, 0])
+        """Return a copy whose centers are moved by (x, y) pixels."""
+        return dataclasses.replace(self, parameters=self.parameters + center_change(shift))
 
 
 class ShapeFitter(ShapeModels):
@@ -161,7 +181,7 @@ class ShapeFitter(ShapeModels):
         super().__init__(psf)
         self._log_scale = np.log(scale)
 
-    def fit(self, data, weight, xy, population=None, start=None, beside=None, nodes=True):
+    def fit(self, data, weight, xy, population=None, start=None, neighbors=None, nodes=True):
         """
         Fit a point and a Sersic profile.
 
@@ -175,7 +195,7 @@ class ShapeFitter(ShapeModels):
             What is known of its shape, at its brightness; `expected` if not given.
         start : `Shape`, optional
             A profile to begin with; several sizes are tried without.
-        beside : `Beside`, optional
+        beside : `Neighbors`, optional
             Neighbors that were fitted with it, whose light is taken off.
         nodes : bool, optional
             Whether it is looked at what else the source may be; otherwise the best profile is returned.
@@ -186,7 +206,7 @@ class ShapeFitter(ShapeModels):
             None where no profile of positive light fits.
         """
         population = population or self.expected
-        mean, precision = _known(xy, population)
+        mean, precision = _prior(xy, population)
         half = _HALF if start is None else _half_width(start.parameters)
         inner = self._stamp(data, weight, mean[None], half)
         if start is None:
@@ -196,29 +216,37 @@ class ShapeFitter(ShapeModels):
             parameters = start.parameters
 
         def best(parameters, precision):
-            found = inner.minimum(parameters[None], mean[None], precision[None])
-            return found and [one if np.ndim(one) == 0 else one[0] for one in found]
+            solution = inner.minimum(parameters[None], mean[None], precision[None])
+            if solution is None:
+                return None
+            _, flux, parameters, evidence, covariance, _ = solution
+            return flux[0], parameters[0], evidence, covariance[0]
 
         extended = best(parameters, precision)
-        if extended is not None and start is None and _half_width(extended[2]) > half:
-            inner = self._stamp(data, weight, mean[None], _half_width(extended[2]))
-            extended = best(extended[2], precision)
+        if extended is not None and start is None:
+            first_fit = extended[1]
+            if _half_width(first_fit) > half:
+                inner = self._stamp(data, weight, mean[None], _half_width(first_fit))
+                extended = best(first_fit, precision)
         if extended is None:
             return None
-        _, flux, parameters, evidence, covariance, _ = extended
+        flux, parameters, evidence, covariance = extended
         if not nodes:
             return Shape(flux, parameters, 0.0, covariance)
-        changes = inner.changes(beside)
+        changes = inner.changes(neighbors)
         nodes = inner.nodes(parameters, flux, covariance[3:, 3:], mean, changes)
         start = parameters.copy()
         start[2] = POINT_SIZE
         as_point = -np.inf
         # a point that is far worse in the same place need not be moved to the best one
-        near = inner.misfit(start) < -2 * evidence + _FAR_BELOW
-        if near and (point := best(start, precision[:2, :2].copy())) is not None:
-            as_point = point[3] - np.log(point[1])
+        if inner.misfit(start) < -2 * evidence + _FAR_BELOW:
+            point = best(start, precision[:2, :2].copy())
+            if point is not None:
+                point_flux, _, point_evidence, _ = point
+                as_point = point_evidence - np.log(point_flux)
         shape = Shape(flux, parameters, 0.0, covariance, nodes, as_point)
-        return shape.among(*(one[0] for one in population.odds(nodes[None], np.array([as_point]))))
+        odds, point_odds = population.odds(nodes[None], np.array([as_point]))
+        return shape.mean_shape(odds[0], point_odds[0])
 
     def fit_together(self, data, weight, xy, populations, shapes):
         """
@@ -239,29 +267,29 @@ class ShapeFitter(ShapeModels):
         -------
         shapes : list of `Shape`
             With other fluxes, parameters and covariances; the given ones where nothing is found.
-        beside : list of `Beside`
+        beside : list of `Neighbors`
             To each, the others; None where nothing is found.
         """
-        mean, precision = (np.array(one) for one in zip(*map(_known, xy, populations), strict=True))
-        start = np.array([one.parameters for one in shapes])
-        inner = self._stamp(data, weight, mean, max(_half_width(one) for one in start))
-        found = inner.minimum(start, mean, precision)
-        if found is None:
+        mean = np.empty((len(shapes), 6))
+        precision = np.empty((len(shapes), 6, 6))
+        for k, population in enumerate(populations):
+            mean[k], precision[k] = _prior(xy[k], population)
+        start = np.array([shape.parameters for shape in shapes])
+        inner = self._stamp(data, weight, mean, max(map(_half_width, start)))
+        solution = inner.minimum(start, mean, precision)
+        if solution is None:
             return list(shapes), [None] * len(shapes)
-        _, flux, parameters, _, covariance, matrix = found
-        new = [
-            dataclasses.replace(
-                shape, flux=flux[k], parameters=parameters[k], covariance=covariance[k]
-            )
-            for k, shape in enumerate(shapes)
-        ]
-        beside = []
-        for k in range(len(new)):
-            others = np.arange(len(new)) != k
-            rows = np.repeat(others, len(matrix) // len(new))
+        _, flux, parameters, _, covariance, matrix = solution
+        new = []
+        neighbors = []
+        for k, shape in enumerate(shapes):
+            values = {"flux": flux[k], "parameters": parameters[k], "covariance": covariance[k]}
+            new.append(dataclasses.replace(shape, **values))
+            is_other = np.arange(len(shapes)) != k
+            rows = np.repeat(is_other, len(matrix) // len(shapes))
             root = np.linalg.cholesky(matrix[np.ix_(rows, rows)])
-            beside.append(Beside(flux[others], parameters[others], root))
-        return new, beside
+            neighbors.append(Neighbors(flux[is_other], parameters[is_other], root))
+        return new, neighbors
 
     @functools.cached_property
     def expected(self):
@@ -273,21 +301,23 @@ class ShapeFitter(ShapeModels):
         covariance = np.zeros((7, 7))
         covariance[3:, 3:] = population.spread
         covariance[1, 1] = covariance[2, 2] = _OFFSET**2
-        return Shape(np.nan, np.array([*xy, *population.mean]), population.point, covariance)
+        parameters = np.concatenate([xy, population.mean])
+        return Shape(np.nan, parameters, population.point, covariance)
 
     def _stamp(self, data, weight, means, half):
         """The pixels within some distance of the middles, (n, 6), on the rectangle that holds all."""
         corners = np.round(means[:, :2]).astype(int) - half
-        size, (left, top) = 2 * half + 1, corners.min(axis=0)
-        right, bottom = corners.max(axis=0) + size
-        found = np.zeros((2, bottom - top, right - left))
+        size = 2 * half + 1
+        (x0, y0) = corners.min(axis=0)
+        x1, y1 = corners.max(axis=0) + size
+        white_inverse = np.zeros((2, y1 - y0, x1 - x0))
         for x, y in corners:
-            seen = np.s_[max(y, 0) : max(y + size, 0), max(x, 0) : max(x + size, 0)]
-            inverse = weight[seen]
-            at = max(y, 0) - top, max(x, 0) - left
+            part = np.s_[max(y, 0) : max(y + size, 0), max(x, 0) : max(x + size, 0)]
+            inverse = weight[part]
+            at = max(y, 0) - y0, max(x, 0) - x0
             box = np.s_[:, at[0] : at[0] + inverse.shape[0], at[1] : at[1] + inverse.shape[1]]
-            found[box] = data[seen] * inverse, inverse
-        return _Stamp(self, self.plan(size), *found, corners)
+            white_inverse[box] = data[part] * inverse, inverse
+        return _Stamp(self, self.plan(size), *white_inverse, corners)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -306,40 +336,49 @@ class _Stamp:
     @functools.cached_property
     def limits(self):
         """Least and largest parameters."""
-        size, index = np.log(max(self.white.shape)), np.log(INDEX_RANGE)
+        size = np.log(max(self.white.shape))
+        index = np.log(INDEX_RANGE)
         low = [-np.inf, -np.inf, np.log(0.05), index[0], -2.0, -2.0]
         return np.array([low, [np.inf, np.inf, size, index[1], 2.0, 2.0]])
 
     def minimum(self, start, mean, precision, steps=_STEPS):
         """As `~miricigale.photometry._core.shape_fits.minimum`; None if nothing is found."""
-        found = minimum(*self.pixels, start, mean, precision, self.limits, steps, _GAIN)
-        return found if np.isfinite(found[0]) else None
+        solution = minimum(*self.pixels, start, mean, precision, self.limits, steps, _GAIN)
+        if not np.isfinite(solution[0]):
+            return None
+        return solution
 
     def misfit(self, parameters):
-        """Chi^2 of a profile with the light that fits best, infinite if that is negative."""
-        found = self.minimum(parameters[None], parameters[None], np.empty((1, 0, 0)), 0)
-        return np.inf if found is None else found[0]
+        """Return chi^2 of a profile with the light that fits best, infinite if that is negative."""
+        solution = self.minimum(parameters[None], parameters[None], np.empty((1, 0, 0)), 0)
+        if solution is None:
+            return np.inf
+        return solution[0]
 
-    def changes(self, beside):
-        """Whitened changes of the light of neighbors by independent unit normal deviates, (p, pixels)."""
-        if beside is None:
+    def changes(self, neighbors):
+        """Return whitened changes of the light of neighbors by independent unit normal deviates, (p, pixels)."""
+        if neighbors is None:
             return np.zeros((0, self.white.size))
         size = self.white.shape
-        images = np.zeros((len(beside.flux), 7, *size))
-        for image, flux, one in zip(images, beside.flux, beside.parameters, strict=True):
+        half = size[0] // 2
+        images = np.zeros((len(neighbors.flux), 7, size[0], size[1]))
+        for k, image in enumerate(images):
             # each on a square of its own: its transform is periodic, and it may be far from the stamp
-            corner = np.round(one[:2]).astype(int) - size[0] // 2
-            drawn = self.models.profiles(size, one - [*corner, 0, 0, 0, 0], 6)
-            middle = (corner - self.corners[0])[::-1] + size[0] // 2
+            parameters = neighbors.parameters[k]
+            corner = np.round(parameters[:2]).astype(int) - half
+            drawn = self.models.profiles(size, parameters - center_change(corner), 6)
+            middle = (corner - self.corners[0])[::-1] + half
             with contextlib.suppress(NoOverlapError):
-                here, there = overlap_slices(size, size, tuple(middle))
-                image[:, *here] = drawn[:, *there]
-            image[1:] *= flux
+                (y, x), (drawn_y, drawn_x) = overlap_slices(size, size, tuple(middle))
+                image[:, y, x] = drawn[:, drawn_y, drawn_x]
+            image[1:] *= neighbors.flux[k]
         columns = (images * self.inverse).reshape(-1, self.white.size)
         # of the layout of an empty one: kernels are compiled once
-        return np.ascontiguousarray(scipy.linalg.solve_triangular(beside.root, columns, lower=True))
+        return np.ascontiguousarray(
+            scipy.linalg.solve_triangular(neighbors.root, columns, lower=True)
+        )
 
-    def nodes(self, parameters, flux, covariance, mean, beside):
+    def nodes(self, parameters, flux, covariance, mean, changes):
         """
         Shapes about the best as `Population.odds` takes them: likelihood over density, flux, shape.
 
@@ -350,24 +389,33 @@ class _Stamp:
         z = normal_nodes()
         shapes = parameters[2:] + z @ root.T
         shapes[:, 0] = np.clip(shapes[:, 0], np.log(0.05), self.limits[1, 2])
-        shapes[:, 1] = np.clip(shapes[:, 1], *np.log(INDEX_RANGE))
-        best, prior = (parameters[None], np.array([flux])), (mean[None], _CENTER[None])
-        found = evidence_of(*self.pixels, *best, shapes, *prior, beside)
+        low, high = np.log(INDEX_RANGE)
+        shapes[:, 1] = np.clip(shapes[:, 1], low, high)
+        likelihoods = evidence_of(
+            *self.pixels,
+            parameters[None],
+            np.array([flux]),
+            shapes,
+            mean[None],
+            _CENTER[None],
+            changes,
+        )
+        # ln of the normal density from which the nodes are drawn
         density = (
             -0.5 * np.sum(z * z, axis=1) - np.sum(np.log(np.diag(root))) - 2 * np.log(2 * np.pi)
         )
-        found[:, 0] -= density
-        return np.column_stack([found, shapes])
+        likelihoods[:, 0] -= density
+        return np.column_stack([likelihoods, shapes])
 
 
-def _known(xy, population):
-    """What is known of the parameters of a source at a position: mean, and inverse of the covariance."""
+def _prior(xy, population):
+    """Return the prior of the parameters of a source at a position: mean, and inverse of the covariance."""
     precision = np.zeros((6, 6))
-    precision[:2, :2], precision[2:, 2:] = _CENTER, population.precision
+    precision[:2, :2] = _CENTER
+    precision[2:, 2:] = population.precision
     return np.concatenate([xy, population.mean]), precision
 
 
 def _half_width(parameters):
-    """Half-width of the stamp that a profile is fitted on."""
-    reach = np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
-    return int(np.clip(np.ceil(_REACH * reach), _HALF, _MOST))
+    """Return the half-width (pixels) of the stamp that a profile is fitted on."""
+    return int(np.clip(np.ceil(_REACH * major_radius(parameters)), _HALF, _MOST))

@@ -6,7 +6,6 @@ import itertools
 
 import numpy as np
 import scipy.ndimage
-import scipy.optimize
 
 from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.images.flags import ForcedFlags
@@ -18,64 +17,32 @@ from miricigale.photometry.shapes.divided_galaxies import (
     padded,
     reaching_over,
 )
-from miricigale.photometry.shapes.shapes import POINT_SIZE, Beside, Shape, ShapeFitter, not_fitted
+from miricigale.photometry.shapes.rectangles import (
+    hull,
+    overlap,
+    rectangle_corner,
+    source_stamp,
+    within,
+)
+from miricigale.photometry.shapes.shapes import POINT_SIZE, ShapeFitter, not_fitted
+from miricigale.photometry.shapes.source_models import (
+    DividedGalaxy,
+    Segments,
+    SourceModel,
+    segment_cutout,
+)
+from miricigale.photometry.shapes.wings import adjust_wings
 from miricigale.utils.parallel import chunks, parallel_map
 
-#: Ratio of the radii of neighboring nodes, and how much the scale may change between two nodes
-#: (standard deviation) where the image does not constrain it.
-_RATIO, _CHANGE = 1.35, 0.3
+#: Width (pixels) of the Gaussian that smooths the image, and signal-to-noise of the smoothed image in a core.
+_WIDTH = 1.5
+_CORE_SNR = 4.0
 
+#: Standard deviations of chi^2 by which a profile may miss the core.
+_EXCESS = 3.0
 
-def adjust_wings(stamp, radius, core, *, convolve, data, weight):
-    """
-    Scale a profile with radius until it is the light outside of the core.
-
-    One Sersic profile does not describe a bulge and a disk; what it owes to the bright inner part
-    must not decide how much light is far outside.
-
-    Parameters
-    ----------
-    stamp, radius : `~numpy.ndarray`, shape (h, w)
-        The profile before convolution, and the semi-major axis (pixels) of the ellipse through each pixel.
-    core : float
-        Semi-major axis up to which the profile stays as it is.
-    convolve : callable
-        Takes images of the stamp's shape, shape (n, h, w), to the pixels of ``data``.
-    data, weight : `~numpy.ndarray`, shape (ny, nx)
-        Light and the inverse of its error, zero for pixels that do not count.
-
-    Returns
-    -------
-    scale, outer : `~numpy.ndarray`, shape (h, w), and float
-        What the profile is to be multiplied with, never negative; the same beyond the stamp.
-
-    Notes
-    -----
-    The scale is linear in ln(radius) between nodes and found by least squares, with a random walk as
-    prior: it starts from 1 in the core and stays constant where the noise hides the light.
-    """
-    last = radius.max()
-    n_nodes = max(int(np.ceil(np.log(max(last / core, 1.0)) / np.log(_RATIO))), 1)
-    place = np.log(np.maximum(radius, 1e-3) / core) / np.log(_RATIO)
-    # node 0 is the core's edge, where the scale is 1
-    hats = [np.clip(1.0 - np.abs(place - k), 0.0, 1.0) for k in range(1, n_nodes + 1)]
-    hats[-1] = np.clip(place - (n_nodes - 1), 0.0, 1.0)
-    inner = np.clip(1.0 - place, 0.0, 1.0)
-    use = weight > 0
-    fixed, *free = (one[use] * weight[use] for one in convolve(stamp * np.array([inner, *hats])))
-    walk = (np.eye(n_nodes) - np.eye(n_nodes, k=-1)) / _CHANGE
-    begin = np.zeros(n_nodes)
-    begin[0] = 1.0 / _CHANGE
-    scale, _ = scipy.optimize.nnls(
-        np.vstack([np.stack(free, axis=1), walk]),
-        np.concatenate([data[use] * weight[use] - fixed, begin]),
-    )
-    return inner + np.tensordot(scale, hats, axes=1), float(scale[-1])
-
-
-#: Width (pixels) of the Gaussian that defines the core, its least signal-to-noise, how many standard
-#: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbor.
-_WIDTH, _CORE_SNR, _EXCESS, _OTHER_SNR = 1.5, 4.0, 3.0, 4.0
+#: Least signal-to-noise of a segment that is a source, and no peak of the noise.
+_SOURCE_SNR = 4.0
 
 #: Noise of the image smoothed with it over that of the pixels.
 _GAIN = 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
@@ -83,23 +50,27 @@ _GAIN = 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
 #: Error of a profile, as a fraction of the brightness: no galaxy is one to better than that.
 _MISFIT = 0.1
 
-#: Half-width (pixels) of the stamps that profiles are fitted on: beyond the segment, least and most.
-_AROUND, _LEAST, _MOST = 6, 16, 160
-
 #: Semi-major axis to which profiles are drawn: in half-light radii, and at most (pixels).
-_DRAWN, _FARTHEST = 6.0, 200.0
+_DRAWN_RADII = 6.0
+_MAX_DRAWN = 200.0
 
-#: Passes in which neighbors' light is taken off, and chi^2 of that light from which a source is fitted
-#: again.
-_PASSES, _CONTAMINATED = 4, 4.0
+#: Passes in which the light of neighbors is subtracted.
+_PASSES = 4
+
+#: Chi^2 of a change of the neighbors' light from which a source is fitted again.
+_CONTAMINATED_CHI2 = 4.0
 
 #: Largest number of sources whose profiles are fitted together, and chi^2 of the light of one on
-#: another's segment from which they are. Not those of a signal-to-noise of a hundred: what a
-#: profile misses of a bright galaxy would be taken for light of its neighbors.
-_TOGETHER, _LINKED, _BRIGHT = 5, 0.3, 100.0
+#: another's segment from which they are.
+_MAX_JOINT = 5
+_LINKED_CHI2 = 0.3
 
-#: Least number of sources by which the population is known well enough.
-_LOOKED_AT = 500
+#: Signal-to-noise from which sources are fitted alone: what a profile misses of a bright galaxy would be taken
+#: for light of its neighbors.
+_BRIGHT_SNR = 100.0
+
+#: Least number of sources on which the population is measured, if there are as many.
+_POPULATION_SIZE = 500
 
 
 def cutouts(
@@ -153,164 +124,78 @@ def cutouts(
     (see `~miricigale.photometry.shapes.shapes.ShapeFitter`). It is the profile where that leaves
     nothing but noise on the core, which are the pixels whose smoothed signal-to-noise is
     above 4; otherwise the core is taken from the image, and everything beyond from the profile,
-    scaled with radius to what is seen (see `~miricigale.photometry.shapes.template_choice.adjust_wings`). Sources
+    scaled with radius to what is seen (see `~miricigale.photometry.shapes.wings.adjust_wings`). Sources
     whose pixels hold light of others' models are fitted again without that light; the profiles of up to five that
     overlap are fitted together, on the pixels of all of them.
     """
-    segments = _Segments.of(data, variance, segmentation)
-    flags, snr = np.zeros(len(label), int), np.full(len(label), np.nan)
-    found, fitted, chosen = [None] * len(label), not_fitted(len(label)), []
-    for k, one in enumerate(label):
-        if not 0 < one < len(segments.ratio) or segments.places[one - 1] is None:
-            flags[k] = int(ForcedFlags.NO_SEGMENT) if one > 0 else 0
+    segments = Segments.of(data, variance, segmentation)
+    flags = np.zeros(len(label), int)
+    snr = np.full(len(label), np.nan)
+    templates = [None] * len(label)
+    fitted = not_fitted(len(label))
+    chosen = []
+    for k, number in enumerate(label):
+        if number <= 0:
             continue
-        snr[k] = segments.ratio[one]
-        if segments.totals[one] > 0 and snr[k] >= min_snr:
+        if number >= len(segments.ratio) or segments.places[number - 1] is None:
+            flags[k] = int(ForcedFlags.NO_SEGMENT)
+            continue
+        snr[k] = segments.ratio[number]
+        if segments.totals[number] > 0 and snr[k] >= min_snr:
             chosen.append(k)
         else:
             flags[k] = int(ForcedFlags.NOISY_SEGMENT)
     if not wings:
         for k in chosen:
-            found[k] = _bare(data, variance, segments, label[k])
-        return found, flags, snr, fitted
+            templates[k] = segment_cutout(data, variance, segments, label[k])
+        return templates, flags, snr, fitted
     lights = _Lights(data, variance, ShapeFitter(psf, scale), segments, select, executor)
     sources = [(label[k], xy[k]) for k in chosen]
     models, population = lights.fit(sources)
     models, galaxies = lights.rejoined(models, sources, population)
     for galaxy in galaxies:
         for row, piece, record in zip(galaxy.rows, galaxy.pieces, galaxy.records(), strict=True):
-            found[chosen[row]], fitted[chosen[row]] = piece, record
+            templates[chosen[row]] = piece
+            fitted[chosen[row]] = record
             flags[chosen[row]] |= int(ForcedFlags.SHREDDED)
-    in_pieces = set(itertools.chain(*(galaxy.rows for galaxy in galaxies)))
+    in_pieces = set(itertools.chain.from_iterable(galaxy.rows for galaxy in galaxies))
     for row, (k, model) in enumerate(zip(chosen, models, strict=True)):
         if model is not None:
-            found[k], fitted[k] = model.cutout, (*model.record, 0.0, 1.0)
-        elif found[k] is None or row not in in_pieces:
+            templates[k] = model.cutout
+            fitted[k] = (*model.record, 0.0, 1.0)
+        elif templates[k] is None or row not in in_pieces:
             flags[k] |= int(ForcedFlags.NOISY_SEGMENT)
     lacking = int(ForcedFlags.NOISY_SEGMENT | ForcedFlags.SHREDDED)
     for k in np.flatnonzero(flags & lacking == int(ForcedFlags.NOISY_SEGMENT)):
         shape = lights.fitter.unfitted(xy[k], population.at(segments.brightness(label[k])))
         fitted[k] = shape.parameters, shape.covariance, shape.point, 1.0, 0.0, 1.0
-    return found, flags, snr, fitted
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Segments:
-    """Where each label is (label 1 first), and its light and signal-to-noise (from label 0)."""
-
-    labels: np.ndarray
-    usable: np.ndarray
-    places: list
-    totals: np.ndarray
-    ratio: np.ndarray
-
-    @classmethod
-    def of(cls, data, variance, labels):
-        places = scipy.ndimage.find_objects(labels)
-        usable = np.isfinite(variance)
-        totals, noise = np.zeros((2, len(places) + 1))
-        for rows in chunks(len(labels), 256):
-            for sums, image in ((totals, data), (noise, variance)):
-                sums += np.bincount(
-                    labels[rows][usable[rows]], image[rows][usable[rows]], len(sums)
-                )
-        # infinite for noiseless images, zero for segments without data
-        ratio = np.where(totals > 0, np.inf, 0.0)
-        np.divide(totals, np.sqrt(noise), out=ratio, where=noise > 0)
-        totals[0] = ratio[0] = 0.0
-        return cls(labels, usable, places, totals, ratio)
-
-    def brightness(self, label):
-        """Ln of the light of a label."""
-        return np.log(max(self.totals[label], 1e-300))
-
-    def merged(self, groups):
-        """The same with each group of labels as one segment, which has the first of them."""
-        names = np.arange(len(self.totals))
-        places, totals, ratio = list(self.places), self.totals.copy(), self.ratio.copy()
-        with np.errstate(divide="ignore", invalid="ignore"):
-            variance = np.where(self.ratio > 0, (self.totals / self.ratio) ** 2, 0.0)
-        for group in groups:
-            leader = group[0]
-            names[group] = leader
-            places[leader - 1] = _hull([self.places[label - 1] for label in group])
-            totals[leader] = self.totals[group].sum()
-            noise = np.sqrt(variance[group].sum())
-            ratio[leader] = totals[leader] / noise if noise > 0 else np.inf
-        labels = names.astype(self.labels.dtype)[self.labels]
-        return _Segments(labels, self.usable, places, totals, ratio)
-
-
-def _bare(data, variance, segments, label):
-    """The segment as it is."""
-    place, total = segments.places[label - 1], segments.totals[label]
-    member = (segments.labels[place] == label) & segments.usable[place]
-    light = np.where(member, data[place], 0.0) / total
-    noise = float(variance[place][member].sum()) / total**2
-    return Cutout(light, (place[0].start, place[1].start), noise=noise)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Model:
-    """
-    A fitted source: its stamp, profile and template (None for a point) of some total light.
-
-    ``image`` is its light on the stamp, ``light`` the profile's part of the template, ``others`` the light
-    that was taken off the stamp before, ``labels`` those of the sources that it was fitted together with, and
-    ``beside`` what is known of these.
-    """
-
-    around: tuple
-    shape: Shape
-    image: np.ndarray
-    cutout: Cutout | None = None
-    light: float = 1.0
-    others: np.ndarray | float = 0.0
-    labels: tuple = ()
-    beside: Beside | None = None
-
-    @property
-    def record(self):
-        """What is kept of the fit."""
-        shape = self.shape.moved(_corner(self.around))
-        return shape.parameters, shape.covariance, shape.point, self.light
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Galaxy:
-    """A galaxy whose light is divided among sources."""
-
-    rows: list  # Numbers of its sources.
-    pieces: list  # The `Cutout` of each, None without light; that of the largest has the template of the whole.
-    shares: np.ndarray  # Their parts of the light.
-    record: tuple | None  # What is known of the whole, None if templates are taken without error.
-    number: int = 0
-
-    def records(self):
-        """What is known of each piece, as `~miricigale.photometry.shapes.shapes.FITTED`."""
-        found = not_fitted(len(self.rows))
-        for k, (piece, share) in enumerate(zip(self.pieces, self.shares, strict=True)):
-            if piece is not None and self.record is not None:
-                found[k] = (*self.record, self.number, share)
-        return found
+    return templates, flags, snr, fitted
 
 
 class _Lights:
     """All sources of one image, whose pixels may hold light of each other."""
 
     def __init__(self, data, variance, fitter, segments, select, executor):
-        self.data, self.variance, self.fitter, self.segments = data, variance, fitter, segments
-        self.select, self.executor = select, executor
+        self.data = data
+        self.variance = variance
+        self.fitter = fitter
+        self.segments = segments
+        self.select = select
+        self.executor = executor
         self.light, self.core = _smooth(data, variance, executor)
         # what is no more than a peak of the noise hides nothing
-        self.others = segments.ratio >= _OTHER_SNR
+        self.is_source = segments.ratio >= _SOURCE_SNR
 
     def fit(self, sources):
         """The model of each (label, position); None where no light fits."""
         # the population is that of some of the sources, of all parts of the list
-        every = max(1, len(sources) // _LOOKED_AT)
-        drafts = [(*one, k % every == 0) for k, one in enumerate(sources)]
-        models = parallel_map(lambda one: self._draft(*one), drafts, executor=self.executor)
+        step = max(1, len(sources) // _POPULATION_SIZE)
+
+        def draft(k):
+            label, xy = sources[k]
+            return self._draft(label, xy, nodes=k % step == 0)
+
+        models = parallel_map(draft, range(len(sources)), executor=self.executor)
         population = self._population(models, sources)
         models = self._joined(models, sources, population)
         return self._refined(models, sources, population), population
@@ -320,18 +205,21 @@ class _Lights:
         for turn in range(first, _PASSES):
             sum_of_all = self._paint(models)
 
-            def again(one, sum_of_all=sum_of_all, turn=turn):
-                model, (label, xy) = one
+            def refit(pair, sum_of_all=sum_of_all, turn=turn):
+                model, (label, xy) = pair
                 if model is None:
                     return None
-                others = sum_of_all[model.around] - model.image
+                neighbor_light = sum_of_all[model.stamp] - model.image
                 if turn:
-                    weight, _, _ = self._weight(model.around, label, model.labels)
-                    if np.sum(((others - model.others) * weight) ** 2) < _CONTAMINATED:
+                    weight, _, _ = self._weight(model.stamp, label, model.labels)
+                    if (
+                        np.sum(((neighbor_light - model.neighbor_light) * weight) ** 2)
+                        < _CONTAMINATED_CHI2
+                    ):
                         return model
-                return self._model(label, xy, others, population, model)
+                return self._model(label, xy, neighbor_light, population, model)
 
-            models = parallel_map(again, zip(models, sources, strict=True), executor=self.executor)
+            models = parallel_map(refit, zip(models, sources, strict=True), executor=self.executor)
         return models
 
     def rejoined(self, models, sources, population):
@@ -347,26 +235,28 @@ class _Lights:
         -------
         models : list
             Those of all sources that are whole; None for pieces.
-        galaxies : list of `_Galaxy`
+        galaxies : list of `DividedGalaxy`
             Galaxies of several pieces, and sources whose profile reaches over those of others although it touches
             none of them.
         """
         labels = [label for label, _ in sources]
-        before, groups, lights = list(models), [], self
+        before = list(models)
+        groups = []
+        lights = self
         # what has no peak of its own first: its profile is no evidence against others
-        for find in [*[continued_groups] * _PASSES, *[claimed_groups] * _PASSES]:
-            found = find(models, sources, lights.segments, *lights.as_seen)
-            if not found:
+        for find in [continued_groups] * _PASSES + [claimed_groups] * _PASSES:
+            new_groups = find(models, sources, lights.segments, *lights.as_seen)
+            if not new_groups:
                 continue
-            groups = joined_groups(groups, found)
-            new = set(itertools.chain(*found))
+            groups = joined_groups(groups, new_groups)
+            new = set(itertools.chain.from_iterable(new_groups))
             lights = self._of_galaxies([[labels[k] for k in group] for group in groups])
             changed = [group for group in groups if not new.isdisjoint(group)]
             models, sources = lights._put_together(models, sources, population, changed)
         reaching = reaching_over(models, sources, lights.segments, *lights.as_seen)
-        members = {group[0]: group for group in groups} | {
-            k: [k] for k in reaching if k not in {group[0] for group in groups}
-        }
+        members = {group[0]: group for group in groups}
+        for k in reaching:
+            members.setdefault(k, [k])
         galaxies = []
         for leader, group in members.items():
             galaxy = None
@@ -385,18 +275,19 @@ class _Lights:
     @property
     def as_seen(self):
         """Variance, labels of sources, and the smoothed image with its noise: as `continued_groups` takes them."""
-        return self.variance, self.others, (self.light, _GAIN)
+        return self.variance, self.is_source, (self.light, _GAIN)
 
     def _of_galaxies(self, groups):
         """The same sources, groups of labels as one segment each."""
         lights = copy.copy(self)
         lights.segments = self.segments.merged(groups)
-        lights.others = lights.segments.ratio >= _OTHER_SNR
+        lights.is_source = lights.segments.ratio >= _SOURCE_SNR
         return lights
 
     def _put_together(self, models, sources, population, groups):
         """Models and sources with those of each group (row numbers) in its first row."""
-        models, sources = list(models), list(sources)
+        models = list(models)
+        sources = list(sources)
         gone = {sources[k][0] for group in groups for k in group}
         for group in groups:
             leader = group[0]
@@ -408,188 +299,224 @@ class _Lights:
             y, x = np.unravel_index(
                 np.argmax(np.where(inside, self.light[place], -np.inf)), inside.shape
             )
-            sources[leader] = label, np.array([x, y]) + _corner(place)
-            models[leader] = self._draft(*sources[leader], nodes=False)
+            sources[leader] = label, np.array([x, y]) + rectangle_corner(place)
+            label, xy = sources[leader]
+            models[leader] = self._draft(label, xy, nodes=False)
         for k, model in enumerate(models):
             if model is not None and not gone.isdisjoint(model.labels):
                 # profiles of pieces were no good neighbors
-                models[k] = dataclasses.replace(model, labels=(), beside=None)
-        fresh = {group[0] for group in groups if models[group[0]] is not None}
+                models[k] = dataclasses.replace(model, labels=(), neighbors=None)
+        changed = {group[0] for group in groups if models[group[0]] is not None}
         # overlapping profiles are fitted together, as all are
-        near = [
-            model if any(_overlap(model, models[k]) for k in fresh) else None for model in models
-        ]
-        for k, model in enumerate(self._joined(near, sources, population)):
-            if model is not near[k]:
+        candidates = [None] * len(models)
+        for k, model in enumerate(models):
+            if model is not None and any(overlap(model.stamp, models[j].stamp) for j in changed):
+                candidates[k] = model
+        for k, model in enumerate(self._joined(candidates, sources, population)):
+            if model is not candidates[k]:
                 models[k] = model
-                fresh.add(k)
+                changed.add(k)
         sum_of_all = self._paint(models)
-        for k in sorted(fresh):
-            others = sum_of_all[models[k].around] - models[k].image
-            models[k] = self._model(*sources[k], others, population, models[k])
+        for k in sorted(changed):
+            neighbor_light = sum_of_all[models[k].stamp] - models[k].image
+            label, xy = sources[k]
+            models[k] = self._model(label, xy, neighbor_light, population, models[k])
         return self._refined(models, sources, population, first=1), sources
 
-    def _divided(self, whole, rows, labels, *, cut):
+    def _divided(self, model, rows, labels, *, cut):
         """
-        The `_Galaxy` of a model of several segments, None if nothing is left of its light.
+        The `DividedGalaxy` of a model of several segments, None if nothing is left of its light.
 
         ``rows`` and ``labels`` are those of the pieces. With ``cut`` it has no light on the segments of others.
         """
-        template, place = whole.cutout, whole.around
+        template = model.cutout
+        place = model.stamp
         reach = int(self.fitter.reach)
-        low, high = _corner(place)[::-1] - reach, [one.stop + reach for one in place]
+        low = rectangle_corner(place)[::-1] - reach
+        high = np.array([place[0].stop, place[1].stop]) + reach
         if template is not None:
             # as far as the profile is drawn
             low = np.minimum(low, template.origin)
             high = np.maximum(high, np.add(template.origin, template.data.shape))
-        corner, shape = tuple(low.tolist()), tuple((high - low).tolist())
+        corner = tuple(low.tolist())
+        shape = tuple((high - low).tolist())
         if template is None:
-            parameters = np.array(whole.shape.parameters)
-            parameters[:2] += _corner(place) - low[::-1]
+            parameters = np.array(model.shape.parameters)
+            parameters[:2] += rectangle_corner(place) - low[::-1]
             parameters[2] = POINT_SIZE
             image = self.fitter.profiles(shape, parameters)[0]
         else:
             origin = np.subtract(template.origin, low)
             image = self.fitter.convolve(template.data[None], origin, shape)[0]
-        image, core = np.array(image, float), np.zeros(shape, bool)
-        if template is not None and template.rest is not None:
-            rest = template.rest
-            image += padded(rest.data, rest.origin, corner, shape, 0.0)
-            core = padded(rest.data != 0, rest.origin, corner, shape, False)
-        seen = padded(self.segments.labels, (0, 0), corner, shape, 0)
-        total = whole.shape.flux / whole.light
+        image = np.array(image, float)
+        core = np.zeros(shape, bool)
+        if template is not None and template.correction is not None:
+            remainder = template.correction
+            image += padded(remainder.data, remainder.origin, corner, shape, 0.0)
+            core = padded(remainder.data != 0, remainder.origin, corner, shape, False)
+        labels_around = padded(self.segments.labels, (0, 0), corner, shape, 0)
+        total = model.shape.flux / model.light
         if cut:
-            image[self.others[seen] & ~np.isin(seen, labels)] = 0.0
+            image[self.is_source[labels_around] & ~np.isin(labels_around, labels)] = 0.0
             within = image.sum()
             if not within > 0:
                 return None
-            image, total = image / within, total * within
+            image = image / within
+            total = total * within
         variance = padded(self.variance, (0, 0), corner, shape, np.inf) / total**2
-        pieces, shares = divided(image, corner, seen, labels, core, variance)
-        record = None if cut else whole.record
+        pieces, shares = divided(image, corner, labels_around, labels, core, variance)
+        record = None
         if not cut:
+            record = model.record
             largest = int(np.argmax(shares))
-            pieces[largest] = dataclasses.replace(pieces[largest], whole=template)
-        return _Galaxy(rows, pieces, shares, record)
+            pieces[largest] = dataclasses.replace(pieces[largest], galaxy=template)
+        return DividedGalaxy(rows, pieces, shares, record)
 
     def _joined(self, models, sources, population):
         """The models, profiles that hold light of each other fitted together."""
         rows = np.full(len(self.segments.ratio), -1)
         for k, (model, (label, _)) in enumerate(zip(models, sources, strict=True)):
-            use = model is not None and self.segments.ratio[label] < _BRIGHT
-            rows[label] = k if use else -1
+            if model is not None and self.segments.ratio[label] < _BRIGHT_SNR:
+                rows[label] = k
+            else:
+                rows[label] = -1
 
         def links(k):
-            model, (own, _) = models[k], sources[k]
-            if rows[own] < 0:
+            model = models[k]
+            (label, _) = sources[k]
+            if rows[label] < 0:
                 return []
-            labels, variance = self.segments.labels[model.around], self.variance[model.around]
+            labels = self.segments.labels[model.stamp]
+            variance = self.variance[model.stamp]
             power = np.bincount(labels.ravel(), (model.image**2 / variance).ravel())
-            some = (one for one in np.flatnonzero(power > _LINKED) if one != own)
-            return [(-power[one], k, rows[one]) for one in some if rows[one] >= 0]
+            row_links = []
+            for other_label in np.flatnonzero(power > _LINKED_CHI2):
+                other_row = rows[other_label]
+                if other_label != label and other_row >= 0:
+                    row_links.append((-power[other_label], k, other_row))
+            return row_links
 
-        found = parallel_map(links, range(len(models)), executor=self.executor)
+        links_of_rows = parallel_map(links, range(len(models)), executor=self.executor)
         groups = {k: [k] for k in range(len(models))}
         # the strongest first; from groups that would be too large light is taken off
-        for _, one, other in sorted(itertools.chain(*found)):
-            both, more = groups[one], groups[other]
-            if both is not more and len(both) + len(more) <= _TOGETHER:
-                both.extend(more)
-                groups.update(dict.fromkeys(more, both))
-        several = [group for k, group in groups.items() if len(group) > 1 and group[0] == k]
+        for _, row, neighbor in sorted(itertools.chain.from_iterable(links_of_rows)):
+            group = groups[row]
+            neighbor_group = groups[neighbor]
+            if group is not neighbor_group and len(group) + len(neighbor_group) <= _MAX_JOINT:
+                group.extend(neighbor_group)
+                groups.update(dict.fromkeys(neighbor_group, group))
+        joint_groups = [group for k, group in groups.items() if len(group) > 1 and group[0] == k]
         sum_of_all = self._paint(models)
 
         def fit(group):
-            members, around = [models[k] for k in group], _hull([models[k].around for k in group])
-            data = self.data[around].astype(float) - sum_of_all[around]
-            for one in members:
-                data[_within(one.around, around)] += one.image
-            labels = [sources[k][0] for k in group]
-            _, weight, _ = self._weight(around, labels[0], labels)
-            corner = _corner(around)
-            shapes, beside = self.fitter.fit_together(
-                data, weight, [sources[k][1] - corner for k in group],
-                [population.at(self.segments.brightness(label)) for label in labels],
-                [one.shape.moved(_corner(one.around) - corner) for one in members],
-            )  # fmt: skip
-            found = []
-            for one, shape, others in zip(members, shapes, beside, strict=True):
-                back = corner - _corner(one.around)
-                others = others and others.moved(back)
-                shape, image = shape.moved(back), self._image(one.around, shape.moved(back))
-                found.append(_Model(one.around, shape, image, labels=labels, beside=others))
-            return found
+            members = [models[k] for k in group]
+            hull_of_group = hull([member.stamp for member in members])
+            data = self.data[hull_of_group].astype(float) - sum_of_all[hull_of_group]
+            for member in members:
+                data[within(member.stamp, hull_of_group)] += member.image
+            corner = rectangle_corner(hull_of_group)
+            labels = []
+            places = []
+            populations = []
+            starts = []
+            for k, member in zip(group, members, strict=True):
+                label, xy = sources[k]
+                labels.append(label)
+                places.append(xy - corner)
+                populations.append(population.at(self.segments.brightness(label)))
+                starts.append(member.shape.moved(rectangle_corner(member.stamp) - corner))
+            _, weight, _ = self._weight(hull_of_group, labels[0], labels)
+            shapes, neighbors = self.fitter.fit_together(data, weight, places, populations, starts)
+            fitted = []
+            for member, shape, neighbor in zip(members, shapes, neighbors, strict=True):
+                back = corner - rectangle_corner(member.stamp)
+                neighbor = neighbor and neighbor.moved(back)
+                shape, image = shape.moved(back), self._image(member.stamp, shape.moved(back))
+                fitted.append(
+                    SourceModel(member.stamp, shape, image, labels=labels, neighbors=neighbor)
+                )
+            return fitted
 
         models = list(models)
-        fits = parallel_map(fit, several, executor=self.executor)
-        for k, model in zip(itertools.chain(*several), itertools.chain(*fits), strict=True):
-            models[k] = model
+        fits = parallel_map(fit, joint_groups, executor=self.executor)
+        for group, group_models in zip(joint_groups, fits, strict=True):
+            for k, model in zip(group, group_models, strict=True):
+                models[k] = model
         return models
 
     def _population(self, models, sources):
         """The distribution of the shapes of all sources."""
-        pairs = zip(models, sources, strict=True)
-        some = [
-            (one.shape, label) for one, (label, _) in pairs if one and one.shape.nodes is not None
-        ]
-        if not some:
+        nodes = []
+        points = []
+        brightness = []
+        for model, (label, _) in zip(models, sources, strict=True):
+            if model is not None and model.shape.nodes is not None:
+                nodes.append(model.shape.nodes)
+                points.append(model.shape.as_point)
+                brightness.append(self.segments.brightness(label))
+        if not nodes:
             return self.fitter.expected
-        shapes, labels = zip(*some, strict=True)
-        nodes, points = (
-            np.array([getattr(one, name) for one in shapes]) for name in ("nodes", "as_point")
-        )
-        brightness = np.array([self.segments.brightness(label) for label in labels])
-        return self.fitter.expected.fitted(nodes, points, brightness)
+        return self.fitter.expected.fitted(np.array(nodes), np.array(points), np.array(brightness))
 
     def _paint(self, models):
         """The light of all models."""
         image = np.zeros(self.data.shape, np.float32)
         for model in models:
             if model is not None:
-                image[model.around] += model.image
+                image[model.stamp] += model.image
         return image
 
-    def _image(self, around, shape):
+    def _image(self, stamp, shape):
         """The light of a profile on a stamp."""
-        size = tuple(s.stop - s.start for s in around)
+        rows, columns = stamp
+        size = rows.stop - rows.start, columns.stop - columns.start
         return np.float32(shape.flux) * self.fitter.profiles(size, shape.parameters)[0]
 
-    def _weight(self, around, label, together=()):
+    def _weight(self, stamp, label, together=()):
         """Inverse noise of the pixels that are free of others, the same for a profile, and own pixels."""
-        labels, usable = self.segments.labels[around], self.segments.usable[around]
-        own = usable & (labels == label)
-        free = own | usable & ~self.others[labels]
-        for one in together:
-            free |= usable & (labels == one)
-        weight = 1.0 / np.sqrt(np.where(free, self.variance[around], np.inf), dtype=float)
-        misfit = _MISFIT * np.maximum(self.light[around], 0.0) * weight
+        labels = self.segments.labels[stamp]
+        usable = self.segments.usable[stamp]
+        is_own = usable & (labels == label)
+        is_free = is_own | usable & ~self.is_source[labels]
+        for other_label in together:
+            is_free |= usable & (labels == other_label)
+        weight = 1.0 / np.sqrt(np.where(is_free, self.variance[stamp], np.inf), dtype=float)
+        misfit = _MISFIT * np.maximum(self.light[stamp], 0.0) * weight
         looser = weight / np.sqrt(1.0 + misfit * misfit)
-        return weight, looser, own
+        return weight, looser, is_own
 
     def _draft(self, label, xy, nodes):
         """The profile of one source, whatever others there are; of no template yet."""
-        around = _around(self.segments.places[label - 1], xy, self.data.shape)
-        _, weight, _ = self._weight(around, label)
-        data = self.data[around].astype(float)
-        shape = self.fitter.fit(data, weight, xy - _corner(around), nodes=nodes)
-        return None if shape is None else _Model(around, shape, self._image(around, shape))
+        stamp = source_stamp(self.segments.places[label - 1], xy, self.data.shape)
+        _, weight, _ = self._weight(stamp, label)
+        data = self.data[stamp].astype(float)
+        shape = self.fitter.fit(data, weight, xy - rectangle_corner(stamp), nodes=nodes)
+        if shape is None:
+            return None
+        return SourceModel(stamp, shape, self._image(stamp, shape))
 
-    def _model(self, label, xy, others, population, last):
+    def _model(self, label, xy, neighbor_light, population, last):
         """Fit one source again, ``others`` being the light of others on its stamp, ``last`` its last model."""
-        around = last.around
-        weight, looser, own = self._weight(around, label, last.labels)
-        data, corner = self.data[around].astype(float) - others, _corner(around)
+        stamp = last.stamp
+        weight, looser, is_own = self._weight(stamp, label, last.labels)
+        data = self.data[stamp].astype(float) - neighbor_light
+        corner = rectangle_corner(stamp)
         prior = population.at(self.segments.brightness(label))
-        shape = self.fitter.fit(data, looser, xy - corner, prior, last.shape, last.beside)
+        shape = self.fitter.fit(data, looser, xy - corner, prior, last.shape, last.neighbors)
         if shape is None:
             # as it was before, and if there was no template yet, as its profile
-            drawn = last.cutout is None and last.shape.point <= 0.5
-            return self._as_profile(last) if drawn else last
-        fitted = {"shape": shape, "image": self._image(around, shape), "others": others}
+            if last.cutout is None and last.shape.point <= 0.5:
+                return self._as_profile(last)
+            return last
+        fitted = {
+            "shape": shape,
+            "image": self._image(stamp, shape),
+            "neighbor_light": neighbor_light,
+        }
         new = dataclasses.replace(last, **fitted, cutout=None, light=1.0)
         if self.select and shape.point > 0.5:
             return new
-        core = own & self.core[around]
+        core = is_own & self.core[stamp]
         n = np.count_nonzero(core)
         if self.select:
             excess = np.sum(((data - new.image) * weight)[core] ** 2) - n
@@ -611,83 +538,52 @@ class _Lights:
         )
         light = profile.data * scale
         image = convolve(light[None])[0]
-        rest = np.where(core, data - image, 0.0)
-        total = light.sum() + rest.sum() + outer * (shape.flux - profile.data.sum())
+        remainder = np.where(core, data - image, 0.0)
+        total = light.sum() + remainder.sum() + outer * (shape.flux - profile.data.sum())
         if not total > 0:
             return self._as_profile(new)
         template = dataclasses.replace(
             profile,
             data=light / total,
-            noise=float(self.variance[around][core].sum()) / total**2,
-            rest=Cutout(rest / total, (around[0].start, around[1].start)),
+            noise=float(self.variance[stamp][core].sum()) / total**2,
+            correction=Cutout(remainder / total, (stamp[0].start, stamp[1].start)),
         )
         return dataclasses.replace(
-            new, image=image + rest, cutout=template, light=shape.flux / total
+            new, image=image + remainder, cutout=template, light=shape.flux / total
         )
 
     def _as_profile(self, model):
         """The same with its profile as the template."""
-        return dataclasses.replace(model, cutout=self._profile(model.shape, _corner(model.around)))
+        return dataclasses.replace(
+            model, cutout=self._profile(model.shape, rectangle_corner(model.stamp))
+        )
 
     def _profile(self, shape, corner, light=1.0):
         """A fitted profile on the fine grid, as far as the PSF reaches at least: steps at its edge show."""
-        reach = min(_DRAWN * shape.axes[0], _FARTHEST)
+        reach = min(_DRAWN_RADII * shape.axes[0], _MAX_DRAWN)
         return shape.moved(corner).drawn(light, max(self.fitter.reach, reach))
-
-
-def _corner(around):
-    """X and y of the first pixel of a stamp."""
-    return np.array([around[1].start, around[0].start])
-
-
-def _hull(places):
-    """The rectangle that holds others."""
-    sides = zip(*places, strict=True)
-    return tuple(slice(min(s.start for s in one), max(s.stop for s in one)) for one in sides)
-
-
-def _overlap(model, other):
-    """Whether the stamps of two models overlap; not if one is None."""
-    if model is None or other is None:
-        return False
-    pairs = zip(model.around, other.around, strict=True)
-    return all(one.start < two.stop and two.start < one.stop for one, two in pairs)
-
-
-def _within(place, around):
-    """Where a rectangle is in another."""
-    pairs = zip(place, around, strict=True)
-    return tuple(slice(s.start - a.start, s.stop - a.start) for s, a in pairs)
-
-
-def _around(place, xy, shape):
-    """The stamp of a source: as far as its segment goes to either side, and a rim."""
-    x, y = round(float(xy[0])), round(float(xy[1]))
-    reach = max(place[0].stop - y, y - place[0].start, place[1].stop - x, x - place[1].start)
-    half = int(np.clip(reach + _AROUND, _LEAST, _MOST))
-    return tuple(
-        slice(min(max(c - half, 0), n - 1), max(min(c + half + 1, n), 1))
-        for c, n in zip((y, x), shape, strict=True)
-    )
 
 
 def _smooth(data, variance, executor):
     """The image smoothed, and where its signal-to-noise is that of a core."""
-    light, core = np.empty(data.shape, np.float32), np.empty(data.shape, bool)
+    light = np.empty(data.shape, np.float32)
+    core = np.empty(data.shape, bool)
     rim = round(16 * _WIDTH) + 1
 
     def smooth(rows):
         first = max(rows.start - rim, 0)
-        part, own = slice(first, rows.stop + rim), slice(rows.start - first, rows.stop - first)
+        part = slice(first, rows.stop + rim)
+        inner = slice(rows.start - first, rows.stop - first)
         usable = np.isfinite(variance[part])
-        found, noise = (
-            scipy.ndimage.gaussian_filter(np.where(usable, image[part], 0.0), width, output=float)[
-                own
-            ]
-            for image, width in ((data, _WIDTH), (variance, 4 * _WIDTH))
-        )
-        light[rows] = found
-        core[rows] = (noise > 0) & (found > _CORE_SNR * _GAIN * np.sqrt(noise))
+
+        def filtered(image, width):
+            values = np.where(usable, image[part], 0.0)
+            return scipy.ndimage.gaussian_filter(values, width, output=float)[inner]
+
+        smoothed = filtered(data, _WIDTH)
+        noise = filtered(variance, 4 * _WIDTH)
+        light[rows] = smoothed
+        core[rows] = (noise > 0) & (smoothed > _CORE_SNR * _GAIN * np.sqrt(noise))
 
     parallel_map(smooth, chunks(len(data), 256), executor=executor)
     return light, core

@@ -42,14 +42,14 @@ class FreeTemplates:
 
     @property
     def flux(self):
-        """Fluxes, shape (n,)."""
+        """Fluxes in uJy, shape (n,)."""
         return self.fit.flux[: self.n]
 
     @property
     def amplitudes(self):
         """Of the templates and of all changes, shape (n,) and (k,)."""
-        found = self.basis @ self.fit.flux
-        return found[: self.n], found[self.n :]
+        amplitudes = self.basis @ self.fit.flux
+        return amplitudes[: self.n], amplitudes[self.n :]
 
     @property
     def strain(self):
@@ -62,14 +62,15 @@ class FreeTemplates:
         """Positions of the changes that are fitted, shape (m, 2)."""
         return self.bank.xy[self.basis[self.n :, self.n :].tocsc().indices]
 
-    def alone(self):
-        """What blending with its own changes leaves of each source's power, shape (n,)."""
-        n, matrix = self.n, self.fit.matrix.tocoo()
+    def remaining_power(self):
+        """Return the part of each source's power that blending with its own changes leaves, shape (n,)."""
+        n = self.n
+        matrix = self.fit.matrix.tocoo()
         if not len(self.owner):
             return np.ones(n)
         source = np.concatenate([np.arange(n), self.owner])
-        own = source[matrix.row] == source[matrix.col]
-        entries = matrix.data[own], (matrix.row[own], matrix.col[own])
+        same_source = source[matrix.row] == source[matrix.col]
+        entries = matrix.data[same_source], (matrix.row[same_source], matrix.col[same_source])
         blocks = scipy.sparse.coo_array(entries, shape=matrix.shape).tocsr()
         side = blocks[n:, :n].sum(axis=1)
         lost = np.bincount(self.owner, side * factorize(blocks[n:, n:])(side), minlength=n)
@@ -77,22 +78,22 @@ class FreeTemplates:
 
     def filling(self, middle):
         """
-        What the errors of the templates add to the right-hand side, (n + m, n + m).
+        Return the covariance that errors of templates add to the right-hand side, shape (n + m, n + m).
 
         ``middle`` is the normal matrix of the templates, (n, n).
         """
-        filling = scipy.sparse.diags_array(self.prior).tocsr()
-        own = np.flatnonzero(self.noise > 0)
-        if len(own):
-            sides = middle.tocsc()[:, own] @ scipy.sparse.diags_array(
-                self.flux[own] * np.sqrt(self.noise[own])
+        total = scipy.sparse.diags_array(self.prior).tocsr()
+        noisy = np.flatnonzero(self.noise > 0)
+        if len(noisy):
+            sides = middle.tocsc()[:, noisy] @ scipy.sparse.diags_array(
+                self.flux[noisy] * np.sqrt(self.noise[noisy])
             )
             block = (sides @ sides.T).tocoo()
             n = len(self.prior)
-            filling = filling + scipy.sparse.coo_array(
+            total = total + scipy.sparse.coo_array(
                 (block.data, (block.row, block.col)), shape=(n, n)
             )
-        return filling.tocsr()
+        return total.tocsr()
 
     def sandwich(self, fit, correlation, middle, border, images):
         """
@@ -102,9 +103,11 @@ class FreeTemplates:
         `~miricigale.photometry.templates.normal_equations.sandwich_matrix`.
         """
         inverse_sigma = fit.inverse_sigma
-        own, more = sandwich_matrix(self.bank, inverse_sigma, correlation, images)
+        changes, change_border = sandwich_matrix(self.bank, inverse_sigma, correlation, images)
         cross = cross_matrix(fit.bank, self.bank, inverse_sigma, correlation).tocsr()[fit.rows]
-        return joined_matrix(middle, cross, own, self.basis), _below(border, more, self.basis)
+        return joined_matrix(middle, cross, changes, self.basis), _right_side(
+            border, change_border, self.basis
+        )
 
 
 def free_templates(fit, fitted):
@@ -130,30 +133,37 @@ def free_templates(fit, fitted):
     of a change. This is linear in f_k and f_k a_j; the latter have the prior variance f_k^2, for which the
     flux of the plain fit is taken.
     """
-    plain, bank, rows = fit.fit, fit.bank, fit.rows
-    owner, every, scale, noise = find_changes(fit, fitted, bank.parts(rows), bank.executor)
+    plain_fit = fit.fit
+    bank = fit.bank
+    rows = fit.rows
+    owner, changes, scale, noise = find_changes(fit, fitted, bank.parts(rows), bank.executor)
     if not (len(owner) or noise.any()):
         return None
-    other = bank.at_resolution(bank.order[rows[owner]], [one.cutout for one in every])
-    owner = owner[other.order]
-    fixed = np.array([one.fixed for one in every], bool)[other.order]
-    basis = change_basis(
-        len(rows), owner, np.array([one.light for one in every])[other.order], fixed
-    )
-    images = [fit.arrays.whitened(one) for one in (fit.arrays.flux, *fit.columns)]
-    own, projection, _, _ = normal_matrix(other, fit.inverse_sigma, images)
-    cross = cross_matrix(bank, other, fit.inverse_sigma).tocsr()[rows]
+    change_bank = bank.at_resolution(bank.order[rows[owner]], [change.cutout for change in changes])
+    # the bank's rows are in an order of their own
+    changes = [changes[k] for k in change_bank.order]
+    owner = owner[change_bank.order]
+    fixed = np.array([change.fixed for change in changes], bool)
+    light = np.array([change.light for change in changes])
+    basis = change_basis(len(rows), owner, light, fixed)
+    images = [fit.arrays.whitened(fit.arrays.flux)]
+    for column in fit.columns:
+        images.append(fit.arrays.whitened(column))
+    changes_matrix, projection, _, _ = normal_matrix(change_bank, fit.inverse_sigma, images)
+    cross = cross_matrix(bank, change_bank, fit.inverse_sigma).tocsr()[rows]
     owner = owner[~fixed]
     prior = np.concatenate([np.zeros(len(rows)), scale[owner] ** -2.0])
-    matrix = joined_matrix(plain.matrix, cross, own, basis) + scipy.sparse.diags_array(prior)
-    free = LinearFit(
+    matrix = joined_matrix(
+        plain_fit.matrix, cross, changes_matrix, basis
+    ) + scipy.sparse.diags_array(prior)
+    solution = LinearFit(
         matrix.tocsr(),
-        _below(plain.rhs, projection[:, 0], basis),
-        _below(plain.border, projection[:, 1:], basis),
-        plain.corner,
-        plain.corner_rhs,
+        _right_side(plain_fit.rhs, projection[:, 0], basis),
+        _right_side(plain_fit.border, projection[:, 1:], basis),
+        plain_fit.corner,
+        plain_fit.corner_rhs,
     )
-    return FreeTemplates(free, other, len(rows), basis, owner, prior, noise)
+    return FreeTemplates(solution, change_bank, len(rows), basis, owner, prior, noise)
 
 
 def find_changes(fit, fitted, parts, executor):
@@ -184,56 +194,80 @@ def find_changes(fit, fitted, parts, executor):
     noise : `~numpy.ndarray`, shape (n,)
         Variance of ln flux by noise in templates that are images.
     """
-    plain = fit.fit
+    plain_fit = fit.fit
     kernel = fit.settings.mean_kernel
     finder = TemplateChanges(kernel.source, kernel.target, fit.settings.errors.size_scatter)
-    snr = np.abs(plain.flux) * np.sqrt(plain.matrix.diagonal())
-    known = np.isfinite(fitted["parameters"][:, 0]) & (fitted["galaxy"] == 0)
-    wanted = np.flatnonzero(known & (snr > LEAST) & (plain.flux > 0))
+    snr = np.abs(plain_fit.flux) * np.sqrt(plain_fit.matrix.diagonal())
+    is_known = np.isfinite(fitted["parameters"][:, 0]) & (fitted["galaxy"] == 0)
+    wanted = np.flatnonzero(is_known & (snr > LEAST) & (plain_fit.flux > 0))
 
     def find(k):
         return finder.of(parts[k], fitted[k], LEAST / snr[k])
 
-    found = parallel_map(find, wanted, executor=executor)
-    owner = [k for k, (some, _) in zip(wanted, found, strict=True) for _ in some]
-    changes = [one for some, _ in found for one in some]
+    results = parallel_map(find, wanted, executor=executor)
+    owner = []
+    changes = []
     noise = np.zeros(len(parts))
-    noise[wanted] = [one for _, one in found]
-    scale = np.abs(plain.flux)
-    for galaxy in divided_galaxies(fitted, plain.flux):
-        noise[galaxy.rows] = [finder.pixel_noise(parts[k]) for k in galaxy.rows]
+    for k, (row_changes, row_noise) in zip(wanted, results, strict=True):
+        owner += [k] * len(row_changes)
+        changes += row_changes
+        noise[k] = row_noise
+    scale = np.abs(plain_fit.flux)
+    for galaxy in divided_galaxies(fitted, plain_fit.flux):
+        for k in galaxy.rows:
+            noise[k] = finder.pixel_noise(parts[k])
         largest = galaxy.largest
-        whole = parts[largest].whole
-        if whole is None and not galaxy.has_largest:
+        whole_cutout = parts[largest].galaxy
+        if whole_cutout is None and not galaxy.has_largest:
             # the template of the whole is that of a piece that is not fitted
             continue
-        least = LEAST / galaxy.signal(plain.matrix)
+        min_power = LEAST / galaxy.signal(plain_fit.matrix)
         # the whole galaxy changes, which its largest piece stands for
         scale[largest] = galaxy.flux
-        for change in finder.of(whole, fitted[largest], least)[0]:
+        for change in finder.of(whole_cutout, fitted[largest], min_power)[0]:
             owner.append(largest)
             changes.append(galaxy.of_largest(change))
     return np.array(owner, int), changes, scale, noise
 
 
 def change_basis(n, owner, light, fixed):
-    """Templates with their fixed changes, and the other changes less their light in the template."""
+    """
+    Make the columns of a fit: templates with their fixed changes, and the changes that are fitted.
+
+    The light of a change is taken off its template, so that the template's column has the flux of all light.
+
+    Parameters
+    ----------
+    n : int
+        Number of templates.
+    owner : int `~numpy.ndarray`, shape (k,)
+        The template of each change.
+    light : `~numpy.ndarray`, shape (k,)
+        Light of each.
+    fixed : bool `~numpy.ndarray`, shape (k,)
+        Whether it belongs to its template.
+
+    Returns
+    -------
+    basis : `~scipy.sparse.csr_array`, shape (n + k, n + m)
+        Of templates and all changes, for templates and the m changes that are fitted.
+    """
     k = np.arange(len(owner))
     column = np.where(fixed, owner, n + np.cumsum(~fixed) - 1)
-    free = ~fixed
-    rows = np.concatenate([np.arange(n), n + k, owner[free]])
-    columns = np.concatenate([np.arange(n), column, column[free]])
-    values = np.concatenate([np.ones(n + len(k)), -light[free]])
-    shape = (n + len(k), n + int(np.count_nonzero(free)))
+    is_fitted = ~fixed
+    rows = np.concatenate([np.arange(n), n + k, owner[is_fitted]])
+    columns = np.concatenate([np.arange(n), column, column[is_fitted]])
+    values = np.concatenate([np.ones(n + len(k)), -light[is_fitted]])
+    shape = (n + len(k), n + int(np.count_nonzero(is_fitted)))
     return scipy.sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
 
 
-def joined_matrix(main, cross, own, basis):
-    """Matrix of the columns of a basis."""
-    whole = scipy.sparse.block_array([[main, cross], [cross.T, own]]).tocsr()
-    return (basis.T @ whole @ basis).tocsr()
+def joined_matrix(main, cross, changes, basis):
+    """Return the normal matrix of the columns of a basis."""
+    joint = scipy.sparse.block_array([[main, cross], [cross.T, changes]]).tocsr()
+    return (basis.T @ joint @ basis).tocsr()
 
 
-def _below(main, own, basis):
-    """Right-hand sides of the columns of a basis."""
-    return basis.T @ np.concatenate([main, own])
+def _right_side(main, changes, basis):
+    """Return right-hand sides of the columns of a basis."""
+    return basis.T @ np.concatenate([main, changes])

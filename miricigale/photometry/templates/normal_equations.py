@@ -55,13 +55,17 @@ def correlated_draws(covariance, keys, size, seed):
     inverse = scipy.sparse.diags_array(1.0 / error[rows])
     unit = (inverse @ covariance[rows][:, rows] @ inverse).tocoo()
     lone = unit.row == unit.col
-    normal = np.stack([stream(seed, *keys[k]).standard_normal(size) for k in rows])
+    normal = np.empty((len(rows), size))
+    for deviates, k in zip(normal, rows, strict=True):
+        deviates[:] = stream(seed, *keys[k]).standard_normal(size)
     for factor in _SHRINK:
         data = np.where(lone, 1.0, factor * unit.data)
-        found = _cholesky(scipy.sparse.coo_array((data, (unit.row, unit.col)), shape=unit.shape))
-        if found is not None:
+        factorization = _cholesky(
+            scipy.sparse.coo_array((data, (unit.row, unit.col)), shape=unit.shape)
+        )
+        if factorization is not None:
             break
-    lower, order = found
+    lower, order = factorization
     draws[:, rows] = ((lower @ normal[np.argsort(order)])[order]).T * error[rows]
     return draws
 
@@ -108,18 +112,19 @@ def noise_correlation(residual, usable, weight, *, executor=None):
         raise argument_error("usable", "100 pixels or more", np.count_nonzero(usable))
 
     # some millions of pixels are enough for the mean and the spread
-    every = np.s_[:: max(1, np.count_nonzero(usable) // _SOME)]
-    some, inverse, where = (one.reshape(-1)[every] for one in (residual, weight, usable))
-    some = (some * inverse)[where]
-    middle, far = np.median(some), _CLIP * mad_std(some)
-    level = residual.dtype.type(some[np.abs(some - middle) <= far].mean(dtype=float))
+    step = np.s_[:: max(1, np.count_nonzero(usable) // _SOME)]
+    white = residual.reshape(-1)[step] * weight.reshape(-1)[step]
+    white = white[usable.reshape(-1)[step]]
+    middle = np.median(white)
+    far = _CLIP * mad_std(white)
+    level = residual.dtype.type(white[np.abs(white - middle) <= far].mean(dtype=float))
 
     def rows(part):
         z = residual[part] * weight[part]
         return z - level, usable[part] & (np.abs(z - middle) <= far)
 
     lag = min(_MAX_LAG, (min(residual.shape) - 1) // 2)
-    strips = [one for one in chunks(len(usable), 256) if usable[one].any()]
+    strips = [strip for strip in chunks(len(usable), 256) if usable[strip].any()]
     # those of tens of millions of pixels are enough
     strips = strips[:: 1 + np.count_nonzero(usable) // 20_000_000]
     in_threads = functools.partial(parallel_map, executor=executor)
@@ -171,7 +176,9 @@ def stated_correlation(factor):
 
 #: Largest separation (pixels) of the noise correlation; pixels further from the median than this many robust
 #: standard deviations do not take part; rings of separations whose mean is less significant than this are cut off.
-_MAX_LAG, _CLIP, _SIGNIFICANCE = 8, 5.0, 3.0
+_MAX_LAG = 8
+_CLIP = 5.0
+_SIGNIFICANCE = 3.0
 
 #: Pairs of stamps that a thread works on at a time.
 _PAIRS = 1024
@@ -186,7 +193,8 @@ def _whitened(bank, block, inverse_sigma):
     sums = np.empty((len(block.box), 4))
 
     def scale(part):
-        whiten_stamps(*block.some(part), inverse_sigma, white.values, sums[part])
+        values, box, start = block.stamps_of(part)
+        whiten_stamps(values, box, start, inverse_sigma, white.values, sums[part])
 
     bank.map(scale, block.parts())
     return white, sums
@@ -197,19 +205,20 @@ def _projected(bank, block, images):
     out = np.empty((len(images), len(block.box)))
 
     def project_part(part):
-        for image, one in zip(images, out, strict=True):
-            projections(*block.some(part), image, one[part])
+        values, box, start = block.stamps_of(part)
+        for image, sums in zip(images, out, strict=True):
+            projections(values, box, start, image, sums[part])
 
     bank.map(project_part, block.parts())
     return out.T
 
 
-def _products(bank, left, right, pairs):
+def _products(bank, left_block, right_block, pairs):
     """Sums of the products of pairs of stamps of two blocks."""
     out = np.empty(len(pairs))
 
     def multiply(part):
-        pair_products(*left.stamps, *right.stamps, pairs[part], out[part])
+        pair_products(*left_block.stamps, *right_block.stamps, pairs[part], out[part])
 
     bank.map(multiply, chunks(len(pairs), _PAIRS))
     return out
@@ -222,33 +231,38 @@ def _walk(bank, inverse_sigma, images, spread=None):
     At most those blocks are in memory that can still overlap. ``spread`` is what is done to the right-hand block
     of a pair; stamps grow by its ``lag``. Returns the matrix, (n, n), the projection, and the stamps' sums.
     """
-    n, grow = len(bank.order), 0 if spread is None else spread.lag
+    n = len(bank.order)
+    grow = 0 if spread is None else spread.lag
     pairs = find_pairs(bank.box, grow=grow)
-    products, diagonal = np.zeros(len(pairs)), np.empty(n)
-    sums, projection, live = np.empty((n, 4)), np.empty((n, len(images))), []
+    products = np.zeros(len(pairs))
+    diagonal = np.empty(n)
+    sums = np.empty((n, 4))
+    projection = np.empty((n, len(images)))
+    live = []
     for block in bank.blocks():
         rows = slice(block.first, block.last)
         white, sums[rows] = _whitened(bank, block, inverse_sigma)
         projection[rows] = _projected(bank, white, images)
-        mine, diagonal[rows] = white, sums[rows, 3]
+        mine = white
+        diagonal[rows] = sums[rows, 3]
         if spread is not None:
             mine = spread(white)
-            own = np.repeat(np.arange(len(block.box), dtype=np.int32), 2).reshape(-1, 2)
-            diagonal[rows] = _products(bank, white, mine, own)
-        live = [one for one in live if one.end + grow > block.box[0, 0]]
+            diagonal_pairs = np.repeat(np.arange(len(block.box), dtype=np.int32), 2).reshape(-1, 2)
+            diagonal[rows] = _products(bank, white, mine, diagonal_pairs)
+        live = [held for held in live if held.end + grow > block.box[0, 0]]
         live.append(white)
-        for other in live:
-            low, high = np.searchsorted(pairs[:, 0], [other.first, other.last])
+        for left_block in live:
+            low, high = np.searchsorted(pairs[:, 0], [left_block.first, left_block.last])
             met = low + np.flatnonzero(
                 (pairs[low:high, 1] >= block.first) & (pairs[low:high, 1] < block.last)
             )
             if len(met):
-                local = pairs[met] - np.array([other.first, block.first], pairs.dtype)
-                products[met] = _products(bank, other, mine, local)
+                local = pairs[met] - np.array([left_block.first, block.first], pairs.dtype)
+                products[met] = _products(bank, left_block, mine, local)
     i, j = pairs.T.astype(np.int64)
-    where = np.concatenate([np.arange(n), i, j]), np.concatenate([np.arange(n), j, i])
+    places = np.concatenate([np.arange(n), i, j]), np.concatenate([np.arange(n), j, i])
     data = np.concatenate([diagonal, products, products])
-    return scipy.sparse.coo_array((data, where), shape=(n, n)).tocsr(), projection, sums
+    return scipy.sparse.coo_array((data, places), shape=(n, n)).tocsr(), projection, sums
 
 
 def normal_matrix(bank, inverse_sigma, images=()):
@@ -291,7 +305,8 @@ class _Spread:
     """Convolves the whitened stamps of a block with the noise's correlation."""
 
     def __init__(self, correlation, bank):
-        self.lag, self._map = correlation.shape[0] // 2, bank.map
+        self.lag = correlation.shape[0] // 2
+        self._map = bank.map
         self._kernel = np.asarray(correlation, np.float32)
         self._transfer = functools.lru_cache(maxsize=64)(
             lambda shape: scipy.fft.rfft2(self._kernel, s=shape)
@@ -308,45 +323,54 @@ class _Spread:
         def convolve(batch):
             shape, rows = batch
             transfer = self._transfer(shape)
-            convolve_stamps(*block.stamps, rows, transfer, shape, box, start, values)
+            convolve_stamps(
+                block.values, block.box, block.start, rows, transfer, shape, box, start, values
+            )
 
         # rounded up so that many stamps share a shape
-        shapes = -(-box[:, 2:] // 8) * 8
-        fast = {n: scipy.fft.next_fast_len(int(n), True) for n in np.unique(shapes)}
-        self._map(convolve, batches((fast[ny], fast[nx]) for ny, nx in shapes))
+        sizes, index = np.unique(-(-box[:, 2:] // 8) * 8, return_inverse=True)
+        fast = np.array([scipy.fft.next_fast_len(int(n), True) for n in sizes], int)
+        shapes = fast[index].reshape(-1, 2).tolist()
+        self._map(convolve, batches(map(tuple, shapes)))
         return Block(block.first, box, start, values)
 
 
-def cross_matrix(bank, other, inverse_sigma, correlation=None):
+def cross_matrix(bank, other_bank, inverse_sigma, correlation=None):
     """
     Products, (n, m), of the whitened stamps of two banks.
 
     With a ``correlation`` (as of `sandwich_matrix`) the other bank's stamps are convolved with it.
     """
-    rows, columns, values = [], [], []
-    spread = None if correlation is None else _Spread(correlation, other)
-    waiting, live = bank.blocks(), []
-    for block in other.blocks():
-        right = _whitened(other, block, inverse_sigma)[0]
-        right = right if spread is None else spread(right)
+    rows = []
+    columns = []
+    values = []
+    spread = None
+    if correlation is not None:
+        spread = _Spread(correlation, other_bank)
+    waiting = bank.blocks()
+    live = []
+    for block in other_bank.blocks():
+        right_block = _whitened(other_bank, block, inverse_sigma)[0]
+        if spread is not None:
+            right_block = spread(right_block)
         # of the first bank, those blocks only that this one and those after it can overlap
-        live = [one for one in live if one.end > right.box[0, 0]]
-        while not live or live[-1].box[0, 0] < right.end:
-            left = next(waiting, None)
-            if left is None:
+        live = [held for held in live if held.end > right_block.box[0, 0]]
+        while not live or live[-1].box[0, 0] < right_block.end:
+            left_block = next(waiting, None)
+            if left_block is None:
                 break
-            live.append(_whitened(bank, left, inverse_sigma)[0])
-        for left in live:
-            pairs = cross_pairs(left.box, right.box)
+            live.append(_whitened(bank, left_block, inverse_sigma)[0])
+        for left_block in live:
+            pairs = cross_pairs(left_block.box, right_block.box)
             if len(pairs):
-                values.append(_products(bank, left, right, pairs))
-                rows.append(pairs[:, 0] + left.first)
-                columns.append(pairs[:, 1] + right.first)
-    shape = len(bank.order), len(other.order)
+                values.append(_products(bank, left_block, right_block, pairs))
+                rows.append(pairs[:, 0] + left_block.first)
+                columns.append(pairs[:, 1] + right_block.first)
+    shape = len(bank.order), len(other_bank.order)
     if not values:
         return scipy.sparse.csr_array(shape)
-    where = (np.concatenate(rows), np.concatenate(columns))
-    return scipy.sparse.coo_array((np.concatenate(values), where), shape=shape).tocsr()
+    places = (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.coo_array((np.concatenate(values), places), shape=shape).tocsr()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -369,13 +393,16 @@ class LinearFit:
 
     def __post_init__(self):
         solve = factorize(self.matrix)
-        z = solve(self.border) if self.border.shape[1] else self.border
+        z = self.border
+        if self.border.shape[1]:
+            z = solve(self.border)
+        # the Schur complement of the sources, and its solution
         q = np.linalg.inv(self.corner - self.border.T @ z)
         common = q @ (self.corner_rhs - z.T @ self.rhs)
-        found = {"solve": solve, "_z": z, "_q": q, "common": common}
-        found["flux"] = solve(self.rhs) - z @ common
+        results = {"solve": solve, "_z": z, "_q": q, "common": common}
+        results["flux"] = solve(self.rhs) - z @ common
         # the class is frozen
-        self.__dict__.update(found)
+        self.__dict__.update(results)
 
     @property
     def common_covariance(self):
@@ -404,19 +431,23 @@ class LinearFit:
         blending : `~numpy.ndarray`, shape (n,)
             Formal error over that of the source alone.
         """
-        z, q = self._z, self._q
-        middles = [None if one is None else one[0] for one in fillings]
+        z = self._z
+        q = self._q
+        middles = [None if filling is None else filling[0] for filling in fillings]
+        x, y = xy.T
         local, inverse = block_covariance(
-            self.matrix, *xy.T[::-1], core=core, halo=halo, pattern=pattern, middles=middles
+            self.matrix, y, x, core=core, halo=halo, pattern=pattern, middles=middles
         )
+        # the inverse of the whole system adds Z Q Z^T to that of the sources alone
         inverse = inverse + np.einsum("kg,kg->k", z @ q, z)
         blending = np.sqrt(inverse * self.matrix.diagonal())
-        found = [self._with_common(*both) for both in zip(local, fillings, strict=True)]
-        return found, blending
+        covariances = list(map(self._with_common, local, fillings))
+        return covariances, blending
 
     def _with_common(self, local, filling):
         """The sources' covariance with what the common parameters add, and that of those."""
-        z, q = self._z, self._q
+        z = self._z
+        q = self._q
         if not len(q):
             return local, q
         if filling is None:
@@ -434,6 +465,6 @@ def _add_low_rank(matrix, terms):
     """Add sums of outer products to the non-zeros of a sparse matrix."""
     coo = matrix.tocoo()
     data = coo.data.copy()
-    for left, right in terms:
-        data += np.einsum("kg,kg->k", left[coo.row], right[coo.col])
+    for first, second in terms:
+        data += np.einsum("kg,kg->k", first[coo.row], second[coo.col])
     return scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=matrix.shape).tocsr()

@@ -39,8 +39,8 @@ class Galaxy:
 
     def signal(self, matrix):
         """Signal-to-noise of the whole galaxy by a normal matrix."""
-        own = matrix[self.rows][:, self.rows]
-        return self.flux * np.sqrt(self.shares @ (own @ self.shares))
+        block = matrix[self.rows][:, self.rows]
+        return self.flux * np.sqrt(self.shares @ (block @ self.shares))
 
 
 def divided_galaxies(fitted, flux):
@@ -54,12 +54,15 @@ def divided_galaxies(fitted, flux):
     flux : `~numpy.ndarray`, shape (n,)
         Their fluxes.
     """
-    number, share = fitted["galaxy"], fitted["share"]
+    number = fitted["galaxy"]
+    share = fitted["share"]
     galaxies = []
     for galaxy in np.unique(number[number > 0]):
         rows = np.flatnonzero((number == galaxy) & (share > 0))
         total = flux[rows].sum()
         if len(rows) > 1 and total > 0:
-            known = float(share[rows].sum())
-            galaxies.append(Galaxy(rows, share[rows] / known, float(total), 1.0 - known))
+            fitted_share = float(share[rows].sum())
+            galaxies.append(
+                Galaxy(rows, share[rows] / fitted_share, float(total), 1.0 - fitted_share)
+            )
     return galaxies

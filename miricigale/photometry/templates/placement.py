@@ -20,12 +20,13 @@ class Placement:
     scale: float
     margin: float
     xy: np.ndarray  # (n, 2): Positions in pixels; NaN for those far off.
-    near: np.ndarray  # (k,): Sources on or near the image.
+    near_rows: np.ndarray  # (k,): Sources on or near the image.
 
     @classmethod
     def of(cls, settings, arrays, sky):
         """Place sources by their coordinates."""
-        scale, kernel = pixel_scale(arrays.wcs), settings.mean_kernel
+        scale = pixel_scale(arrays.wcs)
+        kernel = settings.mean_kernel
         margin = (kernel.target.shape[0] // 2 + 1) * kernel.pixel_scale.to_value(ANGLE) / scale
         xy = sky_pixels(sky, arrays.wcs, arrays.flux.shape, margin)
         return cls(settings, arrays, scale, margin, xy, np.flatnonzero(np.isfinite(xy[:, 0])))
@@ -39,8 +40,11 @@ class Placement:
 
     def bank(self, rows, templates, executor):
         """The `TemplateBank` of some of the sources, whose templates are given."""
-        settings, wcs, xy = self.settings, self.arrays.wcs, self.xy[rows]
-        shape, grid = self.arrays.flux.shape, self.grid(templates)
+        settings = self.settings
+        wcs = self.arrays.wcs
+        xy = self.xy[rows]
+        shape = self.arrays.flux.shape
+        grid = self.grid(templates)
         fine_xy = np.stack(grid.world_to_pixel(templates.sky), axis=-1).reshape(-1, 2)
         # points are where the high-resolution image shows them
         point = np.isfinite(templates.fitted["parameters"][:, 0]) & (templates.kind == "point")
@@ -50,17 +54,16 @@ class Placement:
         if settings.integrate:
             middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
             sides = local_maps(middle, [self.margin / 2], wcs, grid)[0, :, 1:3].T
-        kernels, weigh = [settings.mean_kernel], None
+        kernels = [settings.mean_kernel]
+        weigh = None
         if isinstance(settings.kernel, KernelField):
             kernels = settings.kernel.kernels
 
             def weigh(xy):
                 return settings.kernel.weights(wcs.pixel_to_world(*xy.T).icrs)
 
-        fine = FineTemplates(
-            np.stack([one.array for one in kernels]),
-            np.stack([one.target for one in kernels]),
-            sides,
-        )
+        arrays = np.stack([kernel.array for kernel in kernels])
+        targets = np.stack([kernel.target for kernel in kernels])
+        fine = FineTemplates(arrays, targets, sides)
         sources = BankSources(templates.drawn(grid, fine_xy), fine_xy, xy, poly)
         return TemplateBank(fine, sources, shape, settings.memory.max_bytes, weigh, executor)

@@ -34,7 +34,8 @@ from miricigale.utils.tables import unique_ids
 from miricigale.utils.units import ANGLE
 
 #: Arrays with a row for each source, and least signal-to-noise of a segment whose shape is looked at.
-_ROWS, _MIN_SNR = ("id", "sersic", "flags", "snr", "fitted"), 5.0
+_ROWS = ("id", "sersic", "flags", "snr", "fitted")
+_MIN_SNR = 5.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -116,20 +117,20 @@ class SourceTemplates:
             "sersic": np.full((n, 4), np.nan), "flags": np.zeros(n, int), "snr": np.full(n, np.nan),
             "fitted": not_fitted(n),
         }  # fmt: skip
+        shapes = dict.fromkeys(_ROWS + OPTIONAL, (n,)) | {"sersic": (n, 4)}
         for name in (*_ROWS, *OPTIONAL, "psf"):
             value = getattr(self, name)
             value = nothing.get(name) if value is None else np.array(value)
             if value is None:
                 continue
-            shape = (n, 4) if name == "sersic" else (n,)
-            if name != "psf" and value.shape != shape:
-                raise argument_error(name, f"of shape {shape}", value.shape)
+            if name in shapes and value.shape != shapes[name]:
+                raise argument_error(name, f"of shape {shapes[name]}", value.shape)
             value.flags.writeable = False
             object.__setattr__(self, name, value)
         if len(self.light) != n or len(self.sky) != n:
             lengths = f"{len(self.sky)} and {len(self.light)}"
             raise argument_error("sky, light", f"{n} each, as many as ids", lengths)
-        if self.wcs is None and any(one is not None for one in self.light):
+        if self.wcs is None and self.light.count(None) < n:
             raise argument_error("wcs", "the grid that the light is on", "None")
 
     @classmethod
@@ -174,12 +175,12 @@ class SourceTemplates:
             If an input does not fit; the message says which.
         """
         check_choice(template, "template", ("auto", "cutout"))
-        known = catalog_sources(catalog, epoch_of(highres))
+        columns = catalog_sources(catalog, epoch_of(highres))
         fine = image_arrays(highres, "highres", np.float32)
         segments = _segments(segmentation, fine.flux.shape)
         scale = pixel_scale(highres.wcs)
         psf = _psf_array(psf, scale)
-        xy = np.stack(highres.wcs.world_to_pixel(known["sky"]), axis=-1).reshape(-1, 2)
+        xy = np.stack(highres.wcs.world_to_pixel(columns["sky"]), axis=-1).reshape(-1, 2)
         warn_of_sky(fine, segments)
         label, _ = nearest_values(segments, xy)
         if "label" in catalog.colnames:
@@ -189,19 +190,20 @@ class SourceTemplates:
         width = 1 / np.sqrt(psf.max() / psf.sum())
         full, flat = saturated_cores(fine.flux, fine.usable, segments, label, xy, width)
         flags[full] |= int(ForcedFlags.SATURATED)
-        data, variance = fine.flux, fine.sigma
+        data = fine.flux
+        variance = fine.sigma
         del fine
         variance *= variance
         variance[flat] = np.inf
+        min_snr = _MIN_SNR if template == "auto" else 0.0
         with threads(n_threads) as executor, single_threaded():
-            light, more, snr, fitted = cutouts(
+            light, choice_flags, snr, fitted = cutouts(
                 data, variance, psf, scale, segments, label, xy,
                 select=template == "auto", wings=wings,
-                min_snr=_MIN_SNR if template == "auto" else 0.0,
-                executor=executor,
+                min_snr=min_snr, executor=executor,
             )  # fmt: skip
         return cls(
-            **known, light=light, flags=flags | more, snr=snr, fitted=fitted, wcs=highres.wcs, psf=psf,
+            **columns, light=light, flags=flags | choice_flags, snr=snr, fitted=fitted, wcs=highres.wcs, psf=psf,
             meta=provenance(template=template, min_snr=_MIN_SNR, wings=bool(wings)),
         )  # fmt: skip
 
@@ -232,11 +234,15 @@ class SourceTemplates:
             If an input does not fit; the message says which.
         """
         check_choice(template, "template", ("psf", "sersic"))
-        known = catalog_sources(catalog)
-        rows = sersic_rows(catalog) if template == "sersic" else None
+        columns = catalog_sources(catalog)
+        rows = None
+        if template == "sersic":
+            rows = sersic_rows(catalog)
+        if wcs is not None:
+            wcs = as_wcs(wcs)
+        points = (None,) * len(columns["id"])
         meta = provenance(template=template)
-        grid = None if wcs is None else as_wcs(wcs)
-        return cls(**known, light=(None,) * len(known["id"]), sersic=rows, wcs=grid, meta=meta)
+        return cls(**columns, light=points, sersic=rows, wcs=wcs, meta=meta)
 
     @classmethod
     def from_arrays(cls, arrays, corners, catalog, *, wcs, convolved=True):
@@ -266,25 +272,26 @@ class SourceTemplates:
         ValueError, TypeError
             If an array has no positive total or values that are not finite, or numbers differ.
         """
-        known = catalog_sources(catalog)
-        n = len(known["id"])
-        arrays, corners = list(arrays), np.asarray(corners)
+        columns = catalog_sources(catalog)
+        n = len(columns["id"])
+        arrays = list(arrays)
+        corners = np.asarray(corners)
         if len(arrays) != n or corners.shape != (n, 2) or corners.dtype.kind not in "iu":
             got = f"{len(arrays)} arrays, corners {corners.dtype} of shape {corners.shape}"
             raise argument_error("arrays, corners", f"{n} each, as many as sources", got)
         convolved = np.broadcast_to(np.asarray(convolved, bool), n)
-        light = []
-        for k, one in enumerate(arrays):
-            data = None if one is None else np.asarray(one, float)
-            if data is not None:
-                total = data.sum() if data.ndim == 2 else np.nan
-                wanted = "two-dimensional, finite and of positive total"
-                got = f"shape {data.shape} and total {total} of source {known['id'][k]}"
-                check_that(np.isfinite(total) and total > 0, "arrays", wanted, got)
-                at = tuple(int(c) for c in corners[k])
-                data = Cutout(data / total, at, convolved=bool(convolved[k]))
-            light.append(data)
-        return cls(**known, light=light, wcs=as_wcs(wcs), meta=provenance(template="arrays"))
+        light = [None] * n
+        for k, array in enumerate(arrays):
+            if array is None:
+                continue
+            data = np.asarray(array, float)
+            total = data.sum() if data.ndim == 2 else np.nan
+            wanted = "two-dimensional, finite and of positive total"
+            got = f"shape {data.shape} and total {total} of source {columns['id'][k]}"
+            check_that(np.isfinite(total) and total > 0, "arrays", wanted, got)
+            corner = tuple(corners[k].tolist())
+            light[k] = Cutout(data / total, corner, convolved=bool(convolved[k]))
+        return cls(**columns, light=light, wcs=as_wcs(wcs), meta=provenance(template="arrays"))
 
     @classmethod
     def concatenate(cls, parts):
@@ -310,55 +317,70 @@ class SourceTemplates:
         """
         parts = list(parts)
         check_that(parts, "parts", "at least one SourceTemplates", "none")
-        grids = [one.wcs for one in parts if one.wcs is not None]
-        if any(not same_grid(one, grids[0]) for one in grids[1:]):
-            raise argument_error("parts", "on one grid", "different ones")
-        psfs = [one.psf for one in parts if one.psf is not None]
-        names = {str(one.meta.get("template")): None for one in parts}
+        wcs = None
+        psf = None
+        light = ()
+        names = []
+        for part in parts:
+            if wcs is None:
+                wcs = part.wcs
+            elif part.wcs is not None and not same_grid(part.wcs, wcs):
+                raise argument_error("parts", "on one grid", "different ones")
+            if psf is None:
+                psf = part.psf
+            light += part.light
+            names.append(str(part.meta.get("template")))
         rows = {}
-        for name in (*_ROWS, *OPTIONAL):
-            values = [getattr(one, name) for one in parts]
-            if all(one is not None for one in values):
+        for name in _ROWS + OPTIONAL:
+            values = [getattr(part, name) for part in parts]
+            if all(column is not None for column in values):
                 rows[name] = np.concatenate(values)
         # numbers of divided galaxies are those of their part
-        parts_of = np.repeat(np.arange(len(parts)), [len(one) for one in parts])
+        part_number = np.repeat(np.arange(len(parts)), list(map(len, parts)))
         number = rows["fitted"]["galaxy"]
-        number += np.where(number > 0, parts_of * number.max(initial=0.0), 0.0)
+        number += np.where(number > 0, part_number * number.max(initial=0.0), 0.0)
         return cls(
-            **rows, sky=joined_sky([one.sky for one in parts]),
-            light=sum((one.light for one in parts), ()),
-            wcs=grids[0] if grids else None, psf=psfs[0] if psfs else None,
-            meta={**parts[0].meta, "template": ", ".join(names)},
-        )  # fmt: skip
+            **rows,
+            sky=joined_sky([part.sky for part in parts]),
+            light=light,
+            wcs=wcs,
+            psf=psf,
+            meta={**parts[0].meta, "template": ", ".join(dict.fromkeys(names))},
+        )
 
     def __len__(self):
         return len(self.id)
 
     def __getitem__(self, rows):
-        """Some of the sources, by a slice, a mask or an array of row numbers."""
+        """Return some of the sources, by a slice, a mask or an array of row numbers."""
         rows = np.atleast_1d(np.arange(len(self))[rows])
-        names = [name for name in (*_ROWS, *OPTIONAL) if getattr(self, name) is not None]
-        some = {name: getattr(self, name)[rows] for name in ("sky", *names)}
-        return dataclasses.replace(self, light=tuple(self.light[k] for k in rows), **some)
+        columns = {"sky": self.sky[rows]}
+        for name in _ROWS + OPTIONAL:
+            values = getattr(self, name)
+            if values is not None:
+                columns[name] = values[rows]
+        return dataclasses.replace(self, light=[self.light[k] for k in rows], **columns)
 
     def __repr__(self):
         kinds, counts = np.unique(self.kind, return_counts=True)
-        found = ", ".join(f"{n} {kind}" for kind, n in zip(kinds, counts, strict=True))
-        return f"<SourceTemplates {len(self)} sources{': ' if found else ''}{found}>"
+        text = f"SourceTemplates {len(self)} sources"
+        if len(self):
+            text += ": " + ", ".join(map("{} {}".format, counts, kinds))
+        return f"<{text}>"
 
     @property
     def kind(self):
         """``"point"``, ``"sersic"`` or ``"cutout"``, shape (n,)."""
         kinds = np.full(len(self), "point", "U6")
         kinds[np.isfinite(self.sersic[:, 0])] = "sersic"
-        for k, one in enumerate(self.light):
-            if one is not None:
-                kinds[k] = one.kind
+        for k, cutout in enumerate(self.light):
+            if cutout is not None:
+                kinds[k] = cutout.kind
         return kinds
 
     def drawn(self, grid, xy):
         """
-        The light of all sources on a grid, Sersic profiles of the catalog drawn.
+        Draw the light of all sources on a grid, Sersic profiles of the catalog among them.
 
         Parameters
         ----------
@@ -374,7 +396,9 @@ class SourceTemplates:
         """
         light = list(self.light)
         rows = np.flatnonzero(np.isfinite(self.sersic[:, 0]))
-        jacobian = _pixels_per_arcsec(self.sky[rows[0]], grid) if len(rows) else None
+        if not len(rows):
+            return light
+        jacobian = _pixels_per_arcsec(self.sky[rows[0]], grid)
         for k in rows:
             radius, index, ratio, angle = self.sersic[k]
             r_eff, q, theta = ellipse_to_pixels(
@@ -389,25 +413,31 @@ class SourceTemplates:
         return light
 
     def __getstate__(self):
-        # a WCS pickles through a header, which rounds its numbers
-        return {**self.__dict__, "wcs": None if self.wcs is None else grid_text(self.wcs)}
+        state = dict(self.__dict__)
+        if self.wcs is not None:
+            # a WCS pickles through a header, which rounds its numbers
+            state["wcs"] = grid_text(self.wcs)
+        return state
 
     def __setstate__(self, state):
-        wcs = None if state["wcs"] is None else text_grid(state["wcs"])
-        self.__dict__.update({**state, "wcs": wcs})
+        self.__dict__.update(state)
+        if state["wcs"] is not None:
+            self.__dict__["wcs"] = text_grid(state["wcs"])
 
 
 def _segments(segmentation, shape):
-    plain = not isinstance(segmentation, SegmentationImage)
-    segments = np.asarray(segmentation if plain else segmentation.data)
+    if isinstance(segmentation, SegmentationImage):
+        segmentation = segmentation.data
+    segments = np.asarray(segmentation)
     if segments.shape != shape or segments.dtype.kind not in "iu":
-        wanted, got = f"integers of the shape {shape} of 'highres'", segments.dtype
+        wanted = f"integers of the shape {shape} of 'highres'"
+        got = segments.dtype
         raise argument_error("segmentation", wanted, f"{got} of shape {segments.shape}")
     return segments
 
 
 def _psf_array(psf, scale):
-    """A PSF on the pixels of the image, of unit sum."""
+    """Return a PSF on the pixels of the image, of unit sum."""
     if isinstance(psf, ImagePSF):
         from miricigale.psf import instrument_psf, psf_image
 
@@ -423,6 +453,6 @@ def _psf_array(psf, scale):
 
 
 def _pixels_per_arcsec(sky, wcs):
-    """Jacobian [dx, dy] = J @ [east, north] of a WCS at a position."""
+    """Return the Jacobian [dx, dy] = J @ [east, north] (pixels per arcsec) of a WCS at a position."""
     moved = sky.directional_offset_by([90, 0] * u.deg, 1 * u.arcsec)
     return np.array(wcs.world_to_pixel(moved)) - np.array(wcs.world_to_pixel(sky))[:, None]

@@ -9,11 +9,14 @@ from miricigale.photometry._core.shape_fits import draw_curves
 from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
 from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.shapes.shape_models import ShapeModels
-from miricigale.photometry.shapes.shapes import POINT_SIZE, normal_nodes
+from miricigale.photometry.shapes.shapes import POINT_SIZE, major_radius, normal_nodes
 
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
 #: widths of the PSF.
-_HALF, _MOST, _REACH, _WIDTHS = 16, 160, 5.0, 4.0
+_HALF = 16
+_MOST = 160
+_REACH = 5.0
+_WIDTHS = 4.0
 
 #: Least power of a change (see `TemplateChanges.of`) below which stamps are larger than that.
 _SEEN = 0.01
@@ -50,115 +53,141 @@ class TemplateChanges:
     """
 
     def __init__(self, source, target, size_scatter):
-        self._source, self._target = ShapeModels(source), ShapeModels(target)
-        # of Gaussians as peaked as the PSFs
-        widths = [np.sum(psf) ** 2 / (4 * np.pi * np.sum(psf**2)) for psf in (target, source)]
-        self._width = np.sqrt(widths[0])
-        self._blur = np.sqrt(max(widths[0] - widths[1], 0.0))
+        self._source = ShapeModels(source)
+        self._target = ShapeModels(target)
+        target_variance = _gaussian_variance(target)
+        self._width = np.sqrt(target_variance)
+        self._blur = np.sqrt(max(target_variance - _gaussian_variance(source), 0.0))
         self._size_scatter = size_scatter
 
-    def of(self, cutout, fitted, least):
+    def of(self, cutout, fitted, min_power):
         """
-        Changes of one template, and the variance of ln flux by noise of the pixels that are the image's.
+        Find the changes of one template, and the variance of ln flux by noise of the pixels that are the image's.
 
-        ``cutout`` is the template, None for a point, ``fitted`` what is known of it. Changes with less than the
-        part ``least`` of the root of the sum of squares of the template are left out.
+        Parameters
+        ----------
+        cutout : `~miricigale.photometry.detection.cutouts.Cutout` or None
+            The template, None for a point.
+        fitted : record of `~miricigale.photometry.shapes.shapes.FITTED`
+            What is known of it.
+        min_power : float
+            Changes with less than this part of the root of the template's sum of squares are left out.
+
+        Returns
+        -------
+        changes : list of `Change`
+        noise : float
+            The variance.
         """
-        if cutout is not None and cutout.rest is not None:
-            return self._of_image(cutout, fitted, least)
+        if cutout is not None and cutout.correction is not None:
+            return self._of_image(cutout, fitted, min_power)
         parameters = fitted["parameters"]
         middle = np.rint(parameters[:2])
         # the wings of a brighter source's changes are seen farther out
-        widths = _WIDTHS * np.clip(_SEEN / least, 1.0, 4.0)
-        reach = _REACH * np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
-        half = min(reach, _MOST) + widths * self._width
+        widths = _WIDTHS * np.clip(_SEEN / min_power, 1.0, 4.0)
+        half = min(_REACH * major_radius(parameters), _MOST) + widths * self._width
         half = int(np.ceil(max(half, _HALF)))
         plan = self._target.plan(2 * half + 1)
         # nodes about the mean, and the profile that is scaled
         covariance = fitted["covariance"][3:, 3:]
         nodes = parameters[2:] + normal_nodes() @ _root(covariance).T
-        nodes[:, 1] = np.clip(nodes[:, 1], *np.log(INDEX_RANGE))
+        low, high = np.log(INDEX_RANGE)
+        nodes[:, 1] = np.clip(nodes[:, 1], low, high)
         step = np.array([0.5 * self._size_scatter, 0.0, 0.0, 0.0])
-        some = [parameters[2:], parameters[2:] + step, parameters[2:] - step]
-        curves = shape_curves(plan.kx, plan.ky, np.concatenate([nodes, some]))
-        profile, *sides = curves[len(nodes) :]
+        best = [parameters[2:], parameters[2:] + step, parameters[2:] - step]
+        curves = shape_curves(plan.kx, plan.ky, np.concatenate([nodes, best]))
+        profile, larger, smaller = curves[len(nodes) :]
         curves = curves[: len(nodes)]
         # a point has no size
         odds = fitted["point"]
         base = np.ones_like(profile) if cutout is None else profile
         mean = (1.0 - odds) * curves.mean(axis=0) + odds
         steps = np.sqrt((1.0 - odds) / len(nodes)) * (curves - mean)
-        scatter = (1.0 - odds) * (sides[0] - sides[1])
+        scatter = (1.0 - odds) * (larger - smaller)
         steps = np.concatenate([steps, [np.sqrt(odds) * (1.0 - mean), scatter]])
         # light is blurred by what is not known of the center
-        kx, ky = plan.kx, plan.ky
+        kx = plan.kx
+        ky = plan.ky
         cxx, cxy, _, cyy = fitted["covariance"][1:3, 1:3].ravel()
         blur = np.exp(-0.5 * (cxx * kx * kx + 2 * cxy * kx * ky + cyy * ky * ky))
-        limit = least**2 * np.sum(plan.weight * base**2)
+        limit = min_power**2 * np.sum(plan.weight * base**2)
         value, vector = np.linalg.eigh((steps * plan.weight) @ steps.T)
-        kept = value > limit
-        found = np.concatenate([vector.T[kept] @ steps, [mean * blur - base]])
-        fixed = np.sum(plan.weight * found[-1] ** 2) > limit
-        place = parameters[:2] - middle + half
-        found = (found if fixed else found[:-1]).astype(np.float32)
-        if not len(found):
+        is_strong = value > limit
+        directions = np.concatenate([vector.T[is_strong] @ steps, [mean * blur - base]])
+        # the last is no deviation, but what the mean of all that is possible has beyond the best
+        fixed = np.sum(plan.weight * directions[-1] ** 2) > limit
+        x, y = parameters[:2] - middle + half
+        if not fixed:
+            directions = directions[:-1]
+        if not len(directions):
             return [], 0.0
-        images = draw_curves(plan, found, *place, 0).swapaxes(0, 1)
+        images = draw_curves(plan, directions.astype(np.float32), x, y, 0).swapaxes(0, 1)
         origin = int(middle[1]) - half, int(middle[0]) - half
-        last = len(images) - 1 if fixed else len(images)
-        return [Change(Cutout(one, origin), fixed=k == last) for k, one in enumerate(images)], 0.0
+        changes = [Change(Cutout(image, origin)) for image in images]
+        if fixed:
+            changes[-1] = dataclasses.replace(changes[-1], fixed=True)
+        return changes, 0.0
 
-    def _of_image(self, cutout, fitted, least):
+    def _of_image(self, cutout, fitted, min_power):
         """The same where the core is the image: its own noise, and the profile elsewhere."""
-        profile, rest = cutout.layers
-        shape, corner = rest.data.shape, np.array(rest.origin)
-        core = rest.data != 0
+        profile, remainder = cutout.layers
+        shape = remainder.data.shape
+        corner = np.array(remainder.origin)
+        core = remainder.data != 0
         parameters = fitted["parameters"] - np.array([corner[1], corner[0], 0, 0, 0, 0])
         image = self._source.convolve(profile.data[None], profile.origin - corner, shape)[0]
-        image = image + rest.data
+        image = image + remainder.data
         images = self._source.profiles(shape, parameters, 6)
         images = np.where(core, 0.0, fitted["light"] * images)
         # the full profile's light, of which that in the core is replaced by the image's
         light = images.sum(axis=(1, 2))
-        template, *derivatives = self._blurred(np.stack([image, *images]))
+        blurred = self._blurred(np.concatenate([image[None], images]))
+        template = blurred[0]
+        derivatives = blurred[1:]
         power = np.sum(template**2)
-        changes = [
-            Change(Cutout(np.tensordot(step, derivatives, 1), rest.origin), float(step @ light))
-            for step in _steps(_root(fitted["covariance"]), derivatives, least**2 * power)
-        ]
+        changes = []
+        for step in _steps(_root(fitted["covariance"]), derivatives, min_power**2 * power):
+            cutout_of_step = Cutout(np.tensordot(step, derivatives, 1), remainder.origin)
+            changes.append(Change(cutout_of_step, float(step @ light)))
         # more or less of the light may be in the middle than in the other band, unless a point on top of it
         # is that light: the center is open only then
-        middle = self._target.profiles(shape, [*parameters[:2], POINT_SIZE, 0.0, 0.0, 0.0])[0]
-        middle = middle - self._blurred(rest.data)
+        point = np.array([parameters[0], parameters[1], POINT_SIZE, 0.0, 0.0, 0.0])
+        middle = self._target.profiles(shape, point)[0]
+        middle = middle - self._blurred(remainder.data)
         middle -= self._target.convolve(profile.data[None], profile.origin - corner, shape)[0]
-        seen = self._size_scatter**2 * np.sum(middle**2) > least**2 * power
-        if seen and not fitted["covariance"][1, 1]:
-            changes.append(Change(Cutout(self._size_scatter * middle, rest.origin)))
+        is_strong = self._size_scatter**2 * np.sum(middle**2) > min_power**2 * power
+        if is_strong and not fitted["covariance"][1, 1]:
+            changes.append(Change(Cutout(self._size_scatter * middle, remainder.origin)))
         # each pixel adds to the light, and to what is taken off by the fit
         weight = 1.0 - self._blurred(template) / power
-        each = cutout.noise / max(np.count_nonzero(core), 1)
-        return changes, float(each * np.sum(weight[core] ** 2))
+        pixel_variance = cutout.noise / max(np.count_nonzero(core), 1)
+        return changes, float(pixel_variance * np.sum(weight[core] ** 2))
 
     def pixel_noise(self, cutout):
         """Variance of ln flux by the noise of a cutout's pixels."""
         template = self._blurred(cutout.data.astype(float))
-        seen = cutout.data != 0
+        has_light = cutout.data != 0
         weight = 1.0 - self._blurred(template) / np.sum(template**2)
-        return float(cutout.noise * np.mean(weight[seen] ** 2))
+        return float(cutout.noise * np.mean(weight[has_light] ** 2))
 
     def _blurred(self, images):
-        """Images, (..., ny, nx), as blurred as the image is beside the high-resolution one."""
+        """Blur images, (..., ny, nx), as much as the image is blurred compared with the high-resolution one."""
         return scipy.ndimage.gaussian_filter(images, self._blur, mode="constant", axes=(-2, -1))
 
 
+def _gaussian_variance(psf):
+    """Variance along an axis (pixels^2) of a Gaussian as peaked as a PSF."""
+    return np.sum(psf) ** 2 / (4 * np.pi * np.sum(psf**2))
+
+
 def _root(covariance):
-    """A root of a covariance that may be singular."""
+    """Return a root of a covariance that may be singular."""
     value, vector = np.linalg.eigh(covariance)
     return vector * np.sqrt(np.maximum(value, 0.0))
 
 
-def _steps(root, derivatives, least):
-    """Steps of the parameters that are independent in the image, of those with enough power."""
+def _steps(root, derivatives, min_power):
+    """Find steps of the parameters that are independent in the image, and have enough power there."""
     flat = np.reshape(derivatives, (len(derivatives), -1))
     value, vector = np.linalg.eigh(root.T @ (flat @ flat.T) @ root)
-    return [root @ vector[:, k] for k in range(len(value)) if value[k] > least]
+    return [root @ vector[:, k] for k in range(len(value)) if value[k] > min_power]

@@ -49,19 +49,19 @@ class FineTemplates:
     @functools.cached_property
     def _points(self):
         """Coefficients of the point source at each place, shape (k, h, w), its center in the middle."""
-        found = [convolve_padded(one, self._response) for one in self.target]
-        return np.concatenate(found, dtype=np.float32)
+        coefficients = [convolve_padded(psf, self._response) for psf in self.target]
+        return np.concatenate(coefficients, dtype=np.float32)
 
     def points(self, weights):
         """
-        Coefficients of point sources, (m, h, w), the center in the middle, and which is each source's, (n,).
+        Return coefficients of point sources, (m, h, w), the center in the middle, and the number of each source's.
 
         ``weights``, (n, k), are what each place's PSF counts for each source.
         """
         if len(self.target) == 1:
             return self._points, np.zeros(len(weights), int)
-        alike, which = np.unique(weights, axis=0, return_inverse=True)
-        return np.tensordot(np.float32(alike), self._points, axes=1), which.reshape(-1)
+        alike, member = np.unique(weights, axis=0, return_inverse=True)
+        return np.tensordot(np.float32(alike), self._points, axes=1), member.reshape(-1)
 
     @functools.cached_property
     def kernel_power(self):
@@ -69,7 +69,7 @@ class FineTemplates:
         kernels = self.kernel
         if self.sides is not None:
             response = functools.partial(box_response, sides=self.sides)
-            kernels = np.concatenate([convolve_padded(one, response) for one in kernels])
+            kernels = np.concatenate([convolve_padded(kernel, response) for kernel in kernels])
         flat = kernels.reshape(len(kernels), -1)
         return flat @ flat.T
 
@@ -84,38 +84,40 @@ class FineTemplates:
         return np.complex64(transfer * self._response(shape))
 
     def _transfers(self, shape, convolved, weights):
-        """The transform for each of some sources, or for all if they are alike."""
-        used = np.flatnonzero(weights.any(axis=0))
-        found = [self._transfer(shape, convolved, int(k)) for k in used]
-        if len(used) == 1:
-            return found[0]
-        parts = zip(np.float32(weights.T[used]), found, strict=True)
-        return sum(w[:, None, None] * one for w, one in parts)
+        """Return the transform of the kernel for each of some sources, or one for all if they are alike."""
+        places = np.flatnonzero(weights.any(axis=0))
+        transfers = [self._transfer(shape, convolved, int(k)) for k in places]
+        if len(places) == 1:
+            return transfers[0]
+        parts = zip(np.float32(weights.T[places]), transfers, strict=True)
+        total = 0
+        for weight, transfer in parts:
+            total = total + weight[:, None, None] * transfer
+        return total
 
     def _size(self, cutout):
-        """Size (y, x) of what a cutout is convolved with."""
+        """Return the size (y, x), in fine pixels, of the kernel or PSF that a cutout is convolved with."""
         return (self.kernel if cutout.convolved else self.target).shape[1:]
 
     def shape(self, cutout):
-        """Shape of the transform for a cutout, rounded up so that many share it."""
-        return tuple(
-            scipy.fft.next_fast_len(-(-(n + m - 1 + 2 * RIM) // 16) * 16, True)
-            for n, m in zip(cutout.data.shape, self._size(cutout), strict=True)
-        )
+        """Return the shape of the transform for a cutout, rounded up so that many share it."""
+        sizes = np.add(cutout.data.shape, self._size(cutout)) - 1 + 2 * RIM
+        ny, nx = (-(-sizes // 16) * 16).tolist()
+        return scipy.fft.next_fast_len(ny, True), scipy.fft.next_fast_len(nx, True)
 
     def corner(self, cutout):
-        """Fine pixel (x, y) of the first coefficient of a convolved cutout."""
+        """Return the fine pixel (x, y) of the first coefficient of a convolved cutout."""
         return np.array(cutout.origin[::-1]) - self._size(cutout)[0] // 2 - RIM
 
     def sides_of(self, cutout):
-        """First and last fine (x, y) that the light of a convolved cutout reaches."""
+        """Return the first and last fine (x, y) that the light of a convolved cutout reaches."""
         first = self.corner(cutout) + RIM - 1.0
         return first, first + np.add(cutout.data.shape, self._size(cutout))[::-1]
 
     def coefficients(self, group, shape, weights):
         """Convolve cutouts of one shape, returning an array of shape (n, *shape)."""
-        size = np.max([cutout.data.shape for cutout in group], axis=0) + RIM
-        stamps = np.zeros((len(group), *size), np.float32)
+        height, width = np.max([cutout.data.shape for cutout in group], axis=0) + RIM
+        stamps = np.zeros((len(group), height, width), np.float32)
         for stamp, cutout in zip(stamps, group, strict=True):
             h, w = cutout.data.shape
             stamp[RIM : RIM + h, RIM : RIM + w] = cutout.data
@@ -147,18 +149,19 @@ class Block:
         """Values, boxes and starts, as the kernels take them."""
         return self.values, self.box, self.start
 
-    def some(self, part):
-        """The same of a slice of the block's rows."""
+    def stamps_of(self, part):
+        """Return `stamps` of a slice of the block's rows."""
         return self.values, self.box[part], self.start[part.start : part.stop + 1]
 
     def parts(self):
-        """Slices of the block's own rows (0 for its first), of some hundred thousand pixels each."""
+        """Cut the block's rows (0 for its first) into slices of some hundred thousand pixels each."""
         return _pieces(self.start, _PART)
 
 
 def _pieces(start, size):
-    """Slices of stamps that begin at ``start`` in a flat array, of some ``size`` pixels each."""
-    first, n = 0, len(start) - 1
+    """Cut stamps that begin at ``start`` in a flat array into slices of some ``size`` pixels each."""
+    first = 0
+    n = len(start) - 1
     while first < n:
         last = int(np.searchsorted(start, start[first] + size, side="right")) - 1
         last = min(max(last, first + 1), n)
@@ -227,21 +230,26 @@ class TemplateBank:
     def __post_init__(self):
         sources = self.sources
         n = len(sources.cutout)
-        self._weights = np.ones((n, 1)) if self.weigh is None else self.weigh(sources.xy)
+        self._weights = np.ones((n, 1))
+        if self.weigh is not None:
+            self._weights = self.weigh(sources.xy)
         box = self._boxes(self.shape)
         self.order = np.argsort(box[:, 0], kind="stable")
         self.box = np.ascontiguousarray(box[self.order])
         self.start = np.concatenate([[0], np.cumsum(self.box[:, 2] * self.box[:, 3])])
-        self._kept, self._same = None, {}
+        self._kept = None
+        self._same = {}
 
     def _boxes(self, shape):
-        """Boxes on the image that hold the fine stamps, cut to the image."""
+        """Return boxes on the image that hold the fine stamps, cut to the image."""
         half = self.fine.target.shape[1] // 2 + 1
-        low, high = self.sources.fine_xy - half, self.sources.fine_xy + half
+        low = self.sources.fine_xy - half
+        high = self.sources.fine_xy + half
         for k, cutout in enumerate(self.sources.cutout):
             if cutout is not None:
-                sides = np.array([self.fine.sides_of(one) for one in cutout.layers])
-                low[k], high[k] = sides[:, 0].min(axis=0), sides[:, 1].max(axis=0)
+                sides = np.array([self.fine.sides_of(layer) for layer in cutout.layers])
+                low[k] = sides[:, 0].min(axis=0)
+                high[k] = sides[:, 1].max(axis=0)
         # the middle of the fine rectangle through the inverse of the linear map, and its half sides
         matrix = np.linalg.inv(self.sources.poly[:, :, 1:3])
         middle = 0.5 * (low + high) - self.sources.poly[:, :, 0]
@@ -259,19 +267,20 @@ class TemplateBank:
     def with_points(self, xy, poly):
         """Make the bank of the same sources and, after them, of point sources at positions."""
         old = self.sources
-        more = BankSources(
-            [*old.cutout, *[None] * len(xy)],
+        sources = BankSources(
+            list(old.cutout) + [None] * len(xy),
             np.concatenate([old.fine_xy, poly[:, :, 0]]),
             np.concatenate([old.xy, xy]),
             np.concatenate([old.poly, poly]),
         )
-        return dataclasses.replace(self, sources=more)
+        return dataclasses.replace(self, sources=sources)
 
     def at_resolution(self, rows, cutout):
         """Make the bank of cutouts that have the image's resolution, at some of the sources."""
-        one, old = np.ones((1, 1)), self.sources
+        unit = np.ones((1, 1))
+        old = self.sources
         sources = BankSources(cutout, old.fine_xy[rows], old.xy[rows], old.poly[rows])
-        fine = dataclasses.replace(self.fine, kernel=one, target=one)
+        fine = dataclasses.replace(self.fine, kernel=unit, target=unit)
         return dataclasses.replace(self, sources=sources, fine=fine, weigh=None)
 
     def reuse(self, other):
@@ -280,26 +289,30 @@ class TemplateBank:
 
         The other forgets its own. Nothing is taken where memory does not hold both.
         """
-        kept, n = other._kept, min(len(self.order), len(other.order))
+        kept_blocks = other._kept
+        n = min(len(self.order), len(other.order))
         other.forget()
-        if kept is None or 8.0 * self.start[-1] > self.max_bytes:
+        if kept_blocks is None or 8.0 * self.start[-1] > self.max_bytes:
             return
-        stamps = [
-            one.values[slice(*ends)] for one in kept for ends in itertools.pairwise(one.start)
-        ]
-        mine, theirs = (
-            np.hstack([one.xy, one.poly.reshape(-1, 12)]) for one in (self.sources, other.sources)
-        )
-        same = (mine[:n] == theirs[:n]).all(axis=1)
-        self._same = {k: stamps[row] for row, k in enumerate(other.order) if k < n and same[k]}
+        mine = self.sources
+        theirs = other.sources
+        is_same = (mine.xy[:n] == theirs.xy[:n]).all(axis=1)
+        is_same &= (mine.poly[:n] == theirs.poly[:n]).all(axis=(1, 2))
+        self._same = {}
+        for block in kept_blocks:
+            for row, (start, end) in enumerate(itertools.pairwise(block.start)):
+                source = other.order[block.first + row]
+                if source < n and is_same[source]:
+                    self._same[source] = block.values[start:end]
 
     def parts(self, rows):
-        """The cutouts of some rows, None for points."""
+        """Return the cutouts of some rows, None for points."""
         return [self.sources.cutout[k] for k in self.order[rows]]
 
     def forget(self):
         """Free the templates that are kept; they are made anew if they are needed again."""
-        self._kept, self._same = None, {}
+        self._kept = None
+        self._same = {}
 
     def map(self, function, parts):
         """Call a function with each of some independent pieces of work, on the bank's threads."""
@@ -311,15 +324,18 @@ class TemplateBank:
         return self.sources.xy[self.order]
 
     def noise_terms(self):
-        """Sum over unit-weight pixels of the templates' variance, by row."""
-        noise = np.array([0.0 if one is None else one.noise for one in self.sources.cutout])
+        """Return the sum over unit-weight pixels of the templates' variance by noise, by row."""
+        noise = np.zeros(len(self.sources.cutout))
+        for k, cutout in enumerate(self.sources.cutout):
+            if cutout is not None:
+                noise[k] = cutout.noise
         area = np.abs(np.linalg.det(self.sources.poly[:, :, 1:3]))
         # sums of squares of each source's kernel
         power = np.einsum("nk,kl,nl->n", self._weights, self.fine.kernel_power, self._weights)
         return (noise * area * power)[self.order]
 
     def full_light(self):
-        """Light of a whole point source, by row."""
+        """Return the light of a whole point source, by row."""
         return (self._weights @ self.fine.target.sum(axis=(1, 2)))[self.order]
 
     def blocks(self):
@@ -327,33 +343,38 @@ class TemplateBank:
         if self._kept is not None:
             yield from self._kept
             return
-        keep, kept = 4.0 * self.start[-1] <= self.max_bytes, []
+        keep = 4.0 * self.start[-1] <= self.max_bytes
+        blocks = []
         for rows in _pieces(self.start, 40 * _PART):
             block = self._make(rows.start, rows.stop)
             if keep:
-                kept.append(block)
+                blocks.append(block)
             yield block
         if keep:
-            self._kept, self._same = kept, {}
+            self._kept = blocks
+            self._same = {}
 
     def _make(self, first, last):
         fine = self.fine
         start = self.start[first : last + 1] - self.start[first]
         block = Block(first, self.box[first:last], start, np.zeros(int(start[-1]), np.float32))
         sources = self.order[first:last]
-        cutout = [self.sources.cutout[k] for k in sources]
         needed = (block.box[:, 2] > 0) & (block.box[:, 3] > 0)
+        is_point = np.zeros(len(sources), bool)
+        layers = []
         for row, source in enumerate(sources):
+            cutout = self.sources.cutout[source]
+            if cutout is None:
+                is_point[row] = True
+            else:
+                layers += [(row, layer) for layer in cutout.layers]
             if source in self._same:
                 block.values[start[row] : start[row + 1]] = self._same[source]
                 needed[row] = False
-        points = np.flatnonzero([one is None for one in cutout] & needed)
-        layers = [
-            (row, one) for row, all_of in enumerate(cutout) if all_of for one in all_of.layers
-        ]
+        points = np.flatnonzero(is_point & needed)
         weights = self._weights[sources]
 
-        def add(coefficients, which, amplitude, rows, origin):
+        def add(coefficients, member, amplitude, rows, origin):
             # sums of a piece in double precision, where each stamp begins anew
             box = block.box[rows]
             poly = self.sources.poly[sources[rows]]
@@ -361,7 +382,7 @@ class TemplateBank:
             begin = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
             sums = np.zeros(int(begin[-1]))
             center = self.sources.xy[sources[rows]]
-            sample_stamps(coefficients, which, amplitude, center, poly, box, begin, sums)
+            sample_stamps(coefficients, member, amplitude, center, poly, box, begin, sums)
             for k, low, high in zip(rows, begin[:-1], begin[1:], strict=True):
                 block.values[start[k] : start[k + 1]] += sums[low:high]
 
@@ -369,27 +390,29 @@ class TemplateBank:
             rows = np.intersect1d(points, np.arange(part.start, part.stop))
             if len(rows) == 0:
                 return
-            point, which = fine.points(weights[rows])
+            point, member = fine.points(weights[rows])
             middle = (np.array(point.shape[2:0:-1]) - 1) / 2
             origin = self.sources.fine_xy[sources[rows]] - middle
-            add(point, which, np.ones(len(rows)), rows, origin)
+            add(point, member, np.ones(len(rows)), rows, origin)
 
         def add_cutouts(batch):
-            (*shape, _, _), members = batch
+            (ny, nx, _), members = batch
             rows = np.array([layers[k][0] for k in members])
             group = [layers[k][1] for k in members]
-            origin = np.array([fine.corner(one) for one in group])
-            found = fine.coefficients(group, tuple(shape), weights[rows])
-            add(found, np.arange(len(rows)), np.ones(len(rows)), rows, origin)
+            origin = np.array(list(map(fine.corner, group)))
+            coefficients = fine.coefficients(group, (ny, nx), weights[rows])
+            add(coefficients, np.arange(len(rows)), np.ones(len(rows)), rows, origin)
 
         self.map(add_points, block.parts())
         # profiles first, what is added to them afterwards
-        for rest in (False, True):
-            shapes = (
-                (*fine.shape(one), one.convolved, rest)
-                if needed[row] and rest == (one is not cutout[row])
-                else None
-                for row, one in layers
-            )
-            self.map(add_cutouts, batches(shapes))
+        first_layers = [None] * len(layers)
+        corrections = [None] * len(layers)
+        for k, (row, layer) in enumerate(layers):
+            if needed[row]:
+                is_first = layer is self.sources.cutout[sources[row]]
+                shapes = first_layers if is_first else corrections
+                ny, nx = fine.shape(layer)
+                shapes[k] = ny, nx, layer.convolved
+        self.map(add_cutouts, batches(first_layers))
+        self.map(add_cutouts, batches(corrections))
         return block

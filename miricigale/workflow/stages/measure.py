@@ -83,7 +83,7 @@ def join_detections(context, _):
         xy = np.transpose(wcs.world_to_pixel(table["sky"]))
         table["patch"] = name
         table["label"] = table["id"]
-        tables.append(table[grid.near(grid.names.index(name), xy, RIM)])
+        tables.append(table[grid.is_near(grid.names.index(name), xy, RIM)])
     joined = vstack(tables, metadata_conflicts="silent")
     numbers = np.array([grid.names.index(name) for name in joined["patch"]])
     xy = np.transpose(wcs.world_to_pixel(joined["sky"]))
