@@ -27,7 +27,7 @@ from miricigale.photometry import (
     read_prior,
 )
 from miricigale.photometry.commands.kernel_files import matching_kernel
-from miricigale.photometry.commands.page import _empty_positions
+from miricigale.photometry.commands.page import empty_positions
 from miricigale.psf import (
     MatchingKernel,
     encircled_energy,
@@ -246,7 +246,7 @@ def field(folder):
         )
         chi2 = result.chi2[bright]
         used = kernel if result.psf_stars is None else result.psf_stars.kernel
-        empty = _empty_positions(result, 1)
+        empty = empty_positions(result, 1)
         blank = ForcedPhotometer(used, template="psf").measure(result.residual_image, catalog=empty)
         pulls, depth = np.std(blank.snr), 5 * np.median(blank.flux_err.value) * 1e3
         print(

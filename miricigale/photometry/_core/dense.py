@@ -24,6 +24,7 @@ def cholesky(matrix):
     factor = np.zeros((n, n))
     for i in range(n):
         for j in range(i + 1):
+            # the factor's row i, from the rows above
             total = matrix[i, j]
             for k in range(j):
                 total -= factor[i, k] * factor[j, k]
@@ -53,11 +54,13 @@ def solve_factor(factor, right):
     n = len(factor)
     solution = np.empty(n)
     for i in range(n):
+        # forward substitution
         total = right[i]
         for k in range(i):
             total -= factor[i, k] * solution[k]
         solution[i] = total / factor[i, i]
     for i in range(n - 1, -1, -1):
+        # back substitution
         total = solution[i]
         for k in range(i + 1, n):
             total -= factor[k, i] * solution[k]

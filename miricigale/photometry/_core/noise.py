@@ -36,6 +36,7 @@ def autocorrelation(rows, strips, lag, map_parts=map):
             scipy.fft.next_fast_len(nx + lag, True),
         ]
         spectrum = scipy.fft.rfft2(image, s=shape)
+        # the autocorrelation is the transform of the power spectrum
         power = spectrum.real**2
         power += spectrum.imag**2
         return scipy.fft.irfft2(power, s=shape, overwrite_x=True)[half_plane].astype(float)
@@ -58,6 +59,7 @@ def autocorrelation(rows, strips, lag, map_parts=map):
     # the half plane of negative separations is the mirror of the other
     full = np.concatenate([sums[:, :0:-1, ::-1], sums], axis=1)
     pairs = np.maximum(np.rint(full[1]), 1.0)
+    # mean product of a pair, and its error by the number of pairs
     covariance = full[0] / pairs
     covariance = 0.5 * (covariance + covariance[::-1, ::-1])
     variance = covariance[lag, lag]

@@ -115,6 +115,7 @@ def sample_stamps(coefficients, fine_stamp, amplitude, center, poly, box, start,
         for y in range(box[k, 0], box[k, 0] + box[k, 2]):
             v = y - center[k, 1]
             for m in range(nx):
+                # offset of the pixel from the source
                 u = box[k, 1] + m - center[k, 0]
                 fx[m] = (
                     px[0] + px[1] * u + px[2] * v + px[3] * u * u + px[4] * u * v + px[5] * v * v
@@ -125,6 +126,7 @@ def sample_stamps(coefficients, fine_stamp, amplitude, center, poly, box, start,
             _quintic(fx[:nx], ix, wx)
             _quintic(fy[:nx], iy, wy)
             for m in range(nx):
+                # nodes of the six by six that a quintic spline needs
                 first_row = iy[m] - 2
                 first_column = ix[m] - 2
                 value = 0.0

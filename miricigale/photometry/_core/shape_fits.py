@@ -72,13 +72,15 @@ def make_plan(size, transform, passed):
 
 @njit(cache=True, nogil=True)
 def _placed(plan, x, y):
-    """The PSF's transform moved to a place, (4, ny, nx): its two parts, the real and the imaginary one of each."""
+    """Move the PSF's transform to a place, (4, ny, nx): its two parts, the real and the imaginary one of each."""
     _, ny, nx = plan.response.shape
     along = np.empty(nx, np.complex64)
     for j in range(nx):
+        # the shift theorem, along x
         along[j] = np.exp(-1j * x * plan.kx[j])
     placed = np.empty((4, ny, nx), np.float32)
     for i in range(ny):
+        # and along y
         turn = np.complex64(np.exp(-1j * y * plan.ky[i * nx]))
         for j in range(nx):
             positive = plan.response[0, i, j] * along[j] * turn
@@ -114,11 +116,13 @@ def _images(plan, curves, placed, n_moved):
                 right[i, c, nx + j] = positive_imag + negative_imag
                 right[ny + i, c, j] = negative_imag - positive_imag
                 right[ny + i, c, nx + j] = positive_real - negative_real
+    # inverse transforms along y, then along x, as products of matrices
     middle = np.dot(plan.inner[0], right.reshape(2 * ny, -1)).reshape(size, n, 2 * nx)
     images = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0]).reshape(size, n, size)
     if n_moved < n:
         middle = middle[:, :n_moved].copy()
         right = right[:, :n_moved].copy()
+    # derivatives: the waves of one axis are replaced by their slopes
     along_x = np.dot(middle.reshape(-1, 2 * nx), plan.outer[1])
     middle = np.dot(plan.inner[1], right.reshape(2 * ny, -1))
     along_y = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0])
@@ -180,6 +184,7 @@ def _products(plan, table, inverse, corners, parameters, columns):
         shape = parameters[s, 2:]
         first = s * k
         fill_curves(plan.kx, plan.ky, shape, table, curves.reshape(len(curves), -1))
+        # each source is drawn on a square of its own
         placed = _placed(plan, parameters[s, 0] - corners[s, 0], parameters[s, 1] - corners[s, 1])
         images, along_x, along_y = _images(plan, curves, placed, n_moved)
         x = corners[s, 0] - x0
@@ -205,11 +210,13 @@ def _state(products, parameters, mean, precision):
             power[s, t] = products[s * k, t * k]
         # those without light have none
         power[s, s] += 1e-12 * power[s, s] + 1e-300
+    # the light that fits best: linear least squares for given shapes
     flux = solve_factor(cholesky(power), products[last, :last:k])
     matrix = np.empty((last, last))
     slope = np.empty(last)
     chi2 = products[last, last]
     for i in range(last):
+        # the gradient, and chi^2, with that light
         projection = products[i, last]
         slope[i] = projection
         for s in range(n):
@@ -240,7 +247,7 @@ def _state(products, parameters, mean, precision):
 @njit(cache=True, nogil=True)
 def _step(matrix, slope, parameters, limits, damping):
     """
-    Damped Newton step of light and parameters, (n (1 + m),), and the gain in chi^2 without the damping.
+    Calculate a damped Newton step of light and parameters, (n (1 + m),), and the gain in chi^2 without damping.
 
     Parameters that are at a limit, and would go beyond it, stay there (Bertsekas 1982, SIAM J. Control Optim. 20,
     221).
@@ -249,6 +256,7 @@ def _step(matrix, slope, parameters, limits, damping):
     damped = matrix.copy()
     free_slope = slope.copy()
     for k in range(len(slope)):
+        # Marquardt's damping of the diagonal
         damped[k, k] += damping * matrix[k, k]
     for s in range(n):
         for j in range(m):
@@ -271,7 +279,7 @@ def _step(matrix, slope, parameters, limits, damping):
 @njit(cache=True, nogil=True)
 def minimum(plan, table, white, inverse, corners, start, mean, precision, limits, steps, gain):
     """
-    Levenberg-Marquardt for the light and the first parameters of sources, with Gaussian priors.
+    Fit the light and the first parameters of sources, with Gaussian priors, after Levenberg and Marquardt.
 
     Parameters
     ----------
@@ -333,6 +341,7 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
         trial = parameters.copy()
         for s in range(n):
             for j in range(m):
+                # steps are limited to 1 in each parameter, and to the limits
                 moved = trial[s, j] + min(max(step[s * k + 1 + j], -1.0), 1.0)
                 trial[s, j] = min(max(moved, limits[0, j]), limits[1, j])
         if gained < gain:
@@ -342,6 +351,7 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
             chi2 = chi2 - gained
             break
     factor = cholesky(matrix)
+    # Laplace's approximation of the integral over all parameters
     evidence = -0.5 * (chi2 + log_determinant(factor))
     covariance = np.empty((n, k, k))
     # without a positive matrix the evidence is no number
@@ -351,6 +361,7 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     for s in range(n):
         evidence += 0.5 * log_determinant(cholesky(precision[s]))
         covariance[s] = joint_covariance[s * k : (s + 1) * k, s * k : (s + 1) * k]
+        # from flux to ln flux
         covariance[s, 0] /= flux[s]
         covariance[s, :, 0] /= flux[s]
     return chi2, flux, parameters, evidence, covariance, matrix
@@ -358,7 +369,7 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _center_products(images, along_x, along_y, s, inverse, white, products):
-    """Products, (3, 4), of a whitened model and its derivatives to the center, with these and the data."""
+    """Sum products, (3, 4), of a whitened model and its derivatives to the center with these and the data."""
     aa = ab = ac = ad = bb = bc = bd = cc = cd = 0.0
     for row in range(len(images)):
         for i in range(len(images)):
@@ -386,7 +397,7 @@ def evidence_of(
     plan, table, white, inverse, corners, best, flux, shapes, mean, precision, neighbors
 ):
     """
-    Likelihoods of shapes of a source, with the light, the center and the neighbors that fit best.
+    Calculate likelihoods of shapes of a source, with the light, center and neighbors that fit best.
 
     Parameters
     ----------

@@ -42,9 +42,11 @@ def profile_table():
     rows = np.ones((len(log_n), _NODES))
     at = 4 * np.log(np.maximum(_STEP * np.arange(_NODES), np.exp(_POINT / 4)))
     for row, n in zip(rows, np.exp(log_n), strict=True):
+        # b_n of the profile, by which R_e holds half of the light
         bn = scipy.special.gammaincinv(2 * n, 0.5)
         log_light = 2 * n * np.log(bn) - scipy.special.gammaln(2 * n) + 2 * log_r
         light = np.exp(log_light - bn * np.exp(log_r / n)) / n  # d light / d ln R
+        # the Hankel transform on a logarithmic grid
         transform = scipy.fft.fht(light * np.exp(-log_r), step, 0.0) * np.exp(-log_k)
         row[:] = np.where(at > _POINT, scipy.interpolate.CubicSpline(log_k, transform)(at), 1.0)
     return scipy.interpolate.CubicSpline(log_n, rows).c
@@ -53,6 +55,7 @@ def profile_table():
 @njit(cache=True, nogil=True)
 def profile_of(table, log_n, changes):
     """Return the transform of one index at the nodes, and its derivative to ln n if ``changes`` is True."""
+    # the interval of the spline in ln n
     place = (log_n - _FIRST) / _INDEX_STEP
     m = min(max(int(place), 0), table.shape[1] - 1)
     t = _INDEX_STEP * (place - m)
@@ -118,6 +121,7 @@ def fill_curves(kx, ky, shape, table, out):
         b = profile[0, m]
         e = profile[0, m + 1]
         f = profile[0, m + 2]
+        # cubic through four nodes (Catmull-Rom)
         c1 = np.float32(0.5) * (e - a)
         c2 = a - np.float32(2.5) * b + np.float32(2.0) * e - np.float32(0.5) * f
         c3 = np.float32(0.5) * (f - a) + np.float32(1.5) * (b - e)
@@ -127,6 +131,7 @@ def fill_curves(kx, ky, shape, table, out):
             slope = 0.25 * place * (c1 + t * (2.0 * c2 + 3.0 * t * c3))
             x = kx[i]
             y = ky[i]
+            # derivatives to the two ellipticities, by those of (k R_e)^2
             k2 = x * x + y * y
             d = x * x - y * y
             c = 2.0 * x * y

@@ -79,6 +79,7 @@ def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None,
         Diagonal of H.
     """
     n = matrix.shape[0]
+    # to a unit diagonal, for numerical stability
     scale = 1.0 / np.sqrt(matrix.diagonal())
     unit = scipy.sparse.diags_array(scale)
     matrix = (unit @ matrix @ unit).tocsr()
@@ -108,6 +109,7 @@ def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None,
         for middle, elements in zip(scaled_middles, values, strict=True):
             block = inverse
             if middle is not None:
+                # H M H of the block
                 block = inverse @ _dense(*middle, members, place) @ inverse
             elements.append(block[i, j])
         place[members] = -1
@@ -116,6 +118,7 @@ def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None,
 
     def matrix_of(elements):
         data = np.concatenate(elements) * scale[rows] * scale[columns]
+        # each element stands in the block of its row: the mean with the transpose is symmetric
         half = scipy.sparse.coo_array((data, (rows, columns)), shape=(n, n)).tocsr()
         return ((half + half.T) * 0.5).tocsr()
 
@@ -123,13 +126,13 @@ def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None,
 
 
 def _arrays(matrix):
-    """Starts of the rows, columns and values of a sparse matrix, as the kernels take them."""
+    """Return starts of the rows, columns and values of a sparse matrix, as the kernels take them."""
     return matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), matrix.data
 
 
 @njit(cache=True, nogil=True)
 def _dense(start, column, data, members, place):
-    """Some rows and columns of a sparse matrix; ``place``, (n,), is that of each among them, or -1."""
+    """Fill some rows and columns of a sparse matrix; ``place``, (n,), is that of each among them, or -1."""
     block = np.zeros((len(members), len(members)))
     for i, row in enumerate(members):
         for k in range(start[row], start[row + 1]):
@@ -141,7 +144,7 @@ def _dense(start, column, data, members, place):
 
 @njit(cache=True, nogil=True)
 def _elements(start, column, members, inner, place):
-    """Places, among some rows and columns, of the non-zeros in the inner ones of the rows."""
+    """Find the places, among some rows and columns, of the non-zeros in the inner ones of the rows."""
     capacity = 0
     for i, row in enumerate(members):
         if inner[i]:
@@ -168,6 +171,7 @@ def _blocks(n, y, x, core, halo, exact):
     order = np.argsort(y, kind="stable")
     ys = y[order]
     for row in np.unique(iy):
+        # a row of blocks with its halo
         low, high = np.searchsorted(ys, [row * core - halo, (row + 1) * core + halo])
         strip = order[low:high]
         for column in np.unique(ix[iy == row]):

@@ -12,6 +12,7 @@ def _sweep(box, grow, pairs):
     n = box.shape[0]
     count = 0
     for i in range(n):
+        # the box of stamp i, grown to both sides
         y1 = box[i, 0] + box[i, 2] + grow
         x0 = box[i, 1] - grow
         x1 = box[i, 1] + box[i, 3] + grow
@@ -95,12 +96,14 @@ def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
     for k in range(pairs.shape[0]):
         i = pairs[k, 0]
         j = pairs[k, 1]
+        # the rectangle that the two stamps share
         y0 = max(a_box[i, 0], b_box[j, 0])
         y1 = min(a_box[i, 0] + a_box[i, 2], b_box[j, 0] + b_box[j, 2])
         x0 = max(a_box[i, 1], b_box[j, 1])
         x1 = min(a_box[i, 1] + a_box[i, 3], b_box[j, 1] + b_box[j, 3])
         total = 0.0
         for y in range(y0, y1):
+            # places of the shared row in the flat stamps
             na = a_start[i] + (y - a_box[i, 0]) * a_box[i, 3] - a_box[i, 1] + x0
             nb = b_start[j] + (y - b_box[j, 0]) * b_box[j, 3] - b_box[j, 1] + x0
             row_a = a[na : na + x1 - x0]
@@ -182,7 +185,7 @@ def add_model(image, values, box, start, flux):
 @njit(cache=True, nogil=True)
 def residual_statistics(values, box, start, residual, inverse_sigma, out):
     """
-    Template-weighted mean of (residual / sigma)^2, and the residual below the core.
+    Sum the template-weighted mean of (residual / sigma)^2, and the residual below the core.
 
     ``out`` has the shape (n, 3): mean square, sum of residuals over pixels where the
     template exceeds a tenth of its peak, and the template's own sum there.
@@ -201,6 +204,7 @@ def residual_statistics(values, box, start, residual, inverse_sigma, out):
                 t = values[n]
                 if t > 0.0 and inverse_sigma[y, x] > 0.0:
                     r = residual[y, x]
+                    # chi of the pixel, weighted by the template
                     z = r * inverse_sigma[y, x]
                     square += t * z * z
                     weight += t
@@ -233,6 +237,7 @@ def offset_sums(values, box, start, flux, at, half, model, residual, inverse_sig
         sums[:] = 0.0
         if min(last_row - first_row, last_column - first_column) < 5:
             continue
+        # the part of the stamp in the window about the source
         stamp = values[start[k] : start[k] + ny * nx].reshape(ny, nx)
         stamp = stamp[first_row - y0 : last_row - y0, first_column - x0 : last_column - x0]
         for j in range(stamp.shape[0]):
@@ -246,6 +251,7 @@ def offset_sums(values, box, start, flux, at, half, model, residual, inverse_sig
                 i0 = max(i - 1, 0)
                 i1 = min(i + 1, stamp.shape[1] - 1)
                 white = flux[k] * weight
+                # whitened light, its derivatives by the steps, and the residual
                 term[0] = white * stamp[j, i]
                 term[1] = white * (np.float64(stamp[j, i0]) - stamp[j, i1]) / (i1 - i0)
                 term[2] = white * (np.float64(stamp[j0, i]) - stamp[j1, i]) / (j1 - j0)

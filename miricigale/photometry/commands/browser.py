@@ -17,7 +17,7 @@ _PICTURES = 5000
 
 
 def browser_files(path):
-    """Page of the sources beside the page of a measurement, and the folder of its data."""
+    """Return the path of the page of the sources beside the page of a measurement, and the folder of its data."""
     path = Path(path)
     name = _browser_name(path)
     return path.with_name(f"{name}.html"), path.with_name(name)
@@ -29,7 +29,7 @@ def _browser_name(path):
 
 def write_browser(path, title, bands, highres, confidence, detected):
     """
-    Write the page of the sources beside the page of a measurement: its name.
+    Write the page of the sources beside the page of a measurement, and return its name.
 
     ``bands`` are as for `~miricigale.photometry.commands.page.write_page`, which has the other arguments too;
     fluxes below
@@ -38,6 +38,7 @@ def write_browser(path, title, bands, highres, confidence, detected):
     name = _browser_name(path)
     results = {band.name: band.result for band in bands}
     first = bands[0].result
+    # what a page of a source shows of each band: image, model and residual
     images = {}
     for band, result in results.items():
         image = result.residual_image.copy()
@@ -47,17 +48,32 @@ def write_browser(path, title, bands, highres, confidence, detected):
     pictures = Cutouts(highres, images)
     imaged = pictures.on_image(first.sky)
     best = np.max([np.nan_to_num(result.snr, nan=-np.inf) for result in results.values()], axis=0)
+    # sources with pictures first, by their best signal-to-noise
     order = np.lexsort((-best, ~imaged))
     shown = np.zeros(len(first), bool)
     shown[order[:_PICTURES]] = imaged[order[:_PICTURES]]
     columns = {"id": first.id, "ra": first.sky.ra.deg, "dec": first.sky.dec.deg}
-    limits = {band: result.upper_limit(confidence) for band, result in results.items()}
+    limits = {}
+    bands_of_page = []
+    waves = []
     for band, result in results.items():
+        limits[band] = result.upper_limit(confidence)
+        wave = Filter.from_name(band).pivot.value
+        waves.append(wave)
+        label = band.rpartition(".")[2].upper()
+        bands_of_page.append(
+            {"name": band, "label": label, "wave": rounded([wave])[0], "miri": True}
+        )
+        # magnitudes of detections, limits of all others
         is_limit = ~(result.snr > detected)
         mag = np.where(is_limit, ab_magnitude(limits[band]), ab_magnitude(result.flux))
         columns |= {f"mag_{band}": mag, f"limit_{band}": is_limit, f"sn_{band}": result.snr}
         columns |= {f"chi2_{band}": result.chi2, f"flags_{band}": result.flags}
-    waves = [Filter.from_name(band).pivot.value for band in results]
+    # the columns in the order of the page
+    table = {}
+    for key, values in columns.items():
+        digits = 9 if key in ("ra", "dec") else 4
+        table[key] = rounded(values[order], digits)
     facts = {
         "turn": float(grid_angle(highres.wcs, highres.shape).to_value("deg")),
         "report": path.name,
@@ -66,24 +82,20 @@ def write_browser(path, title, bands, highres, confidence, detected):
         "prior": str(highres.meta.get("filter", "")),
         "cutouts": pictures.describe(),
         "flags": {"photometry": ForcedFlags.meanings()},
-        "bands": [
-            {"name": k, "label": k.rpartition(".")[2].upper(), "wave": wave, "miri": True}
-            for k, wave in zip(results, rounded(waves), strict=True)
-        ],
+        "bands": bands_of_page,
         "wave": rounded([0.7 * min(waves), 1.4 * max(waves)]),
-        "table": {
-            key: rounded(values[order], 9 if key in ("ra", "dec") else 4)
-            for key, values in columns.items()
-        },
+        "table": table,
     }
 
     def entry(row):
-        parts = {"flux": "flux", "error": "flux_err", "flags": "flags"}
-        values = {
-            key: rounded([np.asarray(getattr(result, part))[row] for result in results.values()])
-            for key, part in parts.items()
-        }
-        values["upper"] = rounded([limit[row].value for limit in limits.values()])
+        values = {"flux": [], "error": [], "flags": [], "upper": []}
+        for band, result in results.items():
+            values["flux"].append(result.flux.value[row])
+            values["error"].append(result.flux_err.value[row])
+            values["flags"].append(result.flags[row])
+            values["upper"].append(limits[band].value[row])
+        for key, numbers in values.items():
+            values[key] = rounded(numbers)
         return values | {"imaged": bool(imaged[row])}
 
     def save(file, write):

@@ -17,7 +17,7 @@ from miricigale.utils.exceptions import PhotometryWarning, argument_error
 
 def with_exposures(inputs):
     """
-    The inputs as they are, or as `ExposureInputs` if several are exposures of one filter.
+    Return the inputs as they are, or as `ExposureInputs` if several are exposures of one filter.
 
     Parameters
     ----------
@@ -31,8 +31,7 @@ def with_exposures(inputs):
     if len(inputs.images) == 1:
         return inputs
     counts = collections.Counter(inputs.bands)
-    repeated_bands = {band for band, n in counts.items() if n > 1}
-    repeated_files = [file for file in inputs.images if file.header.filter in repeated_bands]
+    repeated_files = [file for file in inputs.images if counts[file.header.filter] > 1]
     if not repeated_files or not all(file.header.exposure for file in repeated_files):
         return inputs
     values = {field.name: getattr(inputs, field.name) for field in dataclasses.fields(inputs)}
@@ -56,19 +55,20 @@ class ExposureInputs(Inputs):
         """As of `Inputs`, with the names of the exposures, without that of their kind of product."""
         labels = []
         for band, rows in self.groups.items():
-            many_bands = len(self.groups) > 1
             for k in rows:
                 name = Path(str(self.images[k].path)).name.partition(".")[0]
                 # models and residuals are no products of JWST
                 name = name.removesuffix("_cal").removesuffix("_crf")
-                parts = [short_band(band)] if many_bands else []
+                parts = []
+                if len(self.groups) > 1:
+                    parts.append(short_band(band))
                 if len(rows) > 1:
                     parts.append(name)
                 labels.append("_".join(parts))
         return labels
 
     def check(self):
-        """As of `Inputs`; options that exposures do not have are refused too."""
+        """Check as `Inputs` does; options that exposures do not have are refused too."""
         super().check()
         for name, offered in (("components", 1), ("offset_order", None)):
             value = self.options.get(name, offered)
@@ -81,7 +81,7 @@ class ExposureInputs(Inputs):
             raise argument_error("psf_stars", "left out for exposures of one filter", True)
 
     def _check_bands(self):
-        """Several images of a filter are exposures: see `with_exposures`."""
+        """Accept several images of a filter, which are exposures: see `with_exposures`."""
 
     def read(self, prior=None, images=None):
         """Read the images, those of one filter as a list."""
@@ -91,12 +91,13 @@ class ExposureInputs(Inputs):
             )
         images_of_band = {}
         for band, rows in self.groups.items():
-            read = [self.images[k].read() for k in rows]
-            images_of_band[band] = read if len(read) > 1 else read[0]
+            images_of_band[band] = [self.images[k].read() for k in rows]
+            if len(rows) == 1:
+                images_of_band[band] = images_of_band[band][0]
         return Pixels(self.highres.read(), [file.read() for file in self.detection], images_of_band)
 
     def photometers(self, n_threads=None):
-        """As of `Inputs`; the kernels of exposures are those of their places and rolls."""
+        """Make photometers as `Inputs` does; the kernels of exposures are those of their places and rolls."""
         single = [rows[0] for rows in self.groups.values() if len(rows) == 1]
         photometers = {}
         if single:
@@ -117,13 +118,14 @@ class ExposureInputs(Inputs):
         return {band: photometers[band] for band in self.groups}
 
     def _kernels(self, rows):
-        """Kernels of some exposures: of files, or models by place and roll."""
+        """Make the kernels of some exposures: of files, or models by place and roll."""
         # PSFs are heavy, and files are checked before
         from miricigale.photometry.fit.exposure_kernels import ExposureKernels
 
         files = [self.images[k] for k in rows]
-        has_own = [self.kernels[k] is not None or self.images[k].psf is not None for k in rows]
-        modeled = files[0].header.filter.startswith("miri.") and not any(has_own)
+        modeled = files[0].header.filter.startswith("miri.")
+        for k in rows:
+            modeled = modeled and self.kernels[k] is None and self.images[k].psf is None
         if modeled:
             sharp = image_psf(self.highres, "highres_psf")
             headers = [file.header for file in files]
@@ -145,7 +147,7 @@ class ExposureMeasurement(Measurement):
     """What was measured, some of it on exposures."""
 
     def products(self, name):
-        """Models or residuals, one for each image in the order of the labels."""
+        """Return models or residuals, one for each image in the order of the labels."""
         products = []
         for result in self.results.values():
             if result.exposures is None:
@@ -155,7 +157,7 @@ class ExposureMeasurement(Measurement):
         return products
 
     def _shown(self, band):
-        """The first exposure with a name for all, and pulls of points fitted to all residuals."""
+        """Return the first exposure with a name for all, and pulls of points fitted to all residuals."""
         from miricigale.photometry.commands.page import empty_positions
         from miricigale.photometry.fit.forced import ForcedPhotometer
 

@@ -46,20 +46,24 @@ class Inputs:
 
     @classmethod
     def of(cls, image, highres, *, detection=(), kernel=None, **settings):
-        """Of the arguments of `~miricigale.photometry.measure_files`."""
-        images, kernels = (v if isinstance(v, (list, tuple)) else [v] for v in (image, kernel))
-        kernels = [None] * len(images) if kernel is None else kernels
+        """Make inputs of the arguments of `~miricigale.photometry.measure_files`."""
+        images = _as_list(image)
+        kernels = _as_list(kernel)
+        if kernel is None:
+            kernels = [None] * len(images)
         if len(kernels) != len(images):
             raise argument_error("kernel", f"one for each of {len(images)} images", len(kernels))
-        files = [
-            file if isinstance(file, MosaicFile) else MosaicFile(file)
-            for file in (highres, *images, *detection)
-        ]
-        n = 1 + len(images)
-        parts = {"highres": files[0], "images": tuple(files[1:n]), "detection": tuple(files[n:])}
+        # settings that are none of these are options of the photometer
         names = {field.name for field in dataclasses.fields(cls)}
         options = {name: settings.pop(name) for name in sorted(settings.keys() - names)}
-        return cls(**parts, kernels=tuple(kernels), options=options, **settings)
+        return cls(
+            highres=_as_file(highres),
+            images=tuple(map(_as_file, images)),
+            detection=tuple(map(_as_file, detection)),
+            kernels=tuple(kernels),
+            options=options,
+            **settings,
+        )
 
     @property
     def bands(self):
@@ -69,8 +73,11 @@ class Inputs:
     @property
     def _named(self):
         named = [("segmentation", self.segmentation), ("catalog", self.catalog)]
-        named += [("highres_psf", self.highres.psf), *(("psf", file.psf) for file in self.images)]
-        named += [("kernel", path) for path in self.kernels]
+        named.append(("highres_psf", self.highres.psf))
+        for file in self.images:
+            named.append(("psf", file.psf))
+        for path in self.kernels:
+            named.append(("kernel", path))
         return [(argument, path) for argument, path in named if path is not None]
 
     @property
@@ -102,16 +109,23 @@ class Inputs:
     @property
     def labels(self):
         """What the images of models and residuals are called, one for each image; empty for a single one."""
-        return [""] if len(self.images) == 1 else [short_band(band) for band in self.bands]
+        if len(self.images) == 1:
+            return [""]
+        return list(map(short_band, self.bands))
 
     def n_bytes(self, prior=None, images=None):
-        """About how many bytes parts of these shapes take, with sources; without, the whole images alone."""
-        dense = 0 if prior is None else _BYTES["sources"]
-        prior = self.highres.header.shape if prior is None else prior
-        images = [image.header.shape for image in self.images] if images is None else images
-        fine = np.prod(prior, dtype=float) * (1 + len(self.detection))
-        coarse = sum(np.prod(shape, dtype=float) for shape in images)
-        return int(_BYTES["process"] + _BYTES["prior"] * fine + _BYTES["image"] * coarse + dense)
+        """Estimate the memory (bytes) of parts of these shapes with sources, or of the whole images without."""
+        n_bytes = _BYTES["process"]
+        if prior is None:
+            prior = self.highres.header.shape
+        else:
+            n_bytes += _BYTES["sources"]
+        if images is None:
+            images = [image.header.shape for image in self.images]
+        n_bytes += _BYTES["prior"] * np.prod(prior, dtype=float) * (1 + len(self.detection))
+        for shape in images:
+            n_bytes += _BYTES["image"] * np.prod(shape, dtype=float)
+        return int(n_bytes)
 
     def read(self, prior=None, images=None):
         """
@@ -130,12 +144,12 @@ class Inputs:
             Of the parts without data there are images that hold no source.
         """
         if images is None:
-            images_of_bands = {
-                k: file.read() for k, file in zip(self.bands, self.images, strict=True)
-            }
-            return Pixels(
-                self.highres.read(), [file.read() for file in self.detection], images_of_bands
-            )
+            images_of_bands = {}
+            for band, file in zip(self.bands, self.images, strict=True):
+                images_of_bands[band] = file.read()
+            detection = [file.read() for file in self.detection]
+            return Pixels(self.highres.read(), detection, images_of_bands)
+        # a place far from everything, for images of which the part has nothing
         away = self.highres.header.wcs.pixel_to_world(0, 0).icrs
         away = away.directional_offset_by(0 * u.deg, 90 * u.deg)
         images_of_bands = {}
@@ -147,20 +161,25 @@ class Inputs:
         whole_header = self.highres.header
         if prior is None:
             return Pixels(_blank((3, 3), whole_header.wcs), [], images_of_bands)
-        files = [file.replace(section=prior) for file in (self.highres, *self.detection)]
-        sharp, *detection = (file.read() for file in files)
+        highres = self.highres.replace(section=prior)
+        sharp = highres.read()
         if sharp is None:
             # its pixels are those of the segments
-            sharp = _blank(files[0].header.shape, files[0].header.wcs)
-        return Pixels(sharp, [image for image in detection if image is not None], images_of_bands)
+            sharp = _blank(highres.header.shape, highres.header.wcs)
+        detection = []
+        for file in self.detection:
+            image = file.replace(section=prior).read()
+            if image is not None:
+                detection.append(image)
+        return Pixels(sharp, detection, images_of_bands)
 
     def fit_options(self, n_threads=None):
-        """Options of a `~miricigale.photometry.ForcedPhotometer`, with the defaults of files."""
+        """Return options of a `~miricigale.photometry.ForcedPhotometer`, with the defaults of files."""
         defaults = {"background_order": 0, "second_pass": None, "n_threads": n_threads}
         return defaults | self.options
 
     def photometers(self, n_threads=None):
-        """What measures each band: dict of `~miricigale.photometry.ForcedPhotometer`."""
+        """Make the `~miricigale.photometry.ForcedPhotometer` of each band: dict by name of the filter."""
         from miricigale.photometry import ForcedPhotometer
 
         options = self.fit_options(n_threads)
@@ -172,7 +191,7 @@ class Inputs:
         return photometers
 
     def find_sources(self, pixels, catalog=None, part=None):
-        """Segments and sources (as of `~miricigale.photometry.read_prior`); ``part`` is () without a prior."""
+        """Find segments and sources (as `~miricigale.photometry.read_prior`); ``part`` is () without a prior."""
         from miricigale.photometry import chi_image, read_prior
         from miricigale.photometry.detection.prior_catalog import (
             SEGMENTS,
@@ -183,13 +202,15 @@ class Inputs:
         prior = pixels.prior
         detection = pixels.detection
         if self.segmentation is None or part == ():
-            return detected_prior(chi_image([prior, *detection]) if detection else prior, catalog)
+            if detection:
+                prior = chi_image([prior, *detection])
+            return detected_prior(prior, catalog)
         if part is None:
             return read_prior(prior, segmentation=self.segmentation, catalog=catalog)
         header = self.highres.header
-        roles = ("a segmentation map", "the segmentation", SEGMENTS)
+        wanted = "a segmentation map"
         grid = header.shape, header.wcs, self.highres.path
-        with open_map(self.segmentation, *roles, grid) as hdu:
+        with open_map(self.segmentation, wanted, "the segmentation", SEGMENTS, grid) as hdu:
             return sources_of(prior, np.array(plane_data(hdu, part)), catalog)
 
     def measure(self, pixels, photometers, segments, sources):
@@ -226,17 +247,19 @@ class Measurement:
             ((band, result),) = results.items()
             table = result.to_table(band, confidence=inputs.confidence)
         else:
-            tables = {
-                k: result.to_table(confidence=inputs.confidence) for k, result in results.items()
-            }
+            tables = {}
+            for band, result in results.items():
+                tables[band] = result.to_table(confidence=inputs.confidence)
             table = join_bands(tables)
         paths = [str(file.path) for file in inputs.images]
-        paths = paths[0] if len(paths) == 1 else paths
-        table.meta.update(image=paths, highres=str(inputs.highres.path))
+        table.meta["image"] = paths
+        if len(paths) == 1:
+            table.meta["image"] = paths[0]
+        table.meta["highres"] = str(inputs.highres.path)
         return table
 
     def products(self, name):
-        """Models (``"model"``) or residuals (``"residual"``), one for each image that was read."""
+        """Return models (``"model"``) or residuals (``"residual"``), one for each image that was read."""
         return [getattr(result, f"{name}_image") for result in self.results.values()]
 
     def write_page(self, path):
@@ -260,12 +283,26 @@ class Measurement:
         write_page(path, measured, self.pixels.prior, self.segments, confidence, seed)
 
     def _shown(self, band):
-        """The image of a band for the page, and pulls at empty positions, None where the page makes them."""
+        """Return the image of a band for the page, and pulls at empty positions (None: the page makes them)."""
         return self.pixels.images[band], None
 
 
+def _as_list(value):
+    """Return a list or tuple as it is, anything else as a list of one."""
+    if isinstance(value, (list, tuple)):
+        return value
+    return [value]
+
+
+def _as_file(image):
+    """Return a `MosaicFile`, or make one of a path."""
+    if isinstance(image, MosaicFile):
+        return image
+    return MosaicFile(image)
+
+
 def _blank(shape, wcs):
-    """An image without a source, of which a row alone has data."""
+    """Make an image without a source, of which a row alone has data."""
     mask = np.arange(shape[0])[:, None] + np.zeros(shape) > 0
     noise = StdDevUncertainty(np.ones(shape, np.float32))
     data = np.zeros(shape, np.float32)
@@ -275,37 +312,36 @@ def _blank(shape, wcs):
 def _check_images(image, highres):
     """Refuse images that are not what they should be, or do not overlap."""
     wanted = image.filter
-    header_filters = [MosaicFile(file.path).header.filter for file in (image, highres)]
-    if (
-        wanted is not None
-        and header_filters[0] not in (None, wanted)
-        and header_filters[1] == wanted
-    ):
+    # a swap shows in the filters that the headers state
+    image_filter = MosaicFile(image.path).header.filter
+    highres_filter = MosaicFile(highres.path).header.filter
+    if wanted is not None and image_filter not in (None, wanted) and highres_filter == wanted:
         msg = (
             f"'image' and 'highres' seem to be swapped: {highres.path} is the image in {wanted}, "
-            f"{image.path} is in {header_filters[0]}"
+            f"{image.path} is in {image_filter}"
         )
         raise ValueError(msg)
-    name, _ = (file.header.filter for file in (image, highres))
+    # headers refuse what contradicts them
+    headers = [(image.path, image.header), (highres.path, highres.header)]
+    name = image.header.filter
     if name is None:
         wanted = f"given, for the header of {image.path} does not name it"
         raise argument_error("filter", wanted, None)
     if name not in Filter.names() and not name.startswith("sedpy."):
         wanted = f"a filter that 'miricigale filters' lists, for {image.path}"
         raise argument_error("filter", wanted, repr(name))
-    for file in (image, highres):
+    for path, header in headers:
         try:
-            grid_angle(file.header.wcs, file.header.shape)
+            grid_angle(header.wcs, header.shape)
         except ValueError as err:
-            msg = f"{file.path}: {err}"
+            msg = f"{path}: {err}"
             raise ValueError(msg) from err
     if not (_overlap(image.header, highres.header) or _overlap(highres.header, image.header)):
-        middles = [
-            _middle(file.header).to_string("decimal", precision=4) for file in (image, highres)
-        ]
+        middle = _middle(image.header).to_string("decimal", precision=4)
+        highres_middle = _middle(highres.header).to_string("decimal", precision=4)
         msg = (
             f"'image' and 'highres' show different fields: the middle of {image.path} is at "
-            f"{middles[0]}, that of {highres.path} at {middles[1]} deg"
+            f"{middle}, that of {highres.path} at {highres_middle} deg"
         )
         raise ValueError(msg)
 
@@ -316,17 +352,17 @@ def _middle(header):
 
 
 def _inside(sky, header):
-    """Whether some positions are on an image."""
+    """Return whether some positions are on an image."""
     from miricigale.photometry.images.arrays import sky_pixels
 
     return np.isfinite(sky_pixels(sky, header.wcs, header.shape, 0.0)).any()
 
 
 def _overlap(first, second):
-    """Whether some of a coarse grid of pixels of one image are on the other."""
-    axes = [np.linspace(0, n - 1, 15) for n in first.shape]
-    y, x = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
-    return _inside(first.wcs.pixel_to_world(x, y), second)
+    """Return whether some of a coarse grid of pixels of one image are on the other."""
+    ny, nx = first.shape
+    y, x = np.meshgrid(np.linspace(0, ny - 1, 15), np.linspace(0, nx - 1, 15), indexing="ij")
+    return _inside(first.wcs.pixel_to_world(x.ravel(), y.ravel()), second)
 
 
 def _check_psfs(image, highres, kernel):

@@ -112,6 +112,7 @@ def measure_files(
         kernel=kernel, confidence=confidence, psf_stars=psf_stars, seed=seed, **options,
     )  # fmt: skip
     inputs = with_exposures(inputs)
+    # files that will be written, by their kind and number
     results = {("output", 0): output, ("page", 0): page}
     for k, label in enumerate(inputs.labels):
         results |= {
@@ -126,10 +127,10 @@ def measure_files(
         from miricigale.photometry.commands.browser import browser_files
 
         check_outputs(browser_files(page), "page", overwrite=overwrite, inputs=inputs.paths)
+    kinds = dict.fromkeys(kind for kind, _ in results)
     written = [Path(path).resolve() for path in results.values()]
     if len(set(written)) < len(written):
-        arguments = ", ".join(dict.fromkeys(kind for kind, _ in results))
-        raise argument_error(arguments, "different files", [str(path) for path in written])
+        raise argument_error(", ".join(kinds), "different files", list(map(str, written)))
     inputs.check()
     check_memory(inputs.n_bytes(), "photometry of whole images", advice=_IN_PATCHES)
     with progress(show=progress_bar, total=4, desc="images", unit="steps") as bar:
@@ -137,10 +138,10 @@ def measure_files(
         bar.update()
         bar.set_description("kernels and sources")
         photometers = inputs.photometers(n_threads)
-        sources = inputs.find_sources(pixels, catalog)
+        segments, sources = inputs.find_sources(pixels, catalog)
         bar.update()
         bar.set_description("fluxes")
-        measured = inputs.measure(pixels, photometers, *sources)
+        measured = inputs.measure(pixels, photometers, segments, sources)
         table = measured.table
         bar.update()
         bar.set_description("page")
@@ -149,7 +150,7 @@ def measure_files(
         if output is not None:
             with replacing(output, overwrite=overwrite) as partial:
                 write_table(table, partial)
-        for kind in {"model", "residual"} & {kind for kind, _ in results}:
+        for kind in {"model", "residual"} & kinds.keys():
             for k, image in enumerate(measured.products(kind)):
                 with replacing(results[kind, k]) as partial:
                     write_image(image, partial)
@@ -160,7 +161,7 @@ def measure_files(
 
 
 def _labelled(path, label):
-    """A path with a label before its ending, if there are both."""
+    """Put a label before the ending of a path, if there are both."""
     if path is None or not label:
         return path
     name, dot, ending = Path(path).name.partition(".")

@@ -13,11 +13,18 @@ from miricigale.photometry.detection.catalogs import joined_sky
 from miricigale.photometry.detection.detection import bright_centroids
 from miricigale.photometry.errors.error_calibration import ErrorCalibration
 from miricigale.photometry.fit.forced import ForcedPhotometer
-from miricigale.photometry.images.arrays import image_arrays, nearest_values, pixel_scale
+from miricigale.photometry.images.arrays import (
+    image_arrays,
+    lengths,
+    nearest_values,
+    pixel_scale,
+    pixels_to_sky,
+    sky_to_pixels,
+)
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.shapes.shape_models import ShapeModels
-from miricigale.photometry.shapes.shapes import Shape
+from miricigale.photometry.shapes.shapes import Shape, center_change
 from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
@@ -163,8 +170,9 @@ class _Field:
         self.donors = []
         if highres is None or segmentation is None or photometer.template == "psf":
             return
-        labels = segmentation.data if isinstance(segmentation, SegmentationImage) else segmentation
-        self.labels = np.array(labels)
+        if isinstance(segmentation, SegmentationImage):
+            segmentation = segmentation.data
+        self.labels = np.array(segmentation)
         self.fine = image_arrays(highres, "highres")
         # of kernels of several places the mean
         source = photometer.mean_kernel.source
@@ -173,22 +181,21 @@ class _Field:
         if "label" in catalog.colnames:
             self.own_labels = np.asarray(catalog["label"], int)
         else:
-            xy = np.stack(highres.wcs.world_to_pixel(catalog["sky"]), axis=-1).reshape(-1, 2)
+            xy = sky_to_pixels(catalog["sky"], highres.wcs)
             self.own_labels, _ = nearest_values(self.labels, xy)
+        # sources without a flag that matters can be copied
         places = scipy.ndimage.find_objects(self.labels)
         usable = (self.base.flags & ~int(_HARMLESS) == 0) & (templates.flags == 0)
-        candidates = zip(templates.fitted, templates.kind, self.own_labels, strict=True)
-        donors = [
-            self._donor(*candidate, places)
-            for candidate, good in zip(candidates, usable, strict=True)
-            if good
-        ]
-        self.donors = [donor for donor in donors if donor is not None]
+        kinds = templates.kind
+        for k in np.flatnonzero(usable):
+            donor = self._donor(templates.fitted[k], kinds[k], self.own_labels[k], places)
+            if donor is not None:
+                self.donors.append(donor)
         wanted = "with sources that are points or profiles, to be copied"
         check_that(self.donors, "highres", wanted, "none")
 
     def _donor(self, fitted, kind, label, places):
-        """What is copied of a source; None if it is no profile, or has no light."""
+        """Return what is copied of a source; None if it is no profile, or has no light."""
         if kind == "cutout" or np.isnan(fitted["point"]) or not 0 < label <= len(places):
             return None
         place = places[label - 1]
@@ -200,19 +207,21 @@ class _Field:
             parameters[3:] = 0.0
         mask = self.labels[place] == label
         corner = np.array([place[1].start, place[0].start])
-        moved = parameters - [*corner, 0, 0, 0, 0]
-        model = np.where(
-            mask & self.fine.usable[place], self.models.profiles(mask.shape, moved)[0], 0.0
-        )
+        image = self.models.profiles(mask.shape, parameters - center_change(corner))[0]
+        model = np.where(mask & self.fine.usable[place], image, 0.0)
         power = np.sum(model**2)
-        light = np.sum(model * self.fine.flux[place]) / power if power > 0 else 0.0
+        if not power > 0:
+            return None
+        # the light that fits best to the pixels of the segment
+        light = np.sum(model * self.fine.flux[place]) / power
         if not light > 0:
             return None
         return _Donor(parameters, float(light), mask, corner, kind == "point")
 
-    def _places(self, n, rng, occupied):
-        """Sky positions on usable pixels of the image, apart from each other."""
+    def _places(self, n, rng):
+        """Draw positions (x, y) on usable pixels of the image, apart from each other."""
         y, x = np.nonzero(self.arrays.usable)
+        # in pixels of the image
         min_distance = _APART * self.fwhm / pixel_scale(self.image.wcs)
         positions = []
         for _ in range(_ATTEMPTS * n):
@@ -220,24 +229,29 @@ class _Field:
                 break
             k = rng.integers(len(x))
             at = np.array([x[k], y[k]]) + rng.uniform(-0.5, 0.5, 2)
-            placed = np.array([*occupied, *positions]).reshape(-1, 2)
-            if len(placed) and np.min(np.hypot(*(placed - at).T)) < min_distance:
+            if positions and np.min(lengths(np.array(positions) - at)) < min_distance:
                 continue
             positions.append(at)
         return positions
 
     def trial(self, n, rng):
         """Inject sources and measure them: a table of true and measured fluxes."""
-        at = self._places(2 * n, rng, [])
+        at = self._places(2 * n, rng)
         check_that(len(at) >= 2, "image", "large enough for sources", "none")
+        # every other place stays empty
         full = np.array(at[::2])
         empty = np.array(at[1::2])
-        flux = self.error * np.exp(rng.uniform(*np.log(_SNR_RANGE), len(full)))
-        new = self._galaxies(full, flux, rng) if self.donors else self._points(full, flux)
+        low, high = np.log(_SNR_RANGE)
+        flux = self.error * np.exp(rng.uniform(low, high, len(full)))
+        if self.donors:
+            new = self._galaxies(full, flux, rng)
+        else:
+            new = self._points(full, flux)
+        # sources are injected, and all is measured as before
         light = self.photometer.render(self.image, new.light, new.flux * FNU)
         image = _with_light(self.image, light)
-        nothing = self.image.wcs.pixel_to_world(*empty.T).transform_to(self.sky.frame)
-        catalog = QTable({"sky": joined_sky([self.sky, new.catalog["sky"], nothing])})
+        empty_sky = pixels_to_sky(empty, self.image.wcs).transform_to(self.sky.frame)
+        catalog = QTable({"sky": joined_sky([self.sky, new.catalog["sky"], empty_sky])})
         if self.own_labels is not None:
             catalog["label"] = np.concatenate(
                 [self.own_labels, new.catalog["label"], np.zeros(len(empty), int)]
@@ -245,6 +259,7 @@ class _Field:
         result = self.photometer.measure(image, new.highres, new.labels, catalog)
         table = QTable({"kind": np.append(new.kind, np.full(len(empty), "empty", "U6"))})
         table["flux_true"] = np.append(new.flux, np.zeros(len(empty))) * FNU
+        # those that were injected, and the empty places
         rows = np.arange(len(self.sky), len(catalog))
         for name in ("flux", "flux_err", "flux_err_noise", "flags", "template", "template_snr"):
             table[name] = getattr(result, name)[rows]
@@ -252,17 +267,17 @@ class _Field:
         return table
 
     def _points(self, at, flux):
-        """Points, which the prior does not show."""
-        sky = self.image.wcs.pixel_to_world(*at.T).transform_to(self.sky.frame)
+        """Inject points, which the prior does not show."""
+        sky = pixels_to_sky(at, self.image.wcs).transform_to(self.sky.frame)
         catalog = QTable({"sky": sky})
         light = SourceTemplates.from_catalog(catalog)
         kind = np.full(len(at), "point", "U6")
         return _Injected(catalog, light, flux, kind, self.highres, self.labels)
 
     def _galaxies(self, at, flux, rng):
-        """Copies of the prior's sources, with their segments."""
+        """Inject copies of the prior's sources, with their segments."""
         wcs = self.highres.wcs
-        places = np.array(wcs.world_to_pixel(self.image.wcs.pixel_to_world(*at.T))).T
+        places = sky_to_pixels(pixels_to_sky(at, self.image.wcs), wcs)
         data = np.zeros(self.labels.shape)
         labels = self.labels.copy()
         first = self.labels.max() + 1
@@ -270,6 +285,7 @@ class _Field:
         light = []
         for (x, y), total in zip(places, flux, strict=True):
             donor = self.donors[rng.integers(len(self.donors))]
+            # whole pixels, so that the segment is moved as it is
             shift = np.rint([x, y] - donor.parameters[:2]).astype(int)
             corner = donor.corner + shift
             h, w = donor.mask.shape
@@ -280,19 +296,21 @@ class _Field:
             # another source there would own the light
             if np.any(labels_there[donor.mask] != 0):
                 continue
-            shape = Shape(donor.light, donor.parameters + [*shift, 0, 0, 0, 0], 0.0, None)
+            shape = Shape(donor.light, donor.parameters + center_change(shift), 0.0, None)
             self._paint(data, shape)
             labels[cut][donor.mask] = first + len(rows)
             rows.append((total, donor.point, corner + (np.array([w, h]) - 1) / 2))
             light.append(shape.drawn(1.0, max(self.models.reach, 2 * shape.axes[0])))
         check_that(rows, "image", "large enough for sources", "none")
-        flux, point, middle = (np.array(column) for column in zip(*rows, strict=True))
+        flux = np.array([total for total, _, _ in rows])
+        is_point = np.array([is_point for _, is_point, _ in rows])
+        middle = np.array([middle for _, _, middle in rows])
         # positions are those that detection would find
         new_labels = np.maximum(labels - (first - 1), 0)
         x, y = bright_centroids(self.fine.flux + data, new_labels, middle.T)
         catalog = QTable({"sky": wcs.pixel_to_world(x, y).transform_to(self.sky.frame)})
         catalog["label"] = first + np.arange(len(rows))
-        kinds = np.where(point, "point", "galaxy")
+        kinds = np.where(is_point, "point", "galaxy")
         truth = SourceTemplates(
             id=np.arange(len(rows)), sky=catalog["sky"].icrs, light=light, wcs=wcs
         )  # fmt: skip
@@ -310,7 +328,7 @@ class _Field:
 
 
 def _with_light(image, light):
-    """A copy of an image with light (a quantity) added to it, whose noise is not known."""
+    """Copy an image with light (a quantity) added to it, whose noise is not known."""
     changed = image.copy()
     changed.data = image.data + light.to_value(image.unit)
     return changed

@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 def _read_psf(file, argument):
-    """The PSF of a file, on the sky, compared with the model of the filter if there is one."""
+    """Read the PSF of a file, on the sky, and compare it with the model of the filter if there is one."""
     # the kernels of PSFs are compiled when they are needed
     from miricigale.psf import MODEL_FILTERS, read_psf
     from miricigale.psf.files import PSFFile, is_written
@@ -29,7 +29,9 @@ def _read_psf(file, argument):
             wanted = f"left out: {path} is a file of InstrumentPSF.write, which has it"
             check_that(value is None, argument + name, wanted, value)
         psf = read_psf(path)
-        return _compared(psf, header, argument) if has_model else psf
+        if has_model:
+            psf = _compared(psf, header, argument)
+        return psf
     psf_file = PSFFile.open(path)
     pixel_scale = psf_file.pixel_scale(file.psf_scale, argument=f"{argument}_scale")
     angle = psf_file.angle(file.psf_angle, argument=f"{argument}_angle")
@@ -59,14 +61,21 @@ def _read_psf(file, argument):
 
 
 def _grid(header):
-    """Pixel in arcsec and position angle of +y in deg of an image."""
+    """Return the pixel in arcsec and the position angle of +y in deg of an image."""
     from miricigale.photometry.images.arrays import pixel_scale
 
     return pixel_scale(header.wcs), grid_angle(header.wcs, header.shape).to_value(u.deg)
 
 
+def _resampling(header):
+    """Return how an image was resampled: mosaics are drizzled, exposures are not."""
+    if header.exposure:
+        return None
+    return "drizzle"
+
+
 def _compared(psf, header, argument, *, smoothed=False):
-    """A PSF, compared with the model of its image."""
+    """Compare a PSF with the model of its image, and return it."""
     from miricigale.psf import checked_psf
 
     return checked_psf(
@@ -74,7 +83,7 @@ def _compared(psf, header, argument, *, smoothed=False):
         header.filter,
         pixel_scale=_grid(header)[0] * ANGLE,
         pa=header.pa_aper,
-        resampling=None if header.exposure else "drizzle",
+        resampling=_resampling(header),
         smoothed=smoothed,
         argument=argument,
     )
@@ -82,7 +91,7 @@ def _compared(psf, header, argument, *, smoothed=False):
 
 def can_be_modeled(header):
     """
-    Whether `~miricigale.psf.filter_psf` has the PSF of an image, of which the header is given.
+    Return whether `~miricigale.psf.filter_psf` has the PSF of an image, of which the header is given.
 
     It must know the filter and, unless that is one of WFC3/IR, the position angle.
     """
@@ -94,7 +103,7 @@ def can_be_modeled(header):
 
 def image_psf(file, argument="psf"):
     """
-    The PSF of an image: that of a file, or the model of its filter.
+    Return the PSF of an image: that of a file, or the model of its filter.
 
     Parameters
     ----------
@@ -127,13 +136,13 @@ def image_psf(file, argument="psf"):
         pixel_scale=scale * ANGLE,
         pa=header.pa_aper,
         grid_angle=angle * u.deg,
-        resampling=None if header.exposure else "drizzle",
+        resampling=_resampling(header),
     )
 
 
 def matching_kernel(image, highres, kernel=None):
     """
-    The kernel from the prior to the image.
+    Make the kernel from the prior to the image.
 
     Parameters
     ----------
@@ -159,36 +168,39 @@ def matching_kernel(image, highres, kernel=None):
     from miricigale.psf.kernel_io import read_kernel
 
     scale, angle = _grid(highres.header)
-    fine, turn, header = scale * ANGLE, angle * u.deg, image.header
-    wide = image_psf(image) if kernel is None else None
-    sharp = image_psf(highres, "highres_psf")
-    psfs = {"psf": wide, "highres_psf": sharp}
+    fine = scale * ANGLE
+    turn = angle * u.deg
+    header = image.header
+    # the PSFs on the sky, from which the kernel is made
+    psfs = {}
+    if kernel is None:
+        psfs["psf"] = wide = image_psf(image)
+    psfs["highres_psf"] = sharp = image_psf(highres, "highres_psf")
     if kernel is not None:
         if sharp is not None:
             sharp = rotate_psf(sharp, grid_angle=turn)
-        made = read_kernel(kernel, pixel_scale=fine, source=sharp)
-        if isinstance(made, KernelField):
-            return made
-        if made.target is not None and header.filter in MODEL_FILTERS:
+        matched = read_kernel(kernel, pixel_scale=fine, source=sharp)
+        if isinstance(matched, KernelField):
+            return matched
+        if matched.target is not None and header.filter in MODEL_FILTERS:
             form = {"pixel_scale": fine, "frame": "sky", "angle": turn, "enclosed": 1.0}
-            _compared(make_psf(made.target, **form), header, "kernel")
+            _compared(make_psf(matched.target, **form), header, "kernel")
     else:
         _check_widths(sharp.fwhm, wide.fwhm)
-        made = MatchingKernel.from_psfs(sharp, wide, pixel_scale=fine, grid_angle=turn)
-    if made.target is not None:
+        matched = MatchingKernel.from_psfs(sharp, wide, pixel_scale=fine, grid_angle=turn)
+    if matched.target is not None:
         # the peaks of two PSFs of the same light
-        _check_widths(1 / made.source.max(), made.target.sum() / made.target.max())
-    made.meta["psfs"] = {
-        what: {
-            "from": str(one.meta.get("file", "model")),
-            "fwhm": one.fwhm.value,
-            "enclosed": one.enclosed,
-        }
-        for what, one in psfs.items()
-        if one is not None
-    }
-    _log.info("%r", made)
-    return made
+        _check_widths(1 / matched.source.max(), matched.target.sum() / matched.target.max())
+    matched.meta["psfs"] = {}
+    for name, psf in psfs.items():
+        if psf is not None:
+            matched.meta["psfs"][name] = {
+                "from": str(psf.meta.get("file", "model")),
+                "fwhm": psf.fwhm.value,
+                "enclosed": psf.enclosed,
+            }
+    _log.info("%r", matched)
+    return matched
 
 
 def _check_widths(sharp, wide):

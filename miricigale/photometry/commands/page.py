@@ -52,10 +52,12 @@ def write_page(path, bands, highres, segments, confidence, seed):
     ``bands`` are what was measured (`Measured`), ``highres`` and ``segments`` (int array) the prior; upper limits
     are of the ``confidence``, and ``seed`` that of the empty positions.
     """
+    # errors at empty places
     tested = []
     for band in bands:
-        pulls = empty_pulls(band.result, band.kernel, seed) if band.pulls is None else band.pulls
-        tested.append(band._replace(pulls=pulls))
+        if band.pulls is None:
+            band = band._replace(pulls=empty_pulls(band.result, band.kernel, seed))
+        tested.append(band)
     bands = tested
     names = ", ".join(band.name for band in bands)
     files = ", ".join(Path(band.image.meta["source"]).name for band in bands)
@@ -64,10 +66,11 @@ def write_page(path, bands, highres, segments, confidence, seed):
     report = Page(title, subtitle=f"{files} on the prior {prior}")
     page = SectionWriter(report, declared("miricigale.photometry"))
     page.facts = {"confidence": f"{100 * confidence:g}", "detected": f"{_DETECTED:g}"}
+    # the page of single sources, to which this one links
     browser = write_browser(Path(path), title, bands, highres, confidence, _DETECTED)
     _notices(page, bands, highres)
     page.section("summary", browser=Link("one by one", browser))
-    page.table("table", (_summary(band) for band in bands))
+    page.table("table", list(map(_summary, bands)))
     page.section("images")
     for band in bands:
         page.figure("whole", _whole_image(band.result), band=band.name)
@@ -106,12 +109,14 @@ def write_page(path, bands, highres, segments, confidence, seed):
 
 
 def _notices(page, bands, highres):
-    noted = [(f"image ({band.name})", band.image) for band in bands]
+    images = {}
     for band in bands:
+        images[f"image ({band.name})"] = band.image
         result = band.result
         rms = _pulls_rms(band.pulls)
         if band.kernel.target is None:
             page.notice("no_psfs")
+        # many poor fits of bright sources point to a wrong PSF
         bright = np.nan_to_num(result.snr) > _BRIGHT
         poor = bright & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
         n = np.count_nonzero(bright)
@@ -120,14 +125,17 @@ def _notices(page, bands, highres):
             page.notice("poor", n_poor=n_poor, n=n, bright=_BRIGHT, band=band.name)
         if band.pulls is not None and len(band.pulls) >= 100 and not 0.8 < rms < 1.25:
             page.notice("pulls", rms=rms, band=band.name)
+        # sources that the prior lacks, but are not fitted
         evidence = result.meta.get("second_pass", {})
         if evidence.get("peaks") and not evidence["fitted"]:
             page.notice("unfitted", **evidence, band=band.name)
-        offset, error = (np.array(result.meta.get(k, [0.0])) for k in ("offset", "offset_err"))
+        offset = np.array(result.meta.get("offset", [0.0]))
+        error = np.array(result.meta.get("offset_err", [0.0]))
         threshold = 0.1 * pixel_scale(result.residual_image.wcs)
         if result.shift is None and np.any((abs(offset) > threshold) & (abs(offset) > 3 * error)):
             page.notice("offset", offset=_pairs(result.meta), band=band.name)
-    for name, image in (*noted, ("prior", highres)):
+    images["prior"] = highres
+    for name, image in images.items():
         scale = image.meta.get("noise_scale")
         if image.meta.get("n_filled"):
             page.notice("filled", n=image.meta["n_filled"], what=name)
@@ -142,41 +150,52 @@ def _notices(page, bands, highres):
 
 
 def _exposure_rows(table):
-    """Rows of the table of exposures that were fitted together."""
+    """Make rows of the table of exposures that were fitted together."""
     rows = []
     for exposure in table:
-        row = {name: getattr(exposure[name], "value", exposure[name]) for name in table.colnames}
+        row = _plain_values(exposure, table.colnames)
         offset = f"{row['offset_east']:+.3f}, {row['offset_north']:+.3f} ± {row['offset_err']:.3f}"
         sky = f"{row['sky']:.5g} ± {row['sky_err']:.1g}"
         rows.append(row | {"source": Path(row["source"]).name, "offset": offset, "level": sky})
     return rows
 
 
+def _plain_values(row, names):
+    """Return columns of a row of a table by name, without units."""
+    return {name: getattr(row[name], "value", row[name]) for name in names}
+
+
 def _pairs(meta):
-    """The offset of an image along x and y with its errors, as text."""
+    """Write the offset of an image along x and y with its errors as text."""
     pairs = zip(meta["offset"], meta["offset_err"], strict=True)
     return ", ".join(f"{x:+.3f} ± {error:.3f}" for x, error in pairs)
 
 
 def _pulls_rms(pulls):
-    values = [] if pulls is None else pulls[np.isfinite(pulls)]
-    return float(mad_std(values)) if len(values) else np.nan
+    if pulls is None or not np.isfinite(pulls).any():
+        return np.nan
+    return float(mad_std(pulls[np.isfinite(pulls)]))
 
 
 def _summary(band):
     result = band.result
     good = np.isfinite(band.result.flux.value)
+    # the depth is that of sources without a flag
     errors = result.flux_err[good & (result.flags == 0)]
     values = {
         "band": band.name,
         "n": len(result),
         "n_measured": np.count_nonzero(good),
         "n_detected": np.count_nonzero(good & (result.snr > 5)),
-        "depth": (5 * np.median(errors)).to_value(u.ABmag) if len(errors) else np.nan,
+        "depth": np.nan,
         "rms": _pulls_rms(band.pulls),
         "background": Missing("not fitted"),
-        "offset": _pairs(result.meta) if "offset" in result.meta else Missing("no light"),
+        "offset": Missing("no light"),
     }
+    if len(errors):
+        values["depth"] = (5 * np.median(errors)).to_value(u.ABmag)
+    if "offset" in result.meta:
+        values["offset"] = _pairs(result.meta)
     if result.background is not None:
         background = result.background.value
         error = result.background_err.value
@@ -198,22 +217,26 @@ def _whole_image(result):
 
 
 def _examples(result):
-    """Sources to be shown, and why: the best without flags, and the worst fit."""
+    """Choose sources to be shown, and say why: the best without flags, and the worst fit."""
     snr = np.nan_to_num(result.snr, nan=-np.inf)
     good = np.isfinite(result.snr)
     clean = good & (result.flags == 0)
-    chosen = {}
-    if good.any():
-        reason = "the brightest without a flag" if clean.any() else "the brightest"
-        chosen[reason] = np.argmax(np.where(clean if clean.any() else good, snr, -np.inf))
+    chosen = []
+    if clean.any():
+        best = np.argmax(np.where(clean, snr, -np.inf))
+        chosen.append((int(best), "the brightest without a flag"))
+    elif good.any():
+        best = np.argmax(np.where(good, snr, -np.inf))
+        chosen.append((int(best), "the brightest"))
     poor = good & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
     if poor.any():
-        chosen["the poorest fit"] = np.argmax(np.where(poor, result.chi2, -np.inf))
-    return [(int(k), reason) for reason, k in chosen.items()]
+        poorest = np.argmax(np.where(poor, result.chi2, -np.inf))
+        chosen.append((int(poorest), "the poorest fit"))
+    return chosen
 
 
 def _zoom(result, highres, segments, k):
-    """Prior, image, model and residual about a source: squares, white beyond the images."""
+    """Draw prior, image, model and residual about a source: squares, white beyond the images."""
 
     def square(data, wcs, fill=np.nan):
         scale = pixel_scale(wcs)
@@ -225,6 +248,7 @@ def _zoom(result, highres, segments, k):
     model = result.model_image.data
     wcs = result.model_image.wcs
     _, axes = new_figure(1, 4, size=(2.9, 3.0))
+    # the prior with its segments, then the image
     sharp = np.array(highres.data, float)
     if highres.mask is not None:
         sharp[highres.mask] = np.nan
@@ -249,9 +273,11 @@ def _magnitudes(band, confidence):
     detected = result.snr > _DETECTED
     mag = ab_magnitude(result.flux)
     limit = ab_magnitude(result.upper_limit(confidence))
+    # 2.5 / ln 10 over the signal-to-noise
     error = 1.0857 / np.where(detected, result.snr, np.nan)
     clean = detected & (result.flags == 0)
     fainter = np.isfinite(limit) & ~detected
+    # magnitudes of detections, limits of the others
     shown = np.where(detected, mag, limit)
     if np.isfinite(shown).any():
         low = np.floor(np.nanmin(shown))
@@ -281,18 +307,21 @@ def _magnitudes(band, confidence):
 
 
 def _stars(page, stars, band):
-    """The stars that the PSFs were compared with, before and after."""
+    """Show the stars that the PSFs were compared with, before and after."""
     for name, fit in stars.fits.items():
         terms = zip(TERMS, 100 * fit.terms, 100 * fit.terms_err, strict=True)
         changes = ", ".join(
             f"{key.replace('_', ' ')} {x:+.1f} ± {err:.1f} %" for key, x, err in terms
         )
-        label = f"{band} image" if name == "image" else name
+        label = name
+        if name == "image":
+            label = f"{band} image"
         facts = {"what": label, "n": len(fit.after), "error": 100 * fit.error, "changes": changes}
         for text in star_texts(fit):
             page.text(text, **facts, **_star_numbers(fit))
         pairs = list(zip(fit.before, fit.after, strict=True))[:_STARS]
         figure, axes = new_figure(len(pairs), 3, size=(3.0, 2.8))
+        # arcsec per pixel of the star's image
         scale = stars.kernel.pixel_scale.to_value(ANGLE) * np.sqrt(fit.after[0].star.area)
         form = {"pixel_scale": scale}
         pulls = {"limits": (-5, 5), "stretch": "linear", "cmap": "RdBu_r", **form}
@@ -300,10 +329,10 @@ def _stars(page, stars, band):
             star = before.star
             has_data = np.isfinite(before.star.sigma)
             plot_image(np.where(has_data, star.data, np.nan), ax=row[0], title="star", **form)
-            for ax, fit, title in ((row[1], before, "model"), (row[2], after, "corrected")):
+            for ax, star_fit, title in ((row[1], before, "model"), (row[2], after, "corrected")):
                 pull = np.full(star.data.shape, np.nan)
-                pull[has_data] = fit.residual * fit.weight
-                plot_image(pull, ax=ax, title=f"{title}, chi2 {fit.chi2:.2f}", **pulls)
+                pull[has_data] = star_fit.residual * star_fit.weight
+                plot_image(pull, ax=ax, title=f"{title}, chi2 {star_fit.chi2:.2f}", **pulls)
         page.figure("figure", figure, **facts)
     rows = [dict(zip(stars.table.colnames, row, strict=True)) for row in stars.table]
     for row in rows:
@@ -312,16 +341,17 @@ def _stars(page, stars, band):
 
 
 def star_texts(fit):
-    """Names of texts of a `~miricigale.psf.star_fit.StarPSF`: what was done, and whether that fits the stars."""
-    was_tried = len(fit.chi2) > 1
-    texts = [fit.kind if was_tried else "untried"]
+    """Return names of texts of a `~miricigale.psf.star_fit.StarPSF`: its correction, and how it fits."""
+    texts = ["untried"]
+    if len(fit.chi2) > 1:
+        texts = [fit.kind]
     if fit.chi2[fit.kind] > _UNLIKE * fit.dof:
         texts.append("unlike")
     return texts
 
 
 def _star_numbers(fit):
-    """Chi-square of stars with the model and with what was chosen."""
+    """Return chi-square of stars with the model and with the chosen correction."""
     after = fit.chi2[fit.kind]
     ratio = after / max(fit.dof, 1)
     return {"before": fit.chi2["model"], "after": after, "dof": fit.dof, "ratio": ratio}
@@ -336,8 +366,9 @@ def _flag_table(page, bands):
 
     rows = [row("none", "", "usable", lambda result: result.flags == 0)]
     for value, (name, meaning) in ForcedFlags.meanings().items():
-        lost = value in (ForcedFlags.NO_DATA, ForcedFlags.DEGENERATE)
-        flux = "not measured" if lost else "usable"
+        flux = "usable"
+        if value in (ForcedFlags.NO_DATA, ForcedFlags.DEGENERATE):
+            flux = "not measured"
         rows.append(row(f"{value} {name}", meaning, flux, lambda result, v=value: result.flags & v))
     rows.append(row("crowded", page.sentence("crowded"), "usable", lambda result: result.crowded))
     page.table("table", rows)
@@ -348,13 +379,16 @@ def _source_rows(result, confidence):
     table = result.to_table(confidence=confidence)[order]
     rows = []
     for source in table:
-        row = {name: getattr(source[name], "value", source[name]) for name in table.colnames}
+        row = _plain_values(source, table.colnames)
         flags = ", ".join(ForcedFlags.names(row["flags"])).replace("_", " ") or "none"
         position = {"ra": f"{source['sky'].ra.deg:.5f}", "dec": f"{source['sky'].dec.deg:.5f}"}
-        mag, limit = (float(ab_magnitude(source[name])) for name in ("flux", "upper"))
-        mag = f"{mag:.2f}" if row["snr"] > _DETECTED else f"> {limit:.2f}"
-        lost = Missing("not measured")
-        mag = mag if np.isfinite(limit) else lost
+        limit = float(ab_magnitude(source["upper"]))
+        if not np.isfinite(limit):
+            mag = Missing("not measured")
+        elif row["snr"] > _DETECTED:
+            mag = f"{float(ab_magnitude(source['flux'])):.2f}"
+        else:
+            mag = f"> {limit:.2f}"
         rows.append(row | {"flags": flags, "mag": mag, **position})
     return rows
 
@@ -362,19 +396,21 @@ def _source_rows(result, confidence):
 def _input_table(page, bands, highres):
     page.section("inputs")
     files = [(band.name, band.image, band.kernel, "psf") for band in bands]
+    files.append(("prior", highres, bands[0].kernel, "highres_psf"))
     facts = {}
-    for name, image, kernel, psf in (*files, ("prior", highres, bands[0].kernel, "highres_psf")):
+    for name, image, kernel, psf in files:
         psf_facts = kernel.meta.get("psfs", {}).get(psf, {})
-        facts[name] = {**image.meta, **{f"psf_{key}": v for key, v in psf_facts.items()}}
+        facts[name] = dict(image.meta)
+        for key, value in psf_facts.items():
+            facts[name][f"psf_{key}"] = value
         facts[name]["pixels"] = f"{image.data.shape[1]} x {image.data.shape[0]}"
         facts[name]["pixel_scale"] = f"{pixel_scale(image.wcs):.4f}"
-    rows = [
-        {
-            "": label,
-            **{name: _text(facts_of_image.get(key)) for name, facts_of_image in facts.items()},
-        }
-        for key, label in page.texts["inputs"]["facts"].items()
-    ]
+    rows = []
+    for key, label in page.texts["inputs"]["facts"].items():
+        row = {"": label}
+        for name, facts_of_image in facts.items():
+            row[name] = _text(facts_of_image.get(key))
+        rows.append(row)
     page.table("table", rows)
     for band in bands:
         values = band.kernel.array
@@ -387,11 +423,13 @@ def _input_table(page, bands, highres):
 def _text(value):
     if value is None:
         return Missing("not stated or not done")
-    return f"{value:.5g}" if isinstance(value, float) else value
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return value
 
 
 def empty_pulls(result, kernel, seed):
-    """Flux over error of points where a `ForcedPhotometryResult` has none; None without a PSF or such places."""
+    """Measure flux over error of points where a result has no source; None without a PSF or such places."""
     empty = empty_positions(result, seed)
     if kernel.target is None or not len(empty):
         return None
@@ -404,14 +442,16 @@ def empty_pulls(result, kernel, seed):
 
 def empty_positions(result, seed):
     """
-    Random positions at which a measurement left no light: ``id`` and ``sky``.
+    Draw random positions at which a measurement left no light: ``id`` and ``sky``.
 
     They are at least 0.3 arcsec from pixels with light of a model (above a third of the
     noise) or without data.
     """
     residual = result.residual_image
     sigma = residual.uncertainty.array
-    level = 0.0 if result.background is None else result.background.to_value(residual.unit)
+    level = 0.0
+    if result.background is not None:
+        level = result.background.to_value(residual.unit)
     is_free = ~np.asarray(residual.mask, bool)
     is_free &= np.abs(result.model_image.data - level) < 0.3 * np.where(is_free, sigma, 1.0)
     steps = max(1, round(0.3 / pixel_scale(residual.wcs)))
@@ -419,7 +459,9 @@ def empty_positions(result, seed):
     is_free = scipy.ndimage.binary_erosion(is_free, iterations=steps)
     y, x = np.nonzero(is_free)
     rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(x), min(_EMPTY, len(x)), replace=False) if len(x) else np.zeros(0, int)
+    chosen = np.zeros(0, int)
+    if len(x):
+        chosen = rng.choice(len(x), min(_EMPTY, len(x)), replace=False)
     sky = residual.wcs.pixel_to_world(x[chosen].astype(float), y[chosen].astype(float)).icrs
     return QTable({"id": np.arange(1, len(chosen) + 1), "sky": sky})
 
@@ -433,7 +475,9 @@ def write_errors_page(path, errors, *, overwrite=False):
     facts = {"over": meta["noise_over_stated"], "factor": errors.factor}
     page.section("errors", n_free=errors.n_free, **facts)
     page.table("table", [dict(zip(table.colnames, row, strict=True)) for row in Table(table)])
-    aperture, limit = next((k, v.value) for k, v in errors.limits.items())
+    # the map of the first aperture
+    aperture, limit = next(iter(errors.limits.items()))
+    limit = limit.value
     step = max(1, -(-max(limit.shape) // 1500))
     scale = step * pixel_scale(errors.noise.wcs)
     figure, [[limit_ax, correlation_ax]] = new_figure(1, 2, size=(5.2, 4.2))
@@ -444,6 +488,8 @@ def write_errors_page(path, errors, *, overwrite=False):
     plot_image(shown, ax=correlation_ax, stretch="linear", **form).set(
         xlabel="x (pixels)", ylabel="y (pixels)"
     )
-    shape = "a point fitted" if aperture == "psf" else f"a circle of {aperture} arcsec"
+    shape = f"a circle of {aperture} arcsec"
+    if aperture == "psf":
+        shape = "a point fitted"
     page.figure("map", figure, aperture=shape, n_sigma=meta["n_sigma"])
     report.write(path, overwrite=overwrite)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from miricigale.photometry.detection.catalogs import joined_sky
 from miricigale.photometry.fit.bands import spread_rows
 from miricigale.photometry.fit.result_table import new_ids
-from miricigale.photometry.images.arrays import sky_pixels
+from miricigale.photometry.images.arrays import lengths, sky_pixels
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.utils.exceptions import PhotometryWarning, warn
 
@@ -55,11 +55,12 @@ class PatchGrid:
 
     @classmethod
     def over(cls, prior, images, size, overlap):
-        """The grid over a prior and images (each with ``wcs`` and ``shape``), as far as these reach."""
+        """Make the grid over a prior and images (each with ``wcs`` and ``shape``), as far as these reach."""
         low, high = np.array([[0, 0], prior.shape])
         for image in images:
-            edge = _raster([(0, image.shape[0]), (0, image.shape[1])])
-            xy = pixel_to_pixel(image.wcs, prior.wcs, *edge)
+            ny, nx = image.shape
+            x, y = _raster((slice(0, ny), slice(0, nx)))
+            xy = pixel_to_pixel(image.wcs, prior.wcs, x, y)
             # the patches at the edge have an overlap beyond it too
             low = np.fmin(low, np.nanmin(xy, axis=1)[::-1] + overlap)
             high = np.fmax(high, np.nanmax(xy, axis=1)[::-1] - overlap)
@@ -70,17 +71,20 @@ class PatchGrid:
     @property
     def names(self):
         """Names of the patches, row by row."""
-        places = itertools.product(*(range(n) for n in self.shape))
-        return [f"y{y:02d}x{x:02d}" for y, x in places]
+        ny, nx = self.shape
+        return [f"y{y:02d}x{x:02d}" for y, x in itertools.product(range(ny), range(nx))]
 
     def box(self, k):
-        """Rows and columns of a patch with its overlap, which may be beyond the prior."""
+        """Return rows and columns of a patch with its overlap, which may be beyond the prior."""
+        # the core, and the overlap around it
         place = np.array(np.unravel_index(k, self.shape))
         low = (place + self.first) * self.size - self.overlap
-        return tuple(slice(int(n), int(n) + self.size + 2 * self.overlap) for n in low)
+        y0, x0 = low.tolist()
+        side = self.size + 2 * self.overlap
+        return slice(y0, y0 + side), slice(x0, x0 + side)
 
     def holder(self, xy):
-        """Number of the patch whose core holds each pixel (x, y), (n,); the nearest beyond them, -1 for NaN."""
+        """Return the patch whose core holds each pixel (x, y), (n,); the nearest beyond them, -1 for NaN."""
         xy = np.asarray(xy, float).reshape(-1, 2)
         is_known = np.isfinite(xy).all(axis=1)
         place = (
@@ -90,44 +94,59 @@ class PatchGrid:
         return np.where(is_known, np.ravel_multi_index(tuple(place.T), self.shape), -1)
 
     def is_near(self, k, xy, margin):
-        """Whether pixels (x, y) are in the core of a patch or within a margin of it."""
+        """Return whether pixels (x, y) are in the core of a patch or within a margin of it."""
         steps = itertools.product((-margin, 0.0, margin), repeat=2)
         return np.any([self.holder(np.asarray(xy) + step) == k for step in steps], axis=0)
 
 
 def patch_parts(inputs, grid, k):
-    """The parts (slices, or None) of the prior and of each image that a patch has with its overlap."""
+    """Return the parts (slices, or None) of the prior and of each image that a patch has with its overlap."""
     box = grid.box(k)
     prior = inputs.highres.header
-    headers = (image.header for image in inputs.images)
-    parts = [seen_part(box, prior.wcs, image.wcs, image.shape) for image in headers]
-    return [_within(box, prior.shape), *parts]
+    parts = [_within(box, prior.shape)]
+    for image in inputs.images:
+        parts.append(seen_part(box, prior.wcs, image.header.wcs, image.header.shape))
+    return parts
 
 
 def seen_part(box, wcs, other_wcs, shape):
-    """The part (slices, or None) of an image with a WCS that has what a box of pixels of another has."""
-    xy = np.array(
-        pixel_to_pixel(wcs, other_wcs, *_raster([(axis.start, axis.stop) for axis in box]))
-    )
-    ends = np.floor(np.nanmin(xy, axis=1)), np.ceil(np.nanmax(xy, axis=1)) + 1
-    span = [slice(int(a), int(b)) for a, b in zip(*ends, strict=True)]
-    return _within(span[::-1], shape)
+    """Return the part (slices, or None) of an image with a WCS that shows the same sky as a box of another."""
+    x, y = _raster(box)
+    other_x, other_y = pixel_to_pixel(wcs, other_wcs, x, y)
+    return _within((_span(other_y), _span(other_x)), shape)
+
+
+def _span(positions):
+    """Return the pixels along an axis that hold some positions."""
+    first = int(np.floor(np.nanmin(positions)))
+    last = int(np.ceil(np.nanmax(positions)))
+    return slice(first, last + 1)
 
 
 def _within(box, shape):
-    inside = tuple(slice(max(b.start, 0), min(b.stop, n)) for b, n in zip(box, shape, strict=True))
-    return inside if all(axis.start < axis.stop for axis in inside) else None
+    """Cut a box of rows and columns to an image; None if nothing is left."""
+    rows, columns = box
+    y0 = max(rows.start, 0)
+    x0 = max(columns.start, 0)
+    y1 = min(rows.stop, shape[0])
+    x1 = min(columns.stop, shape[1])
+    if y0 >= y1 or x0 >= x1:
+        return None
+    return slice(y0, y1), slice(x0, x1)
 
 
-def _raster(spans):
-    """Pixels x, y all over a box of rows and columns, given as pairs of start and stop."""
-    y, x = np.meshgrid(*(np.linspace(a, b - 1, 33) for a, b in spans), indexing="ij")
+def _raster(box):
+    """Return pixels x, y all over a box of rows and columns."""
+    rows, columns = box
+    y_nodes = np.linspace(rows.start, rows.stop - 1, 33)
+    x_nodes = np.linspace(columns.start, columns.stop - 1, 33)
+    y, x = np.meshgrid(y_nodes, x_nodes, indexing="ij")
     return x.ravel(), y.ravel()
 
 
 def own_rows(patch, grid, xy):
     """
-    Which rows of the tables of patches are kept, so that each source is there once.
+    Choose the rows of the tables of patches that are kept, so that each source is there once.
 
     A row is that of its patch's core. Sources that two patches list within `RIM` of each other, and no nearer one,
     are the same: of these the one in its core stays, or else that of the first patch.
@@ -151,7 +170,7 @@ def own_rows(patch, grid, xy):
     used_keys = set()
     pairs = cKDTree(xy).query_pairs(RIM, output_type="ndarray")
     pairs = pairs[patch[pairs[:, 0]] != patch[pairs[:, 1]]]
-    far = np.hypot(*(xy[pairs[:, 0]] - xy[pairs[:, 1]]).T)
+    far = lengths(xy[pairs[:, 0]] - xy[pairs[:, 1]])
     for i, j in pairs[np.argsort(far, kind="stable")].tolist():
         # the nearest that each patch has for a source of the other
         keys = {(i, patch[j]), (j, patch[i])}
@@ -159,6 +178,7 @@ def own_rows(patch, grid, xy):
             links.append((i, j))
             used_keys |= keys
     if links:
+        # rows that are linked, directly or not, are one source
         graph = scipy.sparse.coo_array(
             (np.ones(len(links)), np.transpose(links)), shape=(len(patch),) * 2
         )
@@ -193,33 +213,42 @@ def join_patches(tables, grid, prior, catalog=None, ids=False):
     table : `~astropy.table.QTable`
         With ``patch``, the name of the patch, in place of ``new``; new sources are the last rows.
     """
-    patch = np.repeat(list(tables), [len(patch_table) for patch_table in tables.values()])
+    # all rows of all patches, of which each source keeps one
+    patch = np.repeat(list(tables), list(map(len, tables.values())))
     table = vstack(list(tables.values()), metadata_conflicts="silent")
     xy = _pixels(table["sky"], prior)
     is_known = ~np.asarray(table["new"])
     new = np.asarray(table["new"])
     is_kept = np.zeros(len(table), bool)
-    for rows_of_kind in (is_known, new) if catalog is None and not ids else (new,):
-        is_kept[rows_of_kind] = own_rows(patch[rows_of_kind], grid, xy[rows_of_kind])
+    is_kept[new] = own_rows(patch[new], grid, xy[new])
+    if catalog is None and not ids:
+        is_kept[is_known] = own_rows(patch[is_known], grid, xy[is_known])
     table["patch"] = np.array(grid.names)[patch]
     table["patch"].info.description = "Patch whose core holds the source"
+    # segments that reach beyond their patch
     flags = [table[name] for name in table.colnames if name.endswith("flags")]
     cut = np.any([values & ForcedFlags.CUT for values in flags], axis=0)
     if catalog is None:
         rows = np.flatnonzero(is_known if ids else is_known & is_kept)
         if ids:
+            # of several rows of an id the one that is not cut, then that in its core
             core = grid.holder(xy[rows]) == patch[rows]
             rows = rows[np.lexsort((~core, cut[rows]))]
             rows = rows[np.unique(np.asarray(table["id"])[rows], return_index=True)[1]]
         source_rows = rows
-        key = np.asarray(table["id"])[rows]
         sky = table["sky"][rows]
-        key = key if ids else np.arange(1, len(rows) + 1)
+        key = np.arange(1, len(rows) + 1)
+        if ids:
+            key = np.asarray(table["id"])[rows]
     else:
-        place = {key: k for k, key in enumerate(np.asarray(table["id"]).tolist()) if is_known[k]}
+        row_of_id = {}
+        for k, source_id in enumerate(np.asarray(table["id"]).tolist()):
+            if is_known[k]:
+                row_of_id[source_id] = k
         key = np.asarray(catalog["id"])
         sky = catalog["sky"].icrs
-        source_rows = np.array([place.get(key, -1) for key in key.tolist()], int)
+        source_rows = np.array([row_of_id.get(source_id, -1) for source_id in key.tolist()], int)
+    # sources that the prior lacks come last
     extra = np.flatnonzero(new & is_kept)
     source_rows = np.concatenate([source_rows, extra])
     if n_cut := np.count_nonzero(cut[source_rows[source_rows >= 0]]):
@@ -230,7 +259,9 @@ def join_patches(tables, grid, prior, catalog=None, ids=False):
     joined["sky"] = joined_sky([sky, table["sky"][extra]])
     for name in table.colnames:
         if name not in ("id", "sky", "new"):
-            kind = "flags" if name.endswith("flags") else name
+            kind = name
+            if name.endswith("flags"):
+                kind = "flags"
             joined[name] = spread_rows(table[name], source_rows, kind)
             joined[name].info.description = table[name].info.description
     return joined
@@ -269,6 +300,7 @@ def measure_patch(inputs, grid, k, catalog=None, n_threads=None):
         rows = np.flatnonzero(grid.is_near(k, xy, grid.overlap))
         catalog = catalog[rows]
         in_core = grid.holder(xy[rows]) == k
+    # sources of the patch with its overlap
     segments, sources = inputs.find_sources(pixels, catalog, part or ())
     if not len(sources) and not any("source" in image.meta for image in pixels.images.values()):
         return QTable({"id": [], "new": []}), None
@@ -298,11 +330,12 @@ def measure_patch(inputs, grid, k, catalog=None, n_threads=None):
 
 
 def _is_cut(segments, part, shape, xy):
-    """Whether the segment at each pixel x, y of the prior reaches an edge of a part which is none of the prior."""
+    """Return whether the segment at each pixel x, y of the prior is cut by an edge of a part."""
     edges = [np.zeros(0, int)]
     for labels, axis, n in zip((segments, segments.T), part, shape, strict=True):
         edges += [labels[0]] * (axis.start > 0) + [labels[-1]] * (axis.stop < n)
-    place = np.nan_to_num(xy[:, ::-1] - [axis.start for axis in part], nan=-1.0)
+    rows, columns = part
+    place = np.nan_to_num(xy[:, ::-1] - [rows.start, columns.start], nan=-1.0)
     place = np.rint(place).astype(int)
     inside = np.all((place >= 0) & (place < segments.shape), axis=1)
     label = np.where(inside, segments[tuple(np.where(inside[:, None], place, 0).T)], 0)
@@ -310,5 +343,5 @@ def _is_cut(segments, part, shape, xy):
 
 
 def _pixels(sky, header):
-    """Pixels (x, y), (n, 2), of the prior's grid; NaN for positions that are missing or a degree off."""
+    """Return pixels (x, y), (n, 2), of the prior's grid; NaN for positions that are missing or a degree off."""
     return sky_pixels(sky, header.wcs, header.shape, 1e5)

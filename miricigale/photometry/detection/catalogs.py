@@ -35,7 +35,11 @@ def catalog_sources(catalog, epoch=None):
     if not isinstance(sky, SkyCoord):
         raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
     name = id_column(catalog.colnames, "catalog", labels=False)
-    ids = counted_ids(catalog, "catalog") if name is None else unique_ids(catalog[name], "catalog")
+    if name is None:
+        ids = counted_ids(catalog, "catalog")
+    else:
+        ids = unique_ids(catalog[name], "catalog")
+    # optional columns
     flux = components = None
     if "flux" in catalog.colnames:
         flux = floats(catalog["flux"])
@@ -47,29 +51,29 @@ def catalog_sources(catalog, epoch=None):
         if components.dtype.kind not in "iu" or not np.isin(components, (1, 2)).all():
             numbers = np.unique(components)[:5].tolist()
             raise argument_error("catalog", "a column 'components' of 1 and 2", f"{numbers}")
+    # positions at the epoch of the image
     sky = at_epoch(sky, epoch, "catalog")
     sky = SkyCoord(sky.ra.deg, sky.dec.deg, unit="deg")
     return {"id": ids, "sky": sky, "flux": flux, "components": components}
 
 
 def sersic_rows(catalog):
-    """Half-light radius (arcsec), index, axis ratio and angle (rad) of a catalog, (n, 4); NaN for points."""
+    """Return half-light radius (arcsec), index, axis ratio and angle (rad), (n, 4); NaN for points."""
     units = {"half_light_radius": u.arcsec, "position_angle": u.deg}
     names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
     require_columns(catalog, names, "catalog", units=units)
-    radius, index, ratio, angle = (catalog[name] for name in names)
-    sizes = (
-        to_array(radius, u.arcsec, "half_light_radius"),
-        to_array(angle, u.rad, "position_angle"),
-    )
-    rows = np.stack([sizes[0], floats(index), floats(ratio), sizes[1]], axis=1)
+    radius = to_array(catalog["half_light_radius"], u.arcsec, "half_light_radius")
+    angle = to_array(catalog["position_angle"], u.rad, "position_angle")
+    index = floats(catalog["sersic_index"])
+    ratio = floats(catalog["axis_ratio"])
+    rows = np.stack([radius, index, ratio, angle], axis=1)
     if "profile" in catalog.colnames:
         rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan
     return rows
 
 
 def joined_sky(skies):
-    """Positions (ICRS) one after the other."""
-    skies = [sky.icrs for sky in skies]
-    angles = (np.concatenate([getattr(sky, axis).deg for sky in skies]) for axis in ("ra", "dec"))
-    return SkyCoord(*angles, unit="deg")
+    """Join positions (ICRS) one after the other."""
+    ra = np.concatenate([sky.icrs.ra.deg for sky in skies])
+    dec = np.concatenate([sky.icrs.dec.deg for sky in skies])
+    return SkyCoord(ra, dec, unit="deg")

@@ -37,12 +37,16 @@ class Cutout:
     @property
     def kind(self):
         """``"cutout"`` if any of it is the image itself, else ``"sersic"``."""
-        return "cutout" if self.convolved or self.correction is not None else "sersic"
+        if self.convolved or self.correction is not None:
+            return "cutout"
+        return "sersic"
 
     @property
     def layers(self):
-        """The profile and the rest, or the one there is."""
-        return (self,) if self.correction is None else (self, self.correction)
+        """The profile and its correction, or the cutout alone."""
+        if self.correction is None:
+            return (self,)
+        return self, self.correction
 
 
 def own_segments(segmentation, labels, xy):
@@ -70,7 +74,9 @@ def own_segments(segmentation, labels, xy):
     for value in values[counts > 1]:
         rows = np.flatnonzero(label == value)
         member = np.argwhere(segmentation == value)
-        middle = member.mean(axis=0) if len(member) else np.zeros(2)
+        middle = np.zeros(2)
+        if len(member):
+            middle = member.mean(axis=0)
         distance = np.hypot(xy[rows, 1] - middle[0], xy[rows, 0] - middle[1])
         losers = np.delete(rows, np.nanargmin(np.nan_to_num(distance, nan=np.inf)))
         label[losers] = 0
@@ -121,6 +127,7 @@ def saturated_cores(data, usable, segmentation, label, xy, width):
         if np.count_nonzero(top) >= _FLAT:
             flat[place] |= top
             saturated[k] = True
+        # a hole without data near the position
         low = np.maximum(np.ceil(xy[k, ::-1] - reach), 0).astype(int)
         high = np.maximum(np.floor(xy[k, ::-1] + reach), -1).astype(int) + 1
         saturated[k] |= holes[low[0] : high[0], low[1] : high[1]].any()
@@ -129,5 +136,5 @@ def saturated_cores(data, usable, segmentation, label, xy, width):
 
 def convolve_padded(array, response):
     """Convolve one array with a rim around it, by the transform that ``response(shape)`` gives."""
-    shape = tuple(n + 2 * RIM for n in array.shape)
-    return convolve_batch(np.pad(array, RIM)[None], response(shape), shape)
+    padded = np.pad(array, RIM)
+    return convolve_batch(padded[None], response(padded.shape), padded.shape)

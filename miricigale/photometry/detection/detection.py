@@ -72,7 +72,7 @@ class DetectionPreset:
 
     def on_pixels(self, ratio):
         """
-        The same settings for other pixels.
+        Bring the settings to other pixels.
 
         Parameters
         ----------
@@ -197,8 +197,12 @@ def detect_sources(
         image, preset, subtract_background=subtract_background, box=box, filter_size=filter_size,
         stated_on=stated_on, threshold=threshold, n_pixels=n_pixels,
     )  # fmt: skip
-    rule = None if dilation is None else dilation_rule(dilation)
+    # refuse an unknown rule before the detection
+    rule = None
+    if dilation is not None:
+        rule = dilation_rule(dilation)
     objects, detected = _extract(arrays.flux, arrays, settings)
+    # one segment all over the image is its sky
     largest = np.bincount(detected.ravel(), minlength=2)[1:].max() / np.count_nonzero(arrays.usable)
     if largest > 0.5:
         msg = f"one segment has {largest:.0%} of the image: {_SKY_LEFT}"
@@ -282,9 +286,8 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
        10.0          1          0
     """
     arrays, settings = _prepared(image, preset, **settings)
-    positive, negative = (
-        _segment_snr(flux, arrays, settings) for flux in (arrays.flux, -arrays.flux)
-    )
+    positive = _segment_snr(arrays.flux, arrays, settings)
+    negative = _segment_snr(-arrays.flux, arrays, settings)
     if snr_edges is None:
         snr_edges = [0.0, np.inf]
         if len(negative):
@@ -294,16 +297,12 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
     edges = floats(snr_edges)
     if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
         raise argument_error("snr_edges", "two numbers or more that ascend", snr_edges)
-    counts = [np.histogram(snr, edges)[0] for snr in (positive, negative)]
-    n_positive, n_negative = counts
+    n_positive, _ = np.histogram(positive, edges)
+    n_negative, _ = np.histogram(negative, edges)
     n_low, n_high = poisson_conf_interval(n_negative, interval="frequentist-confidence")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        purity, low, high = (
-            np.where(n_positive > 0, 1 - n / n_positive, np.nan)
-            for n in (n_negative, n_high, n_low)
-        )
-        above = [np.cumsum(n[::-1])[::-1] for n in counts]
-        purity_above = np.where(above[0] > 0, 1 - above[1] / above[0], np.nan)
+    # of all detections from each edge on
+    n_positive_above = np.cumsum(n_positive[::-1])[::-1]
+    n_negative_above = np.cumsum(n_negative[::-1])[::-1]
     texts = declared("miricigale.photometry", "columns.toml")["purity"]
     meta = provenance(n_positive=len(positive), n_negative=len(negative))
     columns = {
@@ -311,18 +310,24 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
         "snr_high": edges[1:],
         "n_positive": n_positive,
         "n_negative": n_negative,
-        "purity": purity,
-        "purity_low": low,
-        "purity_high": high,
-        "purity_above": purity_above,
+        "purity": _purity(n_positive, n_negative),
+        "purity_low": _purity(n_positive, n_high),
+        "purity_high": _purity(n_positive, n_low),
+        "purity_above": _purity(n_positive_above, n_negative_above),
     }
     return described_columns(columns, texts, {**meta, **dataclasses.asdict(settings)})
+
+
+def _purity(n_positive, n_negative):
+    """Return the share of real detections; NaN without any."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(n_positive > 0, 1 - n_negative / n_positive, np.nan)
 
 
 def _prepared(
     image, preset, *, subtract_background=False, box=64, filter_size=6, stated_on=None, **changes
 ):
-    """Arrays with the background taken off, and settings on the image's pixels."""
+    """Return arrays with the background subtracted, and settings on the image's pixels."""
     if not isinstance(preset, DetectionPreset):
         check_names([preset], "detection preset", DETECTION_PRESETS)
         preset = DETECTION_PRESETS[preset]
@@ -342,7 +347,7 @@ def _prepared(
 
 
 def _extract(flux, arrays, settings):
-    """Objects and labels of an image of flux per pixel."""
+    """Extract objects and labels from an image of flux per pixel."""
     _check_sky(flux, arrays, settings)
     kernel = None
     if settings.fwhm:
@@ -381,14 +386,14 @@ def _check_sky(flux, arrays, settings):
 
 
 def _segment_snr(flux, arrays, settings):
-    """Signal-to-noise of the segments found on an image."""
+    """Return the signal-to-noise of the segments found on an image."""
     objects, labels = _extract(flux, arrays, settings)
     total, noise = _segment_sums(labels, flux, arrays, len(objects))
     return total / noise
 
 
 def _segment_sums(labels, flux, arrays, n):
-    """Light of each segment and its error for white noise."""
+    """Sum the light of each segment (uJy), and its error for white noise."""
     flat = labels.ravel()
     variance = np.where(arrays.usable, arrays.sigma, 0.0) ** 2
     total = np.bincount(flat, flux.ravel(), n + 1)[1:]
@@ -397,7 +402,7 @@ def _segment_sums(labels, flux, arrays, n):
 
 def bright_centroids(flux, labels, fallback):
     """
-    Centroids x, y, (n,), of the bright part of each segment, label 1 first.
+    Calculate the centroids x, y, (n,), of the bright part of each segment, label 1 first.
 
     The centroid of a whole segment found at a low threshold is led astray by its ragged rim.
     ``fallback`` are positions of those without a bright part.
@@ -411,6 +416,7 @@ def bright_centroids(flux, labels, fallback):
     weight = smooth[y, x]
     label = labels[y, x]
     peak = np.append(np.inf, scipy.ndimage.maximum(weight, label, np.arange(1, n + 1)))
+    # the bright part: above three tenths of the smoothed peak
     core = weight > 0.3 * peak[label]
     y = y[core]
     x = x[core]
@@ -426,10 +432,11 @@ def bright_centroids(flux, labels, fallback):
 
 
 def _catalog(objects, detected, labels, arrays, meta):
-    """The table of the detections: segments as found, and as they are returned."""
+    """Make the table of the detections: ``detected`` are segments as found, ``labels`` as they are returned."""
     n = len(objects)
     index = np.arange(1, n + 1)
     flux = arrays.flux
+    # light of the segments as returned, positions of those that were detected
     total, noise = _segment_sums(labels, flux, arrays, n)
     scale = pixel_scale(arrays.wcs)
     x, y = bright_centroids(flux, detected, (objects["x"], objects["y"]))

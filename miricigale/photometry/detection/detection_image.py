@@ -61,19 +61,21 @@ def chi_image(images):
     """
     images = [as_mosaic(image, "images") for image in images]
     arrays = [image_arrays(image, "images") for image in images]
-    alike = all(
-        exposure.flux.shape == arrays[0].flux.shape and same_grid(exposure.wcs, arrays[0].wcs)
-        for exposure in arrays
-    )
     wanted = "at least one, all on the same pixels"
-    check_that(arrays and alike, "images", wanted, f"{len(arrays)} images")
-    square, n = (np.zeros(arrays[0].flux.shape) for _ in range(2))
-    for exposure in arrays:
-        values = exposure.flux / exposure.sigma
-        level, rms, _ = sky_noise(values, exposure.usable)
-        square += np.where(exposure.usable, (values - level) / rms, 0.0) ** 2
-        n += exposure.usable
-    sigma = np.where(arrays[0].usable, arrays[0].sigma / arrays[0].area, np.nan)
+    got = f"{len(arrays)} images"
+    check_that(arrays, "images", wanted, got)
+    first = arrays[0]
+    square = np.zeros(first.flux.shape)
+    n = np.zeros(first.flux.shape)
+    for band in arrays:
+        alike = band.flux.shape == first.flux.shape and same_grid(band.wcs, first.wcs)
+        check_that(alike, "images", wanted, got)
+        # deviations from the sky in units of the noise of source-free pixels
+        values = band.flux / band.sigma
+        level, rms, _ = sky_noise(values, band.usable)
+        square += np.where(band.usable, (values - level) / rms, 0.0) ** 2
+        n += band.usable
+    sigma = np.where(first.usable, first.sigma / first.area, np.nan)
     sigma = np.where(np.isfinite(sigma), sigma, np.nanmedian(sigma))
     # mean of the chi distribution
     mean = np.sqrt(2.0) * np.exp(gammaln((n + 1) / 2) - gammaln(np.maximum(n, 1) / 2))
@@ -81,7 +83,7 @@ def chi_image(images):
     return Image(
         (np.sqrt(square) - mean) * sigma,
         unit=SURFACE_BRIGHTNESS,
-        wcs=arrays[0].wcs,
+        wcs=first.wcs,
         mask=n == 0,
         uncertainty=StdDevUncertainty(spread * sigma),
         meta={"bands": [image.meta.get("filter") for image in images]},

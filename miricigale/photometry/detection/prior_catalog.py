@@ -6,7 +6,7 @@ import os
 import numpy as np
 
 from miricigale.instrument import epoch_of
-from miricigale.photometry.images.arrays import nearest_values
+from miricigale.photometry.images.arrays import nearest_values, sky_to_pixels
 from miricigale.photometry.images.fits_images import open_map
 from miricigale.utils.exceptions import CatalogWarning, data_error, warn
 from miricigale.utils.ids import counted_ids, id_column
@@ -76,9 +76,10 @@ def read_prior(highres, *, segmentation=None, catalog=None):
             check_that(data.dtype != bool, "segmentation", wanted, "a mask")
         else:
             image = highres.data.shape, highres.wcs, highres.meta.get("source", "the image")
-            roles = "a segmentation map", "the segmentation"
-            with open_map(segmentation, *roles, SEGMENTS, image) as hdu:
+            wanted = "a segmentation map"
+            with open_map(segmentation, wanted, "the segmentation", SEGMENTS, image) as hdu:
                 data = np.array(hdu.data)
+        # labels count from 1; ids are those of the map
         segments, ids = _numbered(data, segmentation)
     if catalog is None:
         return segments, _from_segments(highres, segments, ids)
@@ -94,7 +95,7 @@ def read_prior(highres, *, segmentation=None, catalog=None):
 
 def detected_prior(highres, catalog=None):
     """
-    Segments that are detected on an image, and its sources: those of a catalog, or the detected ones.
+    Detect segments on an image, and return them with its sources: those of a catalog, or the detected ones.
 
     Parameters
     ----------
@@ -120,20 +121,20 @@ def detected_prior(highres, catalog=None):
 
 
 def sources_of(highres, segmentation, catalog=None):
-    """As `read_prior`, of a map (an array) that may be without segments: then all of a catalog are points."""
+    """Read a prior as `read_prior`, from a map (an array) that may be without segments: all are points then."""
     if np.any(np.nan_to_num(segmentation)):
         return read_prior(highres, segmentation=segmentation, catalog=catalog)
     from astropy.coordinates import SkyCoord
 
-    nowhere = SkyCoord([], [], unit="deg")
-    catalog = {"id": np.empty(0, int), "sky": nowhere} if catalog is None else catalog
+    if catalog is None:
+        catalog = {"id": np.empty(0, int), "sky": SkyCoord([], [], unit="deg")}
     sources = read_catalog(catalog, epoch=epoch_of(highres))
     sources["label"] = np.zeros(len(sources), int)
     return np.zeros(segmentation.shape, np.int32), sources["id", "sky", "label"]
 
 
 def _numbered(data, path):
-    """Labels 1 to n in the order of the ids, and the ids."""
+    """Return labels 1 to n in the order of the ids, and the ids."""
     if data.dtype.kind == "f":
         rounded = np.where(np.isfinite(data), np.rint(data), 0)
         if not np.array_equal(rounded, np.where(np.isfinite(data), data, 0)):
@@ -155,13 +156,14 @@ def _numbered(data, path):
 
 
 def _from_segments(highres, segments, ids):
-    """A source for each segment, at the centroid of its bright part."""
+    """Make a source of each segment, at the centroid of its bright part."""
     from astropy.table import QTable
     from scipy.ndimage import center_of_mass
 
     from miricigale.photometry.detection.detection import bright_centroids
 
     index = np.arange(1, len(ids) + 1)
+    # segments without a bright part have the middle of their pixels
     middle = np.array(center_of_mass(np.ones(segments.shape), segments, index)).T
     flux = np.where(np.isfinite(highres.data), highres.data, 0.0)
     if highres.mask is not None:
@@ -173,7 +175,7 @@ def _from_segments(highres, segments, ids):
 
 def read_catalog(catalog, wcs=None, epoch=None):
     """
-    Ids and positions of a catalog in any of the usual forms; see ``catalog`` of `read_prior`.
+    Read ids and positions of a catalog in any of the usual forms; see ``catalog`` of `read_prior`.
 
     Proper motions, of a `~astropy.coordinates.SkyCoord` or in columns, bring positions to an epoch
     (`~miricigale.utils.positions.at_epoch`).
@@ -187,17 +189,22 @@ def read_catalog(catalog, wcs=None, epoch=None):
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
 
-    name = f"catalog {catalog}" if isinstance(catalog, (str, os.PathLike)) else "catalog"
+    is_file = isinstance(catalog, (str, os.PathLike))
+    name = "catalog"
+    if is_file:
+        name = f"catalog {catalog}"
     if isinstance(catalog, SkyCoord):
         catalog = QTable({"sky": catalog.reshape(-1)})
     table = QTable(as_table(catalog, "catalog"), copy=False)
     table["sky"] = as_positions(table, name, wcs, missing=True, epoch=epoch, motions=True)
     if "id" not in table.colnames:
         # labels are the ids of files, and in tables those of segments
-        theirs = id_column(table.colnames, name, labels=isinstance(catalog, (str, os.PathLike)))
+        theirs = id_column(table.colnames, name, labels=is_file)
         if theirs is None:
             _log.info("%s has no ids; its rows are counted from 1", name)
-        table["id"] = counted_ids(table, name) if theirs is None else table[theirs]
+            table["id"] = counted_ids(table, name)
+        else:
+            table["id"] = table[theirs]
     table["id"] = unique_ids(table["id"], name)
     return table
 
@@ -206,14 +213,13 @@ def check_labels(labels, found_labels, name):
     """
     Refuse labels that are those of another segmentation map, or warn of them.
 
-    ``labels`` are those of the sources, ``here`` those at their positions (0 for none),
-    ``what`` is the name for messages. Refused if more than half of the sources are on another segment than
+    ``labels`` are those of the sources, ``found_labels`` those at their positions (0 for none),
+    ``name`` is for messages. Refused if more than half of the sources are on another segment than
     theirs, warned of from three and a tenth on.
     """
     on_both = (labels > 0) & (found_labels > 0)
-    n, wrong = (
-        int(np.count_nonzero(rows)) for rows in (on_both, on_both & (labels != found_labels))
-    )
+    n = int(np.count_nonzero(on_both))
+    wrong = int(np.count_nonzero(on_both & (labels != found_labels)))
     text = f"{wrong} of {n} sources that stand on another segment than theirs"
     wanted = "labels of the segmentation map"
     check_that(not wrong > 0.5 * n, name, wanted, f"{text}: is it the map of another detection?")
@@ -223,23 +229,31 @@ def check_labels(labels, found_labels, name):
 
 
 def _labels(sources, segments, ids, wcs, catalog, segmentation):
-    """The segment of each source: by id if that is what the ids are, by position otherwise."""
+    """Return the label of each source's segment: by id if ids are those of segments, by position otherwise."""
     sky = sources["sky"]
     is_placed = np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)
     xy = np.full((len(sources), 2), np.nan)
     if is_placed.any():
-        xy[is_placed] = np.stack(wcs.world_to_pixel(sky[is_placed]), axis=-1)
+        xy[is_placed] = sky_to_pixels(sky[is_placed], wcs)
     labels_at, inside = nearest_values(segments, xy)
+    # the segment of the same id, 0 if there is none
     by_number = np.zeros(len(sources), np.int64)
     if np.asarray(sources["id"]).dtype.kind in "iu":
         place = np.clip(np.searchsorted(ids, sources["id"]), 0, len(ids) - 1)
         by_number = np.where(ids[place] == sources["id"], place + 1, 0)
     has_label = labels_at > 0
+    # ids are those of segments if most are right at their positions
     by_id = has_label.any() and np.mean(by_number[has_label] == labels_at[has_label]) > 0.5
-    label = by_number if by_id else labels_at.astype(np.int64)
+    if by_id:
+        label = by_number
+        _log.info("%s: segments of %s by id", catalog, segmentation)
+    else:
+        label = labels_at.astype(np.int64)
+        _log.info("%s: segments of %s by position", catalog, segmentation)
     check_labels(label, labels_at, f"{catalog} by id")
-    _log.info("%s: segments of %s by %s", catalog, segmentation, "id" if by_id else "position")
-    n_without, n_inside = (int(np.count_nonzero(rows)) for rows in (inside & (label == 0), inside))
+    # sources on the map without a segment
+    n_without = int(np.count_nonzero(inside & (label == 0)))
+    n_inside = int(np.count_nonzero(inside))
     msg = f"{n_without} of the {n_inside} sources of {catalog} on the map have no segment"
     msg += f" of {segmentation} and are taken as points"
     if n_without > 0.5 * n_inside:
@@ -252,9 +266,11 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
     orphans = np.setdiff1d(np.arange(1, len(ids) + 1), np.append(label, edge))
     if orphans.size:
         examples = ", ".join(map(str, ids[orphans[:5] - 1]))
+        if orphans.size > 5:
+            examples += ", ..."
         msg = (
             f"{orphans.size} segments of {segmentation} belong to no source of {catalog} and are not "
-            f"fitted (ids {examples}{', ...' if orphans.size > 5 else ''})"
+            f"fitted (ids {examples})"
         )
         warn(msg, CatalogWarning)
     return label

@@ -65,7 +65,8 @@ def residual_peaks(fit, residual, model, xy):
     sampled = [part for part in chunks(len(residual), _ROWS // 8) if inverse_sigma[part].any()]
     sampled = sampled[:: max(1, residual.size // _SOME)]
     strips = parallel_map(matched.rows, sampled, executor=executor)
-    snr, power = map(np.concatenate, zip(*strips, strict=True))
+    snr = np.concatenate([strip_snr for strip_snr, _ in strips])
+    power = np.concatenate([strip_power for _, strip_power in strips])
     is_usable = np.concatenate([inverse_sigma[part] for part in sampled]) > 0
     matched.min_power = 0.25 * np.median(power[is_usable])
     # what is a thousandth of the stated noise is that of the arithmetic
@@ -73,7 +74,7 @@ def residual_peaks(fit, residual, model, xy):
     reach = int(np.ceil(width))
 
     def find(part):
-        """Places, lights and tops of the parabolas of peaks on some rows."""
+        """Find places, light and tops of the parabolas of peaks on some rows."""
         first = max(part.start - reach, 0)
         snr, power = matched.rows(slice(first, part.stop + reach))
         inner = slice(part.start - first, part.stop - first)
@@ -106,9 +107,11 @@ def residual_peaks(fit, residual, model, xy):
         distance, nearest = scipy.spatial.KDTree(placed).query(pixel)
         # a template that is too narrow leaves as much on the other side of the source
         close = np.flatnonzero(distance < _LEFT_REACH * full_width)
-        for rows in (close[part] for part in chunks(len(close), _CANDIDATES // 10)):
+        for part in chunks(len(close), _CANDIDATES // 10):
+            rows = close[part]
             mirror = np.rint(2 * placed[nearest[rows]] - pixel[rows]).astype(int)
-            is_symmetric = matched.light_at(*mirror.T[::-1]) > 0.5 * light[rows]
+            x, y = mirror.T
+            is_symmetric = matched.light_at(y, x) > 0.5 * light[rows]
             is_symmetric &= np.all((mirror >= 0) & (mirror < residual.shape[::-1]), axis=1)
             distance[rows[is_symmetric]] = 0.0
     is_apart = distance >= _LEFT_DISTANCE * full_width
@@ -133,7 +136,7 @@ _CANDIDATES = 100_000
 
 
 def _radius(width):
-    """Half-width of the Gaussian's window, as `scipy.ndimage.gaussian_filter` has it."""
+    """Return the half-width (pixels) of the Gaussian's window, as `scipy.ndimage.gaussian_filter` has it."""
     return int(4.0 * width + 0.5)
 
 
@@ -147,8 +150,10 @@ class _Matched:
     min_power: float = 0.0  # Power below which too little of a source is seen.
 
     def rows(self, part):
-        """Signal-to-noise and power on some rows, both zero where too little of a source is seen."""
+        """Return signal-to-noise and power on some rows, both zero where too little of a source is seen."""
+        # matched filter: sum of PSF times residual over the variance
         light = self._filtered(part, self.width, self.residual)
+        # and of the squared PSF over the variance, a Gaussian narrower by the root of two
         power = self._filtered(part, self.width / np.sqrt(2)) / (4 * np.pi * self.width**2)
         power[power <= self.min_power] = 0.0
         return np.divide(light, np.sqrt(power), out=np.zeros_like(light), where=power > 0), power
@@ -157,41 +162,47 @@ class _Matched:
         halo = _radius(width)
         rows = slice(max(part.start - halo, 0), part.stop + halo)
         light = self.inverse_sigma[rows] ** 2
-        light *= 1 if image is None else image[rows]
+        if image is not None:
+            light *= image[rows]
         light = scipy.ndimage.gaussian_filter(light, width, mode="constant")
         return light[part.start - rows.start :][: part.stop - part.start]
 
     def at(self, y, x, width, image=None):
-        """The inverse variance, times an image if there is one, filtered with a Gaussian at some pixels."""
+        """Filter the inverse variance, times an image if there is one, with a Gaussian at some pixels."""
         steps = np.arange(-_radius(width), _radius(width) + 1)
         hat = np.exp(-0.5 * (steps / width) ** 2)
         values = _windows(self.inverse_sigma, y, x, steps) ** 2
-        values *= 1 if image is None else _windows(image, y, x, steps)
+        if image is not None:
+            values *= _windows(image, y, x, steps)
         return np.einsum("kij,i,j->k", values, hat, hat) / hat.sum() ** 2
 
     def light_at(self, y, x):
-        """Fluxes at some pixels, zero where too little of a source is seen."""
+        """Return fluxes at some pixels, zero where too little of a source is seen."""
         power = self.at(y, x, self.width / np.sqrt(2)) / (4 * np.pi * self.width**2)
         light = self.at(y, x, self.width, self.residual)
         return np.divide(light, power, out=np.zeros_like(light), where=power > self.min_power)
 
 
 def _windows(image, y, x, steps):
-    """Windows about some pixels, zero beyond the image, shape (n, k, k)."""
-    rows, columns = (place[:, None] + steps for place in (y, x))
-    inside = [(c >= 0) & (c < n) for c, n in zip((rows, columns), image.shape, strict=True)]
+    """Cut windows about some pixels, zero beyond the image, shape (n, k, k)."""
+    ny, nx = image.shape
+    rows = y[:, None] + steps
+    columns = x[:, None] + steps
+    row_inside = (rows >= 0) & (rows < ny)
+    column_inside = (columns >= 0) & (columns < nx)
     values = image[
-        np.clip(rows, 0, image.shape[0] - 1)[:, :, None],
-        np.clip(columns, 0, image.shape[1] - 1)[:, None],
+        np.clip(rows, 0, ny - 1)[:, :, None],
+        np.clip(columns, 0, nx - 1)[:, None],
     ]
-    return np.where(inside[0][:, :, None] & inside[1][:, None], values, 0.0)
+    return np.where(row_inside[:, :, None] & column_inside[:, None], values, 0.0)
 
 
 def _parabola(image, xy):
-    """Offsets (x, y) of maxima from their pixels, at most half a pixel."""
+    """Return offsets (x, y) of maxima from their pixels, at most half a pixel."""
     windows = _windows(image, xy[:, 1], xy[:, 0], np.arange(-1, 2))
     offsets = []
     for low, high in ((windows[:, 1, 0], windows[:, 1, 2]), (windows[:, 0, 1], windows[:, 2, 1])):
+        # vertex of the parabola through three pixels
         curvature = 2 * windows[:, 1, 1] - low - high
         step = 0.5 * (high - low) / np.where(curvature > 0, curvature, np.inf)
         offsets.append(np.clip(step, -0.5, 0.5))
@@ -199,13 +210,13 @@ def _parabola(image, xy):
 
 
 def _close_pairs(peaks, xy, reach=_LEFT_REACH):
-    """Pairs of a peak and a source within reach (full widths) of it, as two arrays of numbers."""
+    """Find pairs of a peak and a source within reach (full widths) of it, as two arrays of numbers."""
     placed = np.flatnonzero(np.isfinite(xy).all(axis=1))
     if not len(placed) or not len(peaks.xy):
         return np.empty(0, int), np.empty(0, int)
     tree = scipy.spatial.KDTree(xy[placed])
     sources_of_peaks = tree.query_ball_point(peaks.xy, reach * peaks.full_width)
-    peak = np.repeat(np.arange(len(sources_of_peaks)), [len(rows) for rows in sources_of_peaks])
+    peak = np.repeat(np.arange(len(sources_of_peaks)), list(map(len, sources_of_peaks)))
     return peak, placed[np.concatenate(sources_of_peaks).astype(int)]
 
 
@@ -232,7 +243,10 @@ def new_sources(peaks, xy, flux, *, usable=None):
     """
     new = np.ones(len(peaks.xy), bool)
     strict = usable is not None
-    for share, reach in ((_LEFT_SHARE, _LEFT_REACH), *[_WINGS] * strict):
+    limits = [(_LEFT_SHARE, _LEFT_REACH)]
+    if strict:
+        limits.append(_WINGS)
+    for share, reach in limits:
         peak, source = _close_pairs(peaks, xy, reach)
         new[peak[peaks.flux[peak] <= share * flux[source]]] = False
     if strict:

@@ -51,7 +51,8 @@ class DilationRule:
     max_area: float = np.inf
 
     def __post_init__(self):
-        areas, factors = (np.atleast_1d(floats(v)) for v in (self.areas, self.factors))
+        areas = np.atleast_1d(floats(self.areas))
+        factors = np.atleast_1d(floats(self.factors))
         if areas.ndim != 1 or np.any(areas <= 0) or np.any(np.diff(areas) <= 0):
             raise argument_error("areas", "positive and ascending", self.areas)
         if factors.shape != areas.shape or not np.all(factors >= 1):
@@ -63,7 +64,7 @@ class DilationRule:
         object.__setattr__(self, "factors", tuple(factors.tolist()))
 
     def area(self, before):
-        """Areas (arcsec2) that segments of some areas are to have, never below these."""
+        """Return areas (arcsec2) that segments of some areas are to have, never below these."""
         before = floats(before)
         with np.errstate(divide="ignore"):
             factor = np.exp(np.interp(np.log(before), np.log(self.areas), np.log(self.factors)))
@@ -132,6 +133,7 @@ def dilate_segments(segmentation, rule, *, pixel_scale, mask=None):
         return SegmentationImage(grown)
     pixel = float(pixel_scale) ** 2
     wanted = np.where(is_sky, 0, np.rint(rule.area(counts * pixel) / pixel)).astype(int)
+    # pixels that each segment is to gain
     missing = np.where(is_sky, 0, wanted - counts)
     distance, nearest = scipy.ndimage.distance_transform_edt(labels == 0, return_indices=True)
     owner = index[tuple(nearest)]
@@ -142,6 +144,7 @@ def dilate_segments(segmentation, rule, *, pixel_scale, mask=None):
     y, x = np.nonzero(is_free)
     owner = owner[y, x]
     distance = distance[y, x]
+    # of each segment the nearest pixels first
     order = np.lexsort((distance, owner))
     first = np.searchsorted(owner[order], np.arange(len(names)))
     last = np.searchsorted(owner[order], np.arange(len(names)), side="right")
@@ -155,7 +158,7 @@ def dilate_segments(segmentation, rule, *, pixel_scale, mask=None):
 
 
 def dilation_rule(rule):
-    """The rule of a name, or the rule itself."""
+    """Return the rule of a name, or the rule itself."""
     if isinstance(rule, DilationRule):
         return rule
     check_names([rule], "dilation rule", DILATION_RULES)

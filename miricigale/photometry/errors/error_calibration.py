@@ -93,10 +93,14 @@ class ErrorCalibration:
         """
         names = ["flux_true", "flux", "flux_err", "flux_err_noise"]
         require_columns(sources, names, "sources", units=dict.fromkeys(names, FNU))
-        true, flux, error, noise = (sources[name].to_value(FNU) for name in names)
+        true = sources["flux_true"].to_value(FNU)
+        flux = sources["flux"].to_value(FNU)
+        error = sources["flux_err"].to_value(FNU)
+        noise = sources["flux_err_noise"].to_value(FNU)
         good = np.flatnonzero(np.isfinite(flux) & (error > 0) & (noise > 0))
         wanted = f"at least {_LEAST} sources that are measured"
         check_that(len(good) >= _LEAST, "sources", wanted, f"{len(good)}")
+        # pulls and relative deviations of measured sources
         snr = true[good] / noise[good]
         pull = (flux[good] - true[good]) / error[good]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -118,7 +122,7 @@ class ErrorCalibration:
 
     def factor(self, flux, flux_err_noise):
         """
-        The factor for fluxes.
+        Return the factor on the errors of fluxes.
 
         Parameters
         ----------
@@ -131,6 +135,7 @@ class ErrorCalibration:
             Between the bins linear in asinh of flux over error, beyond them constant; NaN for NaN.
         """
         snr = np.asarray((flux / flux_err_noise).to_value(""))
+        # asinh is linear for faint and logarithmic for bright sources
         nodes = np.arcsinh(np.asarray(self.bins["snr"]))
         return np.interp(np.arcsinh(snr), nodes, np.asarray(self.bins["factor"]))
 
@@ -163,15 +168,17 @@ class ErrorCalibration:
             names.append("flux_point_err")
             scale = scipy.sparse.block_diag((scale, scale), format="csr")
             changed["joint_covariance"] = (scale @ result.joint_covariance @ scale).tocsr()
-        changed |= {name: getattr(result, name) * factor for name in names}
-        bins = {name: self.bins[name].tolist() for name in ("snr", "factor")}
+        for name in names:
+            changed[name] = getattr(result, name) * factor
+        bins = {"snr": self.bins["snr"].tolist(), "factor": self.bins["factor"].tolist()}
         meta = {**result.meta, "error_calibration": bins}
         return dataclasses.replace(result, **changed, meta=meta)
 
 
 def _members(snr):
-    """Rows of each bin: places without flux, then between the edges, small bins joined with the next."""
+    """Return the rows of each bin: places without flux, then by the edges; small bins join the next."""
     order = np.argsort(snr, kind="stable")
+    # bins of signal-to-noise; empty places are one of their own
     number = np.searchsorted(_EDGES, snr[order], side="right")
     number[snr[order] <= 0] = -1
     members = []
@@ -181,16 +188,22 @@ def _members(snr):
         if len(waiting) >= _LEAST:
             members.append(waiting)
             waiting = np.empty(0, int)
-    if len(waiting):
-        members[-1:] = [np.concatenate([*members[-1:], waiting])]
-    return members
+    if not len(waiting):
+        return members
+    # a last bin that is too small joins the one before
+    if members:
+        waiting = np.concatenate([members.pop(), waiting])
+    return members + [waiting]
 
 
 def _row(snr, pull, ratio, member):
     pull = pull[member]
     ratio = ratio[member][np.isfinite(ratio[member])]
+    # the factor by which errors hold as many pulls as Gaussian ones
     factor = np.percentile(np.abs(pull), _ONE_SIGMA)
-    bias = np.median(ratio) if len(ratio) else np.nan
+    bias = np.nan
+    if len(ratio):
+        bias = np.median(ratio)
     # of a percentile: root of p (1 - p) / n over the density of |x| there, 0.484
     factor_err = factor * 0.4655 / 0.4839 / np.sqrt(len(member))
     snr = snr[member]

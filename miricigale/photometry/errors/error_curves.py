@@ -37,8 +37,9 @@ class Binned:
 
     def rows(self):
         nan = np.full(len(self.flux), np.nan)
-        ends = [np.full(len(self.flux), v) for v in (self.low, self.high)]
-        return [self.flux, self.error, *ends, nan, nan]
+        low = np.full(len(self.flux), self.low)
+        high = np.full(len(self.flux), self.high)
+        return [self.flux, self.error, low, high, nan, nan]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -60,20 +61,23 @@ class Analytic:
         return np.zeros(np.shape(flux), bool)
 
     def rows(self):
-        return [
-            np.array([v]) for v in (np.nan, self.sky, np.nan, np.nan, self.fraction, self.photon)
-        ]
+        values = [np.nan, self.sky, np.nan, np.nan, self.fraction, self.photon]
+        return np.array(values)[:, None]
 
 
 def measured_curve(name, true, measured, size, statistic):
-    """Errors of one band in bins of true flux, from arrays in uJy."""
+    """Measure errors (uJy) of one band in bins of true flux, from arrays in uJy."""
     wanted = f"at least three measured sources in {name!r}"
     check_that(len(true) >= 3, "measured", wanted, f"{len(true)}")
+    # bins of equal number, the brightest first; the faintest takes the remainder
     order = np.argsort(-true, kind="stable")
     edges = np.arange(0, max(len(true) // size, 1) * size + 1, size)
     edges[-1] = len(true)
     parts = [order[a:b] for a, b in itertools.pairwise(edges)][::-1]
-    flux, error = np.transpose([_scatter(true[part], measured[part]) for part in parts])
+    flux = np.empty(len(parts))
+    error = np.empty(len(parts))
+    for k, part in enumerate(parts):
+        flux[k], error[k] = _scatter(true[part], measured[part])
     if statistic != "median_abs":
         error = _pooled(flux, error)
     return Binned(flux, error * STATISTICS[statistic], float(true.min()), float(true.max()))
@@ -81,7 +85,7 @@ def measured_curve(name, true, measured, size, statistic):
 
 def _pooled(flux, error):
     """
-    Errors that rise with the flux, as does the signal-to-noise.
+    Pool errors until they rise with the flux, as does the signal-to-noise.
 
     The scatter of thirty sources is known to a fifth at best. Bins that contradict either order
     are joined (isotonic regression in the logarithm); otherwise the limit, where the
@@ -93,7 +97,9 @@ def _pooled(flux, error):
     flux = flux[order]
     error = error[order]
     if np.all(error > 0):
+        # errors that rise, then signal-to-noise that rises
         error = np.exp(isotonic_regression(np.log(error)).x)
+        # the signal-to-noise of positive fluxes rises too
         bright = flux > 0
         ratio = np.log(flux[bright] / error[bright])
         error[bright] = flux[bright] / np.exp(isotonic_regression(ratio).x)
@@ -104,7 +110,7 @@ def _pooled(flux, error):
 
 def _scatter(true, measured):
     """
-    Median true flux of a bin and median absolute deviation there.
+    Return the median true flux of a bin and the median absolute deviation there.
 
     Bright sources scatter in proportion to their flux (templates, blends), faint ones by the
     noise of the sky. Where the signal-to-noise is above 5 the deviations are taken relative to
@@ -118,12 +124,13 @@ def _scatter(true, measured):
 
 
 def limiting_flux(curve, n_sigma):
-    """Flux (uJy) above which the signal-to-noise exceeds ``n_sigma``; NaN if none reaches it."""
+    """Find the flux (uJy) above which the signal-to-noise exceeds ``n_sigma``; NaN if none reaches it."""
     from scipy.optimize import brentq
 
     def excess(flux):
         return flux - n_sigma * float(curve.sigma(flux))
 
+    # the last flux of a grid below the limit brackets it
     grid = np.geomspace(1e-9, 1e9, 3601)
     undetected = np.flatnonzero(grid < n_sigma * curve.sigma(grid))
     if len(undetected) == 0:
@@ -132,28 +139,29 @@ def limiting_flux(curve, n_sigma):
     if last == len(grid) - 1:
         return np.nan
     limit = brentq(excess, grid[last], grid[last + 1], rtol=1e-12)
-    return np.nan if limit > curve.high else limit
+    if limit > curve.high:
+        return np.nan
+    return limit
 
 
 def common_bands(truth, measured):
-    """Names of the flux columns that two tables both have; an error if there is none."""
+    """Return the names of the flux columns that two tables both have; refuse tables without any."""
     require_columns(truth, [], "truth")
     require_columns(measured, [], "measured")
     errors = {error_column(name) for name in truth.colnames}
     shared = [name for name in truth.colnames if name in measured.colnames and name not in errors]
-    bands = [
-        name
-        for name in shared
-        if getattr(truth[name], "unit", None) is not None
-        and u.Unit(truth[name].unit).is_equivalent(FNU)
-    ]
+    bands = []
+    for name in shared:
+        unit = getattr(truth[name], "unit", None)
+        if unit is not None and u.Unit(unit).is_equivalent(FNU):
+            bands.append(name)
     wanted = "tables that share a column of fluxes with a unit (or 'filters' given)"
     check_that(bands, "truth, measured", wanted, f"the common columns {shared}")
     return bands
 
 
 def same_rows(truth, measured):
-    """Rows of two tables that belong to the same source, by ``id`` or by place."""
+    """Return the rows of two tables that belong to the same source, by ``id`` or by place."""
     if "id" in truth.colnames and "id" in measured.colnames:
         _, rows, measured_rows = np.intersect1d(
             np.asarray(truth["id"]), np.asarray(measured["id"]), return_indices=True
@@ -166,7 +174,7 @@ def same_rows(truth, measured):
 
 
 def flux_table(photometry, filters, model_bands):
-    """A copy of a table with fluxes in uJy, and the bands: those of ``known`` that it has by default."""
+    """Copy a table with fluxes in uJy, and choose the bands: those of ``model_bands`` that it has by default."""
     if filters is not None:
         filters = [known_filter(name, model_bands, "band of this error model") for name in filters]
     names = model_bands if filters is None else filters
@@ -213,12 +221,14 @@ def curves_from_table(table):
     filters = np.asarray(table["filter"]).astype(str)
     for name in dict.fromkeys(filters):
         part = table[filters == name]
-        flux, sigma, low, high, photon = (
-            u.Quantity(part[c]).to_value(FNU) for c in ("flux", "sigma", "low", "high", "photon")
-        )
+        sigma = u.Quantity(part["sigma"]).to_value(FNU)
         if part["kind"][0] == "binned":
-            curves[name] = Binned(flux, sigma, float(low[0]), float(high[0]))
+            flux = u.Quantity(part["flux"]).to_value(FNU)
+            low = u.Quantity(part["low"][0]).to_value(FNU)
+            high = u.Quantity(part["high"][0]).to_value(FNU)
+            curves[name] = Binned(flux, sigma, float(low), float(high))
         else:
-            fraction = float(u.Quantity(part["fraction"][0]).value)
-            curves[name] = Analytic(float(sigma[0]), fraction, float(photon[0]))
+            fraction = u.Quantity(part["fraction"][0]).value
+            photon = u.Quantity(part["photon"][0]).to_value(FNU)
+            curves[name] = Analytic(float(sigma[0]), float(fraction), float(photon))
     return curves

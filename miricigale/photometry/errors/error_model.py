@@ -61,24 +61,30 @@ HERSCHEL_DEPTHS = types.MappingProxyType(
 
 def fractional_error(name):
     """
-    Part of the flux that is added to the error of a band other than MIRI's, in quadrature.
+    Return the part of the flux that is added to the error of a band other than MIRI's, in quadrature.
 
     0.10 for IRAC and MIPS, 0.03 otherwise: the package's own choice, not the paper's.
     """
-    return 0.10 if name.startswith(("irac", "mips")) else 0.03
+    if name.startswith(("irac", "mips")):
+        return 0.10
+    return 0.03
 
 
 def _band(name):
-    """Our name of a band or filter, or its own where it is none of ours."""
+    """Return the package's name of a band or filter, or its own where there is none."""
     name = str(getattr(name, "name", name))
     return find_filter(name) or name
 
 
 def add_noise(photometry, name, sigma, seed):
     """Add noise of known errors, shape (n,), to the fluxes of a band in place; draws belong to ``id`` or row."""
-    keys = photometry["id"] if "id" in photometry.colnames else np.arange(len(photometry))
-    noise = [stream(seed, "photometry", name, str(key)).standard_normal() for key in keys]
-    photometry[name] = photometry[name] + np.array(noise) * sigma
+    keys = np.arange(len(photometry))
+    if "id" in photometry.colnames:
+        keys = photometry["id"]
+    noise = np.empty(len(keys))
+    for k, key in enumerate(keys):
+        noise[k] = stream(seed, "photometry", name, str(key)).standard_normal()
+    photometry[name] = photometry[name] + noise * sigma
     photometry[error_column(name)] = sigma
 
 
@@ -186,6 +192,7 @@ class ErrorModel(Interactive):
         filters = list(filters)
         for table, argument in ((truth, "truth"), (measured, "measured")):
             require_columns(table, filters, argument, units=dict.fromkeys(filters, FNU))
+        # the same sources of both tables
         rows_true, rows_measured = same_rows(truth, measured)
         curves = {}
         for name in filters:
@@ -193,8 +200,10 @@ class ErrorModel(Interactive):
             fluxes = to_array(measured[name], FNU, name)[rows_measured]
             relative = _relative_noise(noise, name, len(measured))[rows_measured]
             good = np.isfinite(true) & np.isfinite(fluxes) & np.isfinite(relative)
-            true, off = true[good], (fluxes - true)[good] / relative[good]
-            curves[name] = measured_curve(name, true, true + off, int(bin_size), statistic)
+            # the scatter as it would be with the noise that the model describes
+            scatter = (fluxes - true)[good] / relative[good]
+            true = true[good]
+            curves[name] = measured_curve(name, true, true + scatter, int(bin_size), statistic)
         return cls(curves, provenance(source="tables", statistic=statistic, bin_size=bin_size))
 
     @classmethod
@@ -216,7 +225,9 @@ class ErrorModel(Interactive):
         curves = {}
         for name, depth in depths.items():
             limit = ab_quantity(depth).to_value(FNU)
-            part = fractional.get(name, 0.0) if isinstance(fractional, dict) else fractional
+            part = fractional
+            if isinstance(fractional, dict):
+                part = fractional.get(name, 0.0)
             if not (np.isfinite(limit) and limit > 0):
                 raise argument_error("depths", "finite depths", f"{depth} for {name!r}")
             check_that(part >= 0, "fractional", "at least 0", f"{part} for {name!r}")
@@ -226,7 +237,7 @@ class ErrorModel(Interactive):
     @classmethod
     def yang2021(cls):
         """
-        Errors of 15 existing bands like the paper's; depths and fractions are the package's choice.
+        Make the errors of 15 existing bands like the paper's; depths and fractions are the package's choice.
 
         Returns
         -------
@@ -276,20 +287,20 @@ class ErrorModel(Interactive):
         from miricigale.depth import fitted_noise
 
         if isinstance(filter, Exposure):
-            names = ("n_integrations", "frame_time", "n_frames", "subarray")
-            facts = {name: getattr(filter, name) for name in names}
-            options = facts | options
+            for name in ("n_integrations", "frame_time", "n_frames", "subarray"):
+                options.setdefault(name, getattr(filter, name))
             time = filter.exposure_time if time is None else time
             filter = filter.filter
         check_that(time is not None, "time", "given, or an Exposure", "None")
         filter = imager_filter(filter)
+        # noise of the sky, and variance by the source's own photons for a unit flux
         sky, photon = fitted_noise(filter, time, excess=excess, **options)
         curve = Analytic(sky, float(fractional), photon)
         return cls({str(filter): curve}, provenance(source="exposure"))
 
     def sigma(self, flux, filter):
         """
-        The error of a flux.
+        Return the 1-sigma error of a flux in uJy.
 
         Parameters
         ----------
@@ -320,7 +331,7 @@ class ErrorModel(Interactive):
 
     def limiting_flux(self, filter, n_sigma=5.0):
         """
-        The flux above which the signal-to-noise exceeds a value.
+        Find the flux (uJy) above which the signal-to-noise exceeds a value.
 
         Parameters
         ----------
@@ -340,7 +351,7 @@ class ErrorModel(Interactive):
 
     def limiting_magnitude(self, filter, n_sigma=5.0):
         """
-        The limit as AB magnitude.
+        Find the AB magnitude at which the signal-to-noise reaches a value.
 
         Parameters
         ----------
@@ -463,7 +474,7 @@ class ErrorModel(Interactive):
 
 
 def _relative_noise(noise, name, n):
-    """Factors of the noise of ``n`` rows in a band: 1 without any, NaN where not positive and finite."""
+    """Return noise factors of ``n`` rows in a band: 1 without any, NaN where not positive and finite."""
     if noise is None:
         return np.ones(n)
     values = to_array(noise[name], u.one, "noise", ndim=1)

@@ -97,10 +97,9 @@ class ImageErrors:
         OSError
             If the file exists and ``overwrite`` is False.
         """
-        planes = {
-            f"limit_{name}": limit.to_value(FNU).astype(np.float32)
-            for name, limit in self.limits.items()
-        }
+        planes = {}
+        for name, limit in self.limits.items():
+            planes[f"limit_{name}"] = limit.to_value(FNU).astype(np.float32)
         planes["correlation"] = self.correlation
         write_image(self.noise, path, planes=planes, overwrite=overwrite)
 
@@ -162,6 +161,7 @@ def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.
     scale = pixel_scale(arrays.wcs)
     usable = arrays.usable
     is_free = sky_noise(arrays.flux / arrays.sigma, usable, significance=4.0)[2]
+    # the sky that is left
     level = np.median((arrays.flux / arrays.area)[is_free])
     flux = np.where(usable, arrays.flux - level * arrays.area, 0.0)
     correlation = noise_correlation(flux, is_free, 1 / arrays.sigma)
@@ -172,7 +172,9 @@ def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.
     rows = []
     limits = {}
     for name, (weight, reach, inside) in _weights(diameters, psf, scale).items():
-        square, ny, nx = weight**2, *weight.shape
+        square = weight**2
+        ny, nx = weight.shape
+        # variance of the weighted sum, for the measured covariance of pixels and for independent pixels
         spread = weight * fftconvolve(weight, correlation)[m : m + ny, m : m + nx]
         factor = np.sqrt(spread.sum() / square.sum())
         # pixels without data count as those around
@@ -183,11 +185,14 @@ def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.
         stated_error = np.sqrt(np.where(usable, stated_error, np.nan))
         error = factor * np.nanmedian(stated_error) * FNU
         limits[name] = n_sigma * factor * stated_error * FNU
+        # test: scatter of sums at empty places in units of these errors
         at = np.argwhere(usable & (distance > reach + 1))
         at = tuple(at[rng.permutation(len(at))[:_EMPTY]].T)
         pulls = fftconvolve(flux, weight[::-1, ::-1], "same")[at] / (factor * stated_error[at])
         limit = n_sigma * error
-        scatter = mad_std(pulls) if pulls.size > 1 else np.nan
+        scatter = np.nan
+        if pulls.size > 1:
+            scatter = mad_std(pulls)
         rows.append(
             {
                 "aperture": name,
@@ -207,16 +212,20 @@ def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.
     texts = declared("miricigale.photometry", "columns.toml")["errors"]
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     table = described_columns(columns, texts, meta)
+    # errors scaled to the measured noise, as surface brightness
     noise = np.where(usable, arrays.sigma / arrays.area * over, np.nan)
     noise = Image(noise, unit=SURFACE_BRIGHTNESS, wcs=arrays.wcs, meta=facts)
     return ImageErrors(noise, correlation, table, limits, int(np.count_nonzero(is_free)))
 
 
 def _weights(diameters, psf, scale):
-    """Of each aperture, and of a point: weights of pixels, reach (pixels), and the light of a point in it."""
+    """Return for each aperture, and a point, weights of pixels, reach (pixels), and the light of a point in it."""
     radii = to_array(diameters, ANGLE, "diameters", ndim=1) / 2 / scale
     check_positive(float(min(radii, default=1.0)), "diameters")
-    half = int(np.ceil(max([*radii, 0 if psf is None else _REACH / scale])))
+    reach = max(radii, default=0)
+    if psf is not None:
+        reach = max(reach, _REACH / scale)
+    half = int(np.ceil(reach))
     shape = (2 * half + 1,) * 2
     apertures = {}
     light = np.full(shape, np.nan)

@@ -10,7 +10,7 @@ from photutils.background import LocalBackground, SExtractorBackground
 from photutils.segmentation import SourceCatalog
 
 from miricigale.photometry.detection.detection import detect_sources
-from miricigale.photometry.images.arrays import image_arrays, pixel_scale
+from miricigale.photometry.images.arrays import image_arrays, pixel_scale, sky_to_pixels
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.utils.options import check_that
 from miricigale.utils.sep_tools import background as sep_background
@@ -90,7 +90,7 @@ def aperture_photometry(image, sky, diameter=None):
     else:
         check_that(diameter is not None, "diameter", "given with positions", "None")
         size = positive(diameter, ANGLE, "diameter")
-        xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
+        xy = sky_to_pixels(sky, arrays.wcs)
         flux, flux_err, coverage = circle_sums(arrays, xy, size / 2 / pixel_scale(arrays.wcs))
         shape = f"a circle of {size:.4g} arcsec diameter"
     columns = {
@@ -188,6 +188,7 @@ def source_extractor_photometry(
         flux = arrays.flux - level
         sigma = np.full(flux.shape, np.median(rms[rms > 0]))
         arrays = dataclasses.replace(arrays, sigma=sigma, usable=sigma > 0)
+    # detection on the image less its background
     data = np.where(arrays.usable, flux, np.nan)
     subtracted = CCDData(data, unit=FNU, uncertainty=StdDevUncertainty(arrays.sigma), wcs=image.wcs)
     segmentation, catalog = detect_sources(subtracted, preset=preset, stated_on=stated_on)
@@ -217,6 +218,7 @@ def _measure(arrays, flux, segmentation, catalog, ratio):
         arrays, flux=flux, sigma=np.where(arrays.usable, arrays.sigma, 0.0)
     )
     factor, min_radius = _KRON
+    # Kron ellipses less the local background
     sources = SourceCatalog(
         flux,
         segmentation,
@@ -229,6 +231,7 @@ def _measure(arrays, flux, segmentation, catalog, ratio):
     auto_err = np.atleast_1d(sources.kron_flux_err)
     radius = _DIAMETER / 2 / pixel_scale(arrays.wcs)
     xy = np.stack([catalog["x_centroid"], catalog["y_centroid"]], axis=-1)
+    # circles, less the level of the ring
     aper, aper_err, coverage = circle_sums(arrays, xy, radius)
     # the mode, for faint sources within the rings raise the median
     mode = LocalBackground(radius, radius + _RING * ratio, bkg_estimator=SExtractorBackground())

@@ -131,6 +131,7 @@ def _measure_prior(images, photometers, highres, segmentation, catalog):
         for exposure in exposures:
             xy = sky_pixels(catalog["sky"], exposure.wcs, exposure.shape, reach)
             is_near |= np.isfinite(xy[:, 0])
+    # templates of sources on some image; the others are points that no fit sees
     templates = first._templates(highres, segmentation, catalog[is_near])
     if not is_near.all():
         parts = [templates, SourceTemplates.from_catalog(catalog[~is_near])]
@@ -141,6 +142,7 @@ def _measure_prior(images, photometers, highres, segmentation, catalog):
         # kernels are not alike
         templates = dataclasses.replace(templates, psf=None)
     results = measure_bands(images, photometers, templates)
+    # sources that the bands have found, each once
     sky = SkyCoord([], [], unit="deg")
     for result in results.values():
         if result.new_sources is None or not len(result.new_sources):
@@ -163,6 +165,7 @@ def _measure_prior(images, photometers, highres, segmentation, catalog):
     points = dataclasses.replace(points, **columns)
     joined = SourceTemplates.concatenate([templates, points])
     joined = dataclasses.replace(joined, meta=templates.meta)
+    # the same sources in all bands, without a search of their own
     last_pass = {}
     for name, photometer in photometers.items():
         last_pass[name] = photometer.replace(second_pass=False)
@@ -217,6 +220,7 @@ def join_bands(results):
         tables[name] = result if isinstance(result, Table) else result.to_table()
         if tables[name].meta:
             bands[name] = dict(tables[name].meta)
+    # the first table that has an id, and its row there
     rows = {}
     for table in tables.values():
         for k, key in enumerate(np.asarray(table["id"]).tolist()):
@@ -233,6 +237,7 @@ def join_bands(results):
     else:
         joined["sky"] = SkyCoord([table["sky"][k].icrs for table, k in rows.values()])
     for name, table in tables.items():
+        # rows of this band in the order of the ids; -1 if it lacks one
         row_of_id = {key: k for k, key in enumerate(np.asarray(table["id"]).tolist())}
         index = np.array([row_of_id.get(key, -1) for key in ids], int)
         for column in table.colnames:

@@ -6,7 +6,7 @@ from astropy.stats import mad_std
 from astropy.table import QTable
 
 from miricigale.photometry.fit.aperture import circle_sums
-from miricigale.photometry.images.arrays import image_arrays
+from miricigale.photometry.images.arrays import image_arrays, sky_to_pixels
 from miricigale.photometry.images.arrays import pixel_scale as image_scale
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.utils.exceptions import argument_error
@@ -67,14 +67,16 @@ def encircled_flux(image, sky, flux, radii):
     check_that(np.all(true > 0), "flux", "positive fluxes", true.min())
     radius = np.atleast_1d(to_array(radii, ANGLE, "radii"))
     scale = image_scale(image.wcs)
-    xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
+    xy = sky_to_pixels(sky, arrays.wcs)
     values = np.empty((len(radius), len(true)))
     for k, r in enumerate(radius):
+        # light in circles that are on usable pixels alone
         inside, _, coverage = circle_sums(arrays, xy, r / scale)
         values[k] = np.where(coverage > 0.999, inside / true, np.nan)
     if not np.isfinite(values).any(axis=1).all():
         raise argument_error("sky", "positions whose apertures are on the image", "none")
     median = np.nanmedian(values, axis=1)
+    # robust against neighbors
     scatter = mad_std(values, axis=1, ignore_nan=True)
     return QTable(
         {"radius": radius * ANGLE, "median": median, "scatter": scatter, "values": values}
@@ -132,6 +134,7 @@ def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
     radius = radius_of_encircled_energy(psf, fraction)
     table = encircled_flux(image, sky, flux, u.Quantity([radius]))
     n = int(np.isfinite(table["values"][0]).sum())
+    # what the PSF's pixels would add up to
     expected = encircled_energy(psf, radius, pixel_scale=image_scale(image.wcs) * ANGLE)
     factor = expected / float(table["median"][0])
     # the error of a median is 1.2533 times that of a mean

@@ -63,6 +63,7 @@ def diagnose(fit, xy):
         lag = correlation.shape[0] // 2
         variance = max(1.0, correlation[lag, lag])
     peaks = residual_peaks(fit, residual, model, xy + fit.displacement(xy))
+    # in units of the noise that was measured
     poor = chi2 > POOR_CHI2 * variance
     if fit.free is not None:
         # what the high-resolution image shows is not what is fitted here
@@ -159,6 +160,7 @@ def _ends(usable):
     for image in (usable, usable.T):
         has_data = image.any(axis=1)
         n = image.shape[1]
+        # the first True of each row, and of the mirrored row
         first = image.argmax(axis=1)
         last = n - 1 - image[:, ::-1].argmax(axis=1)
         ends.append((np.where(has_data, first, n), np.where(has_data, last, -1)))
@@ -201,6 +203,7 @@ def canceling(flux, error, core_flux):
         Those above twice the image's light by three errors, or negative by five.
     """
     with np.errstate(invalid="ignore"):
+        # more than twice the light that is there
         is_above = flux - 2.0 * np.maximum(core_flux, 0.0) > _ABOVE_LIGHT * error
         return is_above | (flux < -_NEGATIVE * error)
 

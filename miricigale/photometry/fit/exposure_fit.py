@@ -81,13 +81,13 @@ class ExposurePart:
         return stated_correlation(factor)
 
     def gather(self, n):
-        """Matrix, (n, k), that sums the bank's rows by source."""
+        """Make the matrix, (n, k), that sums the bank's rows by source."""
         k = len(self.source)
         place = self.row_source, np.arange(k)
         return scipy.sparse.coo_array((np.ones(k), place), shape=(n, k)).tocsr()
 
     def sky_columns(self, order):
-        """Images of the terms of the sky: a polynomial of an order, in uJy per pixel for 1 MJy/sr."""
+        """Draw the terms of the sky, a polynomial of an order, in uJy per pixel for 1 MJy/sr."""
         area = self.arrays.areas()
         if order == 0:
             return [area]
@@ -97,18 +97,18 @@ class ExposurePart:
 
     def moved(self, shift, like=None):
         """
-        The same with its templates moved by some pixels, (2,) or (k, 2).
+        Return a copy with its templates moved by some pixels, (2,) or (k, 2).
 
         Templates that stay where they are in the bank of ``like``, another `ExposurePart`, are taken from there.
         """
         bank = self.bank.shifted(shift)
-        same = self if like is None else like
-        bank.reuse(same.bank)
+        source = self if like is None else like
+        bank.reuse(source.bank)
         return dataclasses.replace(self, bank=bank)
 
 
 def gaussian_width(kernel):
-    """Rms width in arcsec of a Gaussian as peaked as the target of a kernel."""
+    """Return the rms width in arcsec of a Gaussian as peaked as the target of a kernel."""
     target = kernel.target
     width = np.sqrt(target.sum() / (2 * np.pi * target.max()))
     return width * kernel.pixel_scale.to_value(ANGLE)
@@ -193,6 +193,7 @@ class ExposureFit:
         self.places = []
         n_common = 0
         for k, part in enumerate(self.parts):
+            # common parameters of this exposure: its sky, and its shift if that is fitted
             columns = part.sky_columns(self.order)
             places = {"sky": slice(n_common, n_common + len(columns))}
             if gradients is not None and gradients[k]:
@@ -202,9 +203,11 @@ class ExposureFit:
             self.places.append(places)
             white = list(map(part.arrays.whitened, columns))
             data = part.arrays.whitened(part.arrays.flux)
+            # normal equations of this exposure, then summed over exposures by source
             square, projection, power, light = normal_matrix(
                 part.bank, part.inverse_sigma, [data, *white]
             )
+            # from rows of the bank to sources of the joint fit
             gather = part.gather(n)
             source = part.row_source
             light = light / part.bank.full_light()[:, None]
@@ -219,13 +222,16 @@ class ExposureFit:
             is_seen = light[:, 1] >= MIN_COVERAGE
             self.n_exposures[source[is_seen]] += 1
             self.noisy[source[is_seen & (excess <= _MAX_EXCESS)]] = False
+            # of each source the exposure that shows most of it
             best = light[:, 1] > self.light[source, 1]
             self.light[source[best]] = light[best]
             self.power[source[best]] = power[best]
         self.noisy &= self.n_exposures > 0
+        # sources with enough light somewhere
         rows = (self.n_exposures > 0) & (matrix.diagonal() > 0)
         self.degenerate = duplicates(matrix, rows, np.arange(n))
         self.rows = np.flatnonzero(rows & ~self.degenerate)
+        # errors in variables, as for one image
         matrix = (matrix - scipy.sparse.diags_array(correction)).tocsr()
         matrix = matrix[self.rows][:, self.rows]
         self.fit = None
@@ -245,7 +251,7 @@ class ExposureFit:
         return solution.common
 
     def cutouts(self):
-        """The light of each source (`~miricigale.photometry.detection.cutouts.Cutout`), None for points."""
+        """Return the light of each source (`~miricigale.photometry.detection.cutouts.Cutout`), None for points."""
         cutouts = [None] * len(self.xy)
         for part in self.parts:
             for source, light in zip(part.source, part.bank.sources.cutout, strict=True):
@@ -253,7 +259,7 @@ class ExposureFit:
         return cutouts
 
     def model(self, k):
-        """The sources on one exposure in uJy per pixel, without its sky."""
+        """Draw the sources on one exposure in uJy per pixel, without its sky."""
         part = self.parts[k]
         layers = [(part.bank, self.flux[part.row_source])]
         if self.free is not None:
@@ -270,7 +276,7 @@ class ExposureFit:
         return image
 
     def sky(self, k):
-        """The sky of one exposure in uJy per pixel."""
+        """Draw the sky of one exposure in uJy per pixel."""
         part = self.parts[k]
         values = self.common[self.places[k]["sky"]]
         image = part.arrays.new()
@@ -279,7 +285,7 @@ class ExposureFit:
         return image
 
     def residual(self, k, model):
-        """One exposure less its model and sky, zero where not usable."""
+        """Subtract model and sky from one exposure; zero where not usable."""
         arrays = self.parts[k].arrays
         return (arrays.flux - model - self.sky(k)) * arrays.usable
 
@@ -293,6 +299,7 @@ class ExposureFit:
         """
         if self.fit is None or self.settings.errors.size_scatter is None:
             return
+        # sources that the catalog lacks are points
         shapes = not_fitted(len(self.xy))
         shapes[: len(fitted)] = fitted
         # positions move no flux to first order
@@ -305,6 +312,7 @@ class ExposureFit:
         owner, changes, scale, noise = find_changes(self, shapes, parts, executor)
         if not (changes or noise.any()):
             return
+        # owners are counted among the fitted rows
         sources = self.rows[owner]
         fixed = np.array([change.fixed for change in changes], bool)
         light = np.array([change.light for change in changes])
@@ -322,6 +330,7 @@ class ExposureFit:
             data = part.arrays.whitened(part.arrays.flux)
             columns = part.sky_columns(self.order)
             white = list(map(part.arrays.whitened, columns))
+            # normal equations of the changes on this exposure
             square, projection, _, _ = normal_matrix(bank, part.inverse_sigma, [data, *white])
             place = _selection(numbers, n_changes)
             squares = squares + place @ square @ place.T
@@ -330,6 +339,7 @@ class ExposureFit:
             border = np.zeros((n_changes, len(self.fit.corner_rhs)))
             border[:, self.places[k]["sky"]] = place @ projection[:, 1:]
             borders.append(border)
+        # templates and changes in the columns of the basis, with priors of the changes
         border = basis.T @ np.concatenate([self.fit.border, np.sum(borders, axis=0)])
         owner = owner[~fixed]
         prior = np.concatenate([np.zeros(n), scale[owner] ** -2.0])
@@ -346,7 +356,7 @@ class ExposureFit:
         self.flux[self.rows] = self.free.flux
 
     def _change_bank(self, part, sources, changes):
-        """The changes of some sources as an exposure shows them, and the number of each row of that bank."""
+        """Make the bank of changes of some sources on an exposure, and return the number of each of its rows."""
         place = np.full(len(self.xy), -1)
         place[part.source] = np.arange(len(part.source))
         local = place[sources]
@@ -355,14 +365,14 @@ class ExposureFit:
         return bank, shown[bank.order]
 
     def _cross(self, part, bank, place, correlation):
-        """Products of an exposure's templates and changes, rows and changes of the joint fit."""
+        """Sum products of an exposure's templates and changes, by rows and changes of the joint fit."""
         products = cross_matrix(part.bank, bank, part.inverse_sigma, correlation).tocsr()
         gather = part.gather(len(self.xy))[self.rows]
         return gather @ products @ place.T
 
     def noise_filling(self):
         """
-        What noise that exposures state to be correlated does to the right-hand side; None if all is white.
+        Return the covariance of the right-hand side by noise stated to be correlated; None if all is white.
 
         Matrix, border and corner of the middle of the sandwich, as
         `~miricigale.photometry.templates.normal_equations.LinearFit.covariances` takes them.
@@ -389,7 +399,9 @@ class ExposureFit:
             spread = [_spread(column, correlation) for column in white]
             sky = self.places[k]["sky"]
             gather = part.gather(len(self.xy))[self.rows]
+            # covariance of the right-hand side by this exposure's noise
             square, side = sandwich_matrix(part.bank, part.inverse_sigma, correlation, spread)
+            # the exposures' noise is independent: their contributions add up
             middle = middle + gather @ square @ gather.T
             border[:, sky] = gather @ side
             corner[sky, sky] = inner_products(white, spread)
@@ -397,6 +409,7 @@ class ExposureFit:
                 continue
             bank, numbers = self.free.bank[k]
             place = _selection(numbers, n_changes)
+            # and that of the changes
             square, side = sandwich_matrix(bank, part.inverse_sigma, correlation, spread)
             squares = squares + place @ square @ place.T
             change_border[:, sky] = place @ side
@@ -409,13 +422,13 @@ class ExposureFit:
 
 
 def _selection(numbers, n):
-    """Matrix, (n, k), that puts rows of a bank to their numbers."""
+    """Make the matrix, (n, k), that puts rows of a bank to their numbers."""
     k = len(numbers)
     return scipy.sparse.coo_array((np.ones(k), (numbers, np.arange(k))), shape=(n, k)).tocsr()
 
 
 def _spread(image, correlation):
-    """An image convolved with the correlation of the noise."""
+    """Convolve an image with the correlation of the noise."""
     from scipy.signal import oaconvolve
 
     return oaconvolve(image, correlation.astype(image.dtype), mode="same")

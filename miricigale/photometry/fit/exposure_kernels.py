@@ -73,7 +73,7 @@ class ExposureKernels:
         for kernel in kernels:
             if not isinstance(kernel, (MatchingKernel, KernelField)):
                 raise argument_error("kernel", wanted, type(kernel).__name__)
-            mean = _mean_kernel(kernel)
+            mean = mean_kernel(kernel)
             if mean.source is None or mean.target is None:
                 raise argument_error("kernel", "kernels with their PSFs", "one without")
 
@@ -112,6 +112,7 @@ class ExposureKernels:
         roll_fields = []
         kernels = []
         for k, image in enumerate(images):
+            # exposures of one filter, sub-array and roll have the same kernels, but for their places
             facts = ImageFacts.of(image)
             wanted = "exposures of one of the imager's filters"
             is_imager = facts.filter in MIRI_FILTERS
@@ -140,10 +141,10 @@ class ExposureKernels:
     @functools.cached_property
     def mean(self):
         """The mean `~miricigale.psf.MatchingKernel`."""
-        return MatchingKernel.blend(list(map(_mean_kernel, self.kernels)))
+        return MatchingKernel.blend(list(map(mean_kernel, self.kernels)))
 
 
-def _mean_kernel(kernel):
+def mean_kernel(kernel):
     """Return the kernel itself, or the mean of a field of kernels."""
     if isinstance(kernel, KernelField):
         return kernel.mean
@@ -175,7 +176,7 @@ def _subarray(image, stated_name):
 
 
 def _sharp_psf(highres, psf, scale, turn):
-    """The PSF of the high-resolution image on its axes."""
+    """Return the PSF of the high-resolution image on its axes."""
     if psf is not None:
         psf = instrument_psf(psf, "highres_psf")
         return rotate_psf(psf, grid_angle=turn)

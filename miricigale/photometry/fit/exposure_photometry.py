@@ -84,6 +84,7 @@ def measure_exposures(
     if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
         catalog = highres
         highres = None
+    # check everything before templates are made
     images = _opened(images)
     settings = _settings_of_each(photometer, len(images))
     _check_offered(photometer)
@@ -106,6 +107,7 @@ def measure_exposures(
         exposure = fit_arrays(image, f"image[{k}]")
         arrays.append(exposure)
         placed.append(Placement.of(settings[k], exposure, sources.sky))
+    # templates of those sources alone that an exposure shows
     near_rows = np.unique(np.concatenate([place.near_rows for place in placed]))
     if len(sources.id) and not len(near_rows):
         msg = f"none of the {len(sources.id)} sources is on or near the exposures: nothing is measured"
@@ -115,10 +117,11 @@ def measure_exposures(
     else:
         templates = templates[near_rows]
     photometer._check_grid(templates)
+    # a common plane, for the search of new sources and for pictures
     plane = _plane(arrays)
     margin = max(place.margin for place in placed)
     xy = sky_pixels(sources.sky, plane.wcs, plane.shape, margin)
-    rows = _catalog_rows(sources, templates, near_rows, xy)
+    rows = CatalogRows.of(sources, xy, near_rows, templates)
     meta = {"template": templates.meta.get("template", photometer.template)}
     name = images[0].meta.get("filter", images[0].meta.get("FILTER"))
     if name is not None:
@@ -131,7 +134,7 @@ def measure_exposures(
 
 
 def _opened(images):
-    """The exposures as images, checked to be of one filter."""
+    """Open the exposures as images, and check that they are of one filter."""
     if not len(images):
         raise argument_error("image", "at least one exposure", "none")
     opened = [as_mosaic(image, f"image[{k}]") for k, image in enumerate(images)]
@@ -141,7 +144,7 @@ def _opened(images):
 
 
 def _settings_of_each(photometer, n):
-    """The photometer with the kernel of each of n exposures."""
+    """Return the photometer with the kernel of each of n exposures."""
     kernel = photometer.kernel
     if not isinstance(kernel, ExposureKernels):
         if photometer.bare:
@@ -171,7 +174,7 @@ def _check_offered(photometer):
 
 
 def _plane(arrays):
-    """The grid that exposures have in common: north up, with pixels of their mean size."""
+    """Make the grid that exposures have in common: north up, with pixels of their mean size."""
     scale = np.mean([pixel_scale(exposure.wcs) for exposure in arrays])
     grids = []
     sized = []
@@ -185,28 +188,6 @@ def _plane(arrays):
         sized.append(wcs)
     wcs = mosaic_wcs(sized, scale * ANGLE)
     return Plane.over(wcs, grids)
-
-
-def _catalog_rows(sources, templates, near_rows, xy):
-    """The catalog as the fit and its result take it."""
-    n = len(sources.id)
-    flags = np.zeros(n, int)
-    snr = np.full(n, np.nan)
-    kinds = np.full(n, "none", "U6")
-    flags[near_rows] = templates.flags
-    snr[near_rows] = templates.snr
-    kinds[near_rows] = templates.kind
-    return CatalogRows(
-        id=np.asarray(sources.id),
-        sky=sources.sky,
-        xy=xy,
-        near_rows=near_rows,
-        flags=flags,
-        template=kinds,
-        template_snr=snr,
-        fitted=templates.fitted,
-        reference=sources.flux,
-    )
 
 
 @dataclasses.dataclass(eq=False)
@@ -265,7 +246,7 @@ class _Joint:
 
     def fit_all(self):
         """
-        The last fit, positions of new sources in the plane, the evidence for them, and offsets of exposures.
+        Fit all: the last fit, new sources in the plane, the evidence for them, and offsets of exposures.
 
         The offsets are east and north in arcsec, (n_exposures, 2), with their errors, (n_exposures,).
         """
@@ -295,11 +276,12 @@ class _Joint:
         return ExposureFit(parts, self._settings, xy, self._scale, self._order, gradients)
 
     def _with_shifts(self, fit):
-        """The fit with templates moved by a shift of each exposure."""
+        """Fit with templates moved by a shift of each exposure."""
         limit = self._settings.max_shift.value
         fixed = np.zeros(len(self._parts), bool)
         first_parts = self._parts
         for _ in range(_MAX_SHIFT_STEPS):
+            # shifts that the fit lacks; those that failed stay at zero
             steps, self._errors = self._steps(fit)
             self._measured = self._shifts + steps
             fixed |= np.isnan(steps[:, 0])
@@ -316,6 +298,7 @@ class _Joint:
             fixed |= far
             shifts[fixed] = 0.0
             step = np.abs(shifts - self._shifts).max()
+            # at most a pixel at a time: the gradient holds no farther
             self._shifts = self._shifts + np.clip(shifts - self._shifts, -1.0, 1.0)
             moved = []
             for part, shift, like in zip(first_parts, self._shifts, fit.parts, strict=True):
@@ -327,7 +310,7 @@ class _Joint:
         return fit
 
     def _steps(self, fit):
-        """Shifts of exposures beyond those of their templates, to first order, and errors: pixels, (k, 2)."""
+        """Measure shifts (pixels, (k, 2)) of exposures against their templates, to first order, and errors."""
         gradients = []
         for k, part in enumerate(fit.parts):
             dy, dx = np.gradient(fit.model(k))
@@ -340,6 +323,7 @@ class _Joint:
                 # too little light to find a shift of less than a pixel
                 derivatives = []
             gradients.append(derivatives)
+        # fluxes, skies and shifts together
         trial = self._fit(fit.parts, fit.xy[self._n :], gradients)
         variance = np.diag(trial.fit.common_covariance)
         steps = np.full((len(fit.parts), 2), np.nan)
@@ -351,7 +335,7 @@ class _Joint:
         return steps, errors
 
     def _on_sky(self, shifts):
-        """Shifts of exposures (pixels) as arcsec to the east and north."""
+        """Convert shifts of exposures (pixels) to arcsec to the east and north."""
         offsets = []
         for part, shift in zip(self._parts, shifts, strict=True):
             ny, nx = part.arrays.flux.shape
@@ -362,7 +346,7 @@ class _Joint:
 
     def _new_positions(self, fit):
         """
-        Where the residuals show sources that the catalog lacks, in the plane, and the evidence for them.
+        Find sources that the catalog lacks on the residuals, in the plane, and the evidence for them.
 
         As for one image, the negative of the residual and Gaussian noise say how many are false.
         """
@@ -370,11 +354,13 @@ class _Joint:
         flux = np.full(len(self._catalog.id), np.nan)
         flux[self._catalog.near_rows] = fit.flux
         xy = self._catalog.xy
+        # peaks of the residual, and of its negative, which are false
         peaks, negative, usable = plane_peaks(fit, self._plane, xy)
         form = {"usable": usable} if decide else {}
         new = new_sources(peaks, xy, flux, **form)
         false = new_sources(negative, xy, flux, **form)
         width = gaussian_width(self._settings.mean_kernel) / self._scale
+        # independent trials: usable pixels over the area of the squared PSF
         n_beams = np.count_nonzero(usable) / (4 * np.pi * width**2)
         n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
         rate = float(n_false / max(np.count_nonzero(new), 1))
@@ -389,7 +375,7 @@ class _Joint:
         return positions, evidence
 
     def _with_points(self, new_xy):
-        """Positions of new sources, refined, and the fit with them."""
+        """Refine positions of new sources, and fit with them."""
         fit = self._fit(self._added(new_xy, self._parts), new_xy)
         for _ in range(_REFINED):
             step, error, _ = self._offsets(fit)
@@ -402,7 +388,7 @@ class _Joint:
         return new_xy, fit
 
     def _added(self, new_xy, like):
-        """The exposures with points at positions of the plane; templates that are those of ``like`` are kept."""
+        """Add points at positions of the plane to the exposures; templates that are those of ``like`` are kept."""
         sky = pixels_to_sky(new_xy, self._plane.wcs).icrs
         added = []
         for k, (part, place, grid) in enumerate(
@@ -421,7 +407,7 @@ class _Joint:
 
     def _offsets(self, fit):
         """
-        Offsets of sources from their templates, of all exposures together.
+        Measure offsets of sources from their templates, of all exposures together.
 
         In pixels of the plane: the steps, (n, 2), their errors and the light of others over a source's own, (n,);
         errors are infinite where no exposure shows enough.
@@ -440,6 +426,7 @@ class _Joint:
             step, error, neighbor_light = source_offsets(view, residual, model, rows)
             good = np.isfinite(error) & np.isfinite(step).all(axis=1) & (error > 0)
             source = part.row_source[good]
+            # steps in the pixels of the plane, weighted by their errors
             plane_step = np.einsum("kij,kj->ki", self._turns(part, part.bank.xy)[good], step[good])
             step_weight = error[good] ** -2.0
             total[source] += step_weight[:, None] * plane_step
@@ -449,7 +436,7 @@ class _Joint:
             return total / weight[:, None], weight**-0.5, neighbors / weight
 
     def _turns(self, part, xy):
-        """Linear maps from pixels of an exposure to those of the plane at some pixels, (k, 2, 2)."""
+        """Return linear maps from pixels of an exposure to those of the plane at some pixels, (k, 2, 2)."""
         if not len(xy):
             # which astropy cannot convert
             return np.empty((0, 2, 2))
@@ -462,7 +449,7 @@ class _Joint:
 
     def _settled(self, fit):
         """
-        The fit with bright isolated sources moved to where the exposures show them, as for one image.
+        Fit with bright isolated sources moved to where the exposures show them, as for one image.
 
         Nothing is done if offsets do not scatter beyond their errors, or if all have a large one in common.
         """
@@ -473,10 +460,12 @@ class _Joint:
         first_parts = self._parts
         for _ in range(_OFFSET_PASSES):
             step, error, neighbors = self._offsets(fit)
+            # bright isolated sources with a small error
             snr = np.zeros(len(fit.xy))
             snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
             good = (snr > _BRIGHT_SNR) & (neighbors < _ISOLATED) & ~fit.noisy & np.isfinite(error)
             good &= (fit.light > 0.9).all(axis=1) & (error < width / _BRIGHT_SNR * 2)
+            # their offsets, those already applied included
             measured = offsets + np.where(good[:, None], step, 0.0)
             good &= lengths(measured) < _LARGEST_OFFSET * width
             if np.count_nonzero(good) < _FEWEST_SOURCES:
@@ -491,6 +480,7 @@ class _Joint:
             if scatter <= _OFFSET_FLOOR**2:
                 break
             new = np.zeros_like(offsets)
+            # offsets shrunk by the part of their scatter that is noise
             new[good] = measured[good] * (scatter / (scatter + error[good] ** 2))[:, None]
             change = np.abs(new - offsets).max()
             offsets = new

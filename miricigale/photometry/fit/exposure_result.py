@@ -103,7 +103,7 @@ class _PlaneFit:
 
 def plane_peaks(fit, plane, xy):
     """
-    Peaks of the mean residual of all exposures in their common plane, and of its negative, and the usable pixels.
+    Find peaks of the mean residual of all exposures in their plane, of its negative, and the usable pixels.
 
     ``xy``, (n, 2), are all known sources.
     """
@@ -114,7 +114,7 @@ def plane_peaks(fit, plane, xy):
 
 
 def _images(fit):
-    """Model without sky, residual and inverse errors of each exposure, in MJy/sr."""
+    """Return model without sky, residual and inverse errors of each exposure, in MJy/sr."""
     models = []
     residuals = []
     inverse = []
@@ -162,6 +162,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     """
     n = len(catalog.id)
     n_all = n + len(new_xy)
+    # number of each of the fit's sources among all; new ones come after the catalog
     place = np.concatenate([catalog.near_rows, np.arange(n, n_all)])
     models, residuals, inverse = _images(fit)
     chi2, residual_fraction, core_flux, poor, checks = _compared(fit, models, residuals)
@@ -175,11 +176,13 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
         k = np.arange(len(measured))
         gather = scipy.sparse.coo_array((np.ones(len(k)), (measured, k)), shape=(n_all, len(k)))
         spread = [(gather @ term @ gather.T).tocsr() for term in terms]
+        # noise, templates and PSF are independent
         joint = (spread[0] + spread[1] + spread[2]).tocsr()
         joint.sort_indices()
         # the total first, as its name is
         for name, term in zip(errors, [joint, *spread], strict=True):
             errors[name][measured] = np.sqrt(np.maximum(term.diagonal()[measured], 0.0))
+    # peaks of the last residual, for flags of their neighbors
     xy = np.concatenate([catalog.xy, new_xy])
     peaks, _ = _peaks(fit, plane, xy, models, residuals, inverse)
     flags, coverage = _flags(fit, place, n_all, flux, blending, poor)
@@ -189,6 +192,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
     has_neighbor = unexplained_neighbors(peaks, xy, flux)
     flags[has_neighbor & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    # columns of all sources, from which the catalog's and the new ones are taken
     columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage}
     columns["chi2"] = _spread_over(chi2, place, n_all)
     columns["residual_fraction"] = _spread_over(residual_fraction, place, n_all)
@@ -204,6 +208,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     sky = exposures.table["sky"]
     weight = exposures.table["sky_err"] ** -2
     reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
+    # mean sky of the exposures, by their errors
     background = {}
     if len(fit.rows):
         background["background"] = np.sum(sky * weight) / np.sum(weight)
@@ -246,7 +251,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
 
 
 def _spread_over(values, place, n):
-    """Values of the fit's sources at their places among n; NaN elsewhere."""
+    """Spread values of the fit's sources over their places among n; NaN elsewhere."""
     spread = np.full(n, np.nan)
     spread[place] = values
     return spread
@@ -254,9 +259,15 @@ def _spread_over(values, place, n):
 
 def _compared(fit, models, residuals):
     """
-    Chi-square of each source, light left, flux with all light of its core, whether chi-square is poor.
+    Compare a fit with its exposures.
 
-    Then noise and correlation of each exposure.
+    Returns
+    -------
+    chi2, light_left, core_flux, poor : `~numpy.ndarray`, shape (n,)
+        Of each source: chi-square, residual light of its core over its flux, the flux (uJy) with which it has all
+        light of its core, and whether chi-square is too large for noise.
+    checks : list of tuple of float
+        Noise and correlation of each exposure.
     """
     n = len(fit.xy)
     square, weight, light_left, core_light, core = np.zeros((5, n))
@@ -275,6 +286,7 @@ def _compared(fit, models, residuals):
                 residual_statistics(*block.stamps, image, part.inverse_sigma, sums[rows])
             for row, (first, last) in enumerate(itertools.pairwise(block.start)):
                 row_light[block.first + row] = block.values[first:last].sum()
+        # sums over exposures by source, chi^2 weighted with the template's light
         good = np.isfinite(statistics[:, 0]) & (row_light > 0)
         np.add.at(square, source[good], (row_light * statistics[:, 0])[good])
         np.add.at(weight, source[good], row_light[good])
@@ -302,13 +314,14 @@ def _compared(fit, models, residuals):
 
 
 def _noise_check(white, model, part):
-    """Robust rms of a whitened residual where no source is, and the correlation of neighbors; NaN without sky."""
+    """Measure the robust rms of a whitened residual without sources, and its correlation; NaN without sky."""
     is_free = part.arrays.usable & (np.abs(model) < _FREE)
     if np.count_nonzero(is_free) < _FEWEST_PIXELS:
         return np.nan, np.nan
     rms = float(mad_std(white[is_free]))
     if not rms > 0:
         return rms, np.nan
+    # products of neighboring pixels along x and y, over the variance
     calm = is_free & (np.abs(white) < 5 * rms)
     products = []
     for first, second in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
@@ -318,7 +331,7 @@ def _noise_check(white, model, part):
 
 
 def _covariances(fit):
-    """Covariances by noise, templates and PSF, that of the common parameters, and blending of all sources."""
+    """Calculate covariances by noise, templates and PSF, that of the common parameters, and blending."""
     blending = np.full(len(fit.xy), np.nan)
     if not len(fit.rows):
         return [], None, blending
@@ -345,6 +358,7 @@ def _covariances(fit):
     covariances, all_blending = solution.covariances(
         xy, fillings, core=BLOCK_CORE / fit.scale, halo=BLOCK_HALO / fit.scale, pattern=pattern
     )
+    # by noise, of fluxes alone: those of changes do not count
     noise, common = covariances[0]
     noise = noise[:n][:, :n]
     blending[fit.rows] = all_blending[:n]
@@ -357,13 +371,14 @@ def _covariances(fit):
     is_image = [light is not None and light.kind == "cutout" for light in fit.cutouts()]
     error = psf_errors(fit, np.array(is_image, bool))[fit.rows]
     coo = noise.tocoo()
+    # errors by the PSF are fully correlated
     data = error[coo.row] * error[coo.col]
     psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
     return [noise, template, psf], common, blending
 
 
 def _flags(fit, place, n_all, flux, blending, poor):
-    """Flags of all sources, and the fraction of each template on the exposure that shows most of it."""
+    """Return flags of all sources, and the fraction of each template on the exposure that shows most of it."""
     flags = np.zeros(n_all, int)
     inside = np.zeros(n_all)
     coverage = np.zeros(n_all)
@@ -384,10 +399,11 @@ def _flags(fit, place, n_all, flux, blending, poor):
 
 
 def _exposures(fit, images, models, residuals, inverse, common, checks, offsets):
-    """The `ExposureResults` of a fit."""
+    """Make the `ExposureResults` of a fit."""
     table = QTable({"exposure": np.arange(len(images))})
     table["source"] = [str(image.meta.get("source", k)) for k, image in enumerate(images)]
     table["n_sources"] = list(map(_n_seen, fit.parts))
+    # the constant term of each exposure's sky
     first = [places["sky"].start for places in fit.places]
     errors = np.full(len(fit.common), np.nan)
     if common is not None:
@@ -408,6 +424,7 @@ def _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
     model_images = []
     residual_images = []
     for k, part in enumerate(fit.parts):
+        # images of this exposure in MJy/sr
         usable = part.arrays.usable
         sky = fit.sky(k) / part.arrays.areas()
         with np.errstate(divide="ignore"):
@@ -444,14 +461,14 @@ def _warn_of_offsets(fit, offsets):
 
 
 def _n_seen(part):
-    """Number of sources that are on an exposure."""
+    """Count the sources that are on an exposure."""
     ny, nx = part.arrays.flux.shape
     x, y = part.bank.sources.xy.T
     return int(np.count_nonzero((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)))
 
 
 def _plane_images(plane, models, residuals, inverse, meta):
-    """Mean model and residual in the plane, for pictures."""
+    """Average model and residual in the plane, for pictures."""
     weights = [image.astype(float) ** 2 for image in inverse]
     model, weight = plane.mean(models, weights)
     residual, _ = plane.mean(residuals, weights)

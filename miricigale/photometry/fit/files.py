@@ -37,7 +37,7 @@ def _existing(thing, names):
 
 
 def _columns(table):
-    """Columns of a table that was read, without masks: what is not finite stays so."""
+    """Return columns of a table that was read, without masks: what is not finite stays so."""
     return {name: native(np.asarray(table[name])) for name in table.colnames}
 
 
@@ -103,6 +103,7 @@ def _read_templates(path):
         pixels = np.empty(0)
         if "pixels" in parts:
             pixels = parts.array("pixels")
+        # templates from their layers
         light = [None] * len(columns["id"])
         wholes = list(light)
         ends = np.cumsum(np.prod(rows["shape"], axis=1, dtype=int))
@@ -151,6 +152,7 @@ _MATRICES = ("covariance", "joint_covariance")
 
 
 def _write_result(result, path, *, overwrite=False):
+    # images
     residual = result.residual_image
     arrays = {
         "model": result.model_image.data,
@@ -174,6 +176,7 @@ def _write_result(result, path, *, overwrite=False):
     }
     table = {"id": ascii_ids(result.id, "id"), **_sky_columns(result.sky)}
     tables = {"sources": QTable({**table, **_existing(result, _ROWS)})}
+    # smooth fields, and tables
     fields = {"background_field": result.background_field}
     if result.offset_map is not None:
         fields["offset_map"] = result.offset_map.field
@@ -194,6 +197,7 @@ def _read_result(path):
         text = parts.text
         wcs = text_grid(text["wcs"])
         columns = _table(parts, "sources")
+        # attributes of the result by name
         values = {name: columns[name] for name in ("id", *_ROWS) if name in columns.colnames}
         for name, (value, unit) in text["quantities"].items():
             values[name] = value * u.Unit(unit)
@@ -234,7 +238,7 @@ def _read_result(path):
 
 
 def _table(parts, name):
-    """A table with positions."""
+    """Read a table with positions."""
     read = parts.table(name)
     columns = _columns(read)
     sky = _sky(columns)

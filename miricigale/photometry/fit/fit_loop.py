@@ -107,6 +107,7 @@ def _new_positions(fit, catalog):
     searched = usable if decide else None
     new = new_sources(peaks, xy, flux, usable=searched)
     false = new_sources(negative, xy, flux, usable=searched)
+    # independent trials: usable pixels over the area of the squared PSF
     n_beams = np.count_nonzero(usable) / (4 * np.pi * fit.psf_width**2)
     n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
     rate = float(n_false / max(np.count_nonzero(new), 1))
@@ -158,6 +159,7 @@ class _AddedPoints:
         settings = first.settings
         source_shifts = first.source_shifts
         n = len(near_rows)
+        # second components have the number of their source, new sources their own
         host = np.concatenate([np.arange(n), double, n + len(double) + np.arange(len(new_xy))])
         all_xy = np.concatenate([self.catalog.xy[near_rows], self._centers(double), new_xy])
         xy = all_xy[n:]
@@ -198,6 +200,7 @@ class _AddedPoints:
             x, y = xy[rows].T
             place = pixel_to_pixel(image_wcs, self._grid_wcs, x, y)
             offset = center - np.stack(place, axis=1)
+            # chi^2 of the distance by the covariance of the center
             inverse = np.linalg.pinv(fitted["covariance"][rows, 1:3, 1:3])
             far = np.einsum("ki,kij,kj->k", offset, inverse, offset) > _ELSEWHERE**2
             if far.any():

@@ -224,6 +224,7 @@ class ForcedPhotometer(Interactive):
     n_threads: int | None = None
 
     def __post_init__(self, psf, highres_psf):
+        # one kernel, given or made of PSFs
         got = "neither" if psf is None else "both"
         check_that((self.kernel is None) != (psf is None), "kernel, psf", "one of them given", got)
         if self.kernel is not None:
@@ -258,6 +259,7 @@ class ForcedPhotometer(Interactive):
             # as far as it reaches, and as wide
             mean = dataclasses.replace(mean, source=mean.array, target=mean.array)
             changed |= {"template": "cutout", "wings": False, "mean_kernel": mean}
+        # options in their ranges
         for name, largest in (("background_order", 4), ("offset_order", 3)):
             order = getattr(self, name)
             if order is not None and not (is_number(order, np.integer) and 0 <= order <= largest):
@@ -356,6 +358,7 @@ class ForcedPhotometer(Interactive):
             else:
                 result = photometer.measure(image, highres, segmentation, catalog)
             return stars.noted(result)
+        # sources on or near the image, and their templates
         place = Placement.of(self, arrays, sources.sky)
         if len(sources.id) and not len(place.near_rows):
             msg = (
@@ -368,6 +371,7 @@ class ForcedPhotometer(Interactive):
             templates = templates[place.near_rows]
         self._check_grid(templates)
         rows, templates = self._rows(sources, place, templates)
+        # what the result says of its making
         meta = {"template": templates.meta.get("template", self.template)}
         name = image.meta.get("filter", image.meta.get("FILTER"))
         if name is not None:
@@ -417,6 +421,7 @@ class ForcedPhotometer(Interactive):
         model = np.zeros(arrays.flux.shape)
         with threads(self.n_threads) as executor, single_threaded():
             bank = place.bank(place.near_rows, near_templates, executor)
+            # fluxes in the order of the bank's rows
             values = flux[place.near_rows][bank.order]
             for block in bank.blocks():
                 block_flux = values[block.first : block.last]
@@ -425,33 +430,17 @@ class ForcedPhotometer(Interactive):
 
     def _rows(self, sources, place, templates):
         """Return the catalog as the fit takes it, and the templates of its sources that are near."""
-        n = len(sources.id)
-        near_rows = place.near_rows
-        flags = np.zeros(n, int)
-        snr = np.full(n, np.nan)
-        kinds = np.full(n, "none", "U6")
-        flags[near_rows] = templates.flags
-        snr[near_rows] = templates.snr
-        if self.bare:
-            # there is no PSF for points
-            with_segment = np.flatnonzero(templates.kind != "point")
-            near_rows = near_rows[with_segment]
-            templates = templates[with_segment]
-        kinds[near_rows] = templates.kind
-        double = None
-        if sources.components is not None:
-            double = sources.components == 2
-        rows = CatalogRows(
-            id=np.asarray(sources.id),
-            sky=sources.sky,
-            xy=place.xy,
-            near_rows=near_rows,
-            flags=flags,
-            template=kinds,
-            template_snr=snr,
+        rows = CatalogRows.of(sources, place.xy, place.near_rows, templates)
+        if not self.bare:
+            return rows, templates
+        # there is no PSF for points: they are not measured
+        with_segment = np.flatnonzero(templates.kind != "point")
+        templates = templates[with_segment]
+        rows = dataclasses.replace(
+            rows,
+            near_rows=place.near_rows[with_segment],
+            template=np.where(rows.template == "point", "none", rows.template),
             fitted=templates.fitted,
-            reference=sources.flux,
-            double=double,
         )
         return rows, templates
 

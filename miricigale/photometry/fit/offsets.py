@@ -82,7 +82,7 @@ class OffsetMap:
 
     def evaluate(self, sky):
         """
-        Offsets at positions.
+        Return offsets (dx, dy) in arcsec at positions.
 
         Parameters
         ----------
@@ -167,6 +167,7 @@ def source_offsets(fit, residual, model, rows):
         fit.bank.map(measure, chunks(high - low, 256))
     products = out[:, :16].reshape(-1, 4, 4)
     (neighbor_light, n_pixels) = out[:, 16:].T
+    # normal equations of light and steps along x and y, scaled to a unit diagonal
     scale = np.sqrt(products.diagonal(axis1=1, axis2=2))[:, :3]
     with np.errstate(divide="ignore", invalid="ignore"):
         normal = products[:, :3, :3] / (scale[:, :, None] * scale[:, None])
@@ -174,7 +175,9 @@ def source_offsets(fit, residual, model, rows):
         inverse = np.linalg.inv(normal)
         projection = products[:, :3, 3] / scale
         step = np.einsum("kij,kj->ki", inverse, projection)
+        # chi^2 that remains sets the scale of the errors
         chi2_left = np.maximum(products[:, 3, 3] - np.sum(step * projection, axis=1), 0)
+        # variance of a step: the mean of both axes
         variance = np.mean((inverse.diagonal(axis1=1, axis2=2) / scale**2)[:, 1:], axis=1)
         error = np.sqrt(variance * chi2_left / np.maximum(n_pixels - 3, 1))
         return (step / scale)[:, 1:], error, neighbor_light / scale[:, 0] ** 2
@@ -192,6 +195,7 @@ def fit_offsets(arrays, bank, settings, catalog):
     xy = catalog.xy[catalog.near_rows]
     limit = settings.max_shift.value / fit.scale
     for _ in range(6):
+        # offsets of bright sources, those already applied included
         rows, offset, error = _bright_offsets(fit, catalog, moved)
         good = lengths(offset) < limit
         order = settings.offset_order
@@ -212,6 +216,7 @@ def fit_offsets(arrays, bank, settings, catalog):
     if order < settings.offset_order:
         _too_few(settings.offset_order, good, f"order {order} is taken")
     sources = catalog.near_rows[member]
+    # the sources of the map, in arcsec
     table = QTable({"id": catalog.id[sources], "sky": catalog.sky[sources]})
     table["x_centroid"], table["y_centroid"] = xy[member].T
     table["dx"], table["dy"] = offset.T * fit.scale * ANGLE
@@ -278,6 +283,7 @@ def settled(fit, bank, catalog):
         if scatter <= _FLOOR**2:
             break
         new = np.zeros_like(source_shifts)
+        # offsets shrunk by the part of their scatter that is noise
         new[member] = deviation * (scatter / (scatter + error**2))[:, None]
         change = np.abs(new - source_shifts).max()
         source_shifts = new
@@ -335,6 +341,7 @@ def _robust_field(xy, offset, error, good, shape, order):
     def misfit(flat):
         return (a @ flat.reshape(start.shape) - b).ravel()
 
+    # robust against sources that moved
     solution = scipy.optimize.least_squares(misfit, start.ravel(), loss="soft_l1")
     coefficients = solution.x.reshape(start.shape)
     for _ in range(5):

@@ -56,6 +56,38 @@ class CatalogRows:
     #: Which sources have two components; None where their fits decide.
     double: np.ndarray | None = None
 
+    @classmethod
+    def of(cls, sources, xy, near_rows, templates):
+        """
+        Make the rows of sources at pixels (x, y), (n, 2).
+
+        ``sources`` and ``templates`` are `~miricigale.photometry.SourceTemplates`: of the whole catalog, and of
+        the sources of ``near_rows``, (k,).
+        """
+        n = len(sources.id)
+        # sources far off have no template
+        flags = np.zeros(n, int)
+        snr = np.full(n, np.nan)
+        kinds = np.full(n, "none", "U6")
+        flags[near_rows] = templates.flags
+        snr[near_rows] = templates.snr
+        kinds[near_rows] = templates.kind
+        double = None
+        if sources.components is not None:
+            double = sources.components == 2
+        return cls(
+            id=np.asarray(sources.id),
+            sky=sources.sky,
+            xy=xy,
+            near_rows=near_rows,
+            flags=flags,
+            template=kinds,
+            template_snr=snr,
+            fitted=templates.fitted,
+            reference=sources.flux,
+            double=double,
+        )
+
 
 def package(fit, diagnostics, new_xy, catalog, meta):
     """
@@ -74,6 +106,7 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     owner[len(owner) - len(new_xy) :] = np.arange(n, n_all)
     place = owner[fit.host[fit.bank.order]]
     main = fit.main
+    # what was not measured is NaN
     common = np.full((n_columns, n_columns), np.nan)
     blending = np.full(len(place), np.nan)
     flux = np.full(n_all, np.nan)
@@ -87,7 +120,9 @@ def package(fit, diagnostics, new_xy, catalog, meta):
             _by_source(covariance, place[fit.rows], main[fit.rows], n_all)
             for covariance in covariances
         ]
+        # noise, templates and PSF are independent
         joint = terms[0] + terms[1] + terms[2]
+        # total fluxes stand in the rows of the first components
         measured = fit.rows[main[fit.rows]]
         flux[place[measured]] = fit.total[measured]
         for error, term in zip(flux_err, (joint, *terms), strict=True):
@@ -103,6 +138,7 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     flags[canceling(flux, flux_err[0], core_flux)] |= int(ForcedFlags.CANCELING)
     chi2[place[main]] = diagnostics.chi2[main]
     residual_fraction[place[main]] = diagnostics.residual_fraction[main]
+    # columns of all sources, from which the catalog's and the new ones are taken
     columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage, "chi2": chi2}
     columns["residual_fraction"] = residual_fraction
     for name, error in zip(_TERMS, flux_err, strict=True):
@@ -148,7 +184,7 @@ def package(fit, diagnostics, new_xy, catalog, meta):
 
 def _registration(fit, diagnostics, common, n_bright):
     """
-    How far the image lies from the prior, and the error of that, arcsec along x and y: for the meta dictionary.
+    Measure how far the image lies from the prior, with its error, arcsec along x and y: for the meta dictionary.
 
     The shift that was fitted, the mean of the sources of a map, or else what the residuals show, to first order:
     then the error is the jackknife's over strips of rows, which has errors of single templates in it, and there
@@ -178,12 +214,14 @@ def _registration(fit, diagnostics, common, n_bright):
     sums = np.array(sums, float)
     # of all strips, and of all but each
     sums_of_strips = np.concatenate([[sums.sum(axis=0)], sums.sum(axis=0) - sums])
+    # least squares for the shift, of all strips and without each
     normal = sums_of_strips[:, :2, :2]
     if np.linalg.det(normal).min() <= 0:
         return {}
     offsets = np.linalg.solve(normal, sums_of_strips[:, :2, 2:])[..., 0]
     offset = offsets[0]
     without = offsets[1:]
+    # the jackknife's error
     error = np.sqrt((len(sums) - 1) * np.var(without, axis=0))
     far = (
         np.any((np.abs(offset) > _WARNED_OFFSET) & (np.abs(offset) > 3 * error))
@@ -198,7 +236,7 @@ def _registration(fit, diagnostics, common, n_bright):
 
 
 def _offset_meta(offset, error):
-    """Offset and error in arcsec as plain values."""
+    """Return offset and error in arcsec as plain values."""
     return {"offset": offset.round(5).tolist(), "offset_err": error.round(5).tolist()}
 
 
@@ -206,6 +244,7 @@ def _by_source(covariance, place, main, n):
     """Return the covariance of sources' total fluxes, and after them of their second components, (2 n, 2 n)."""
     k = np.arange(len(place))
     rows = np.concatenate([place, n + place[~main]])
+    # sums of both components, and the second ones alone
     gather = scipy.sparse.coo_array(
         (np.ones(len(rows)), (rows, np.concatenate([k, k[~main]]))), shape=(2 * n, len(k))
     ).tocsr()

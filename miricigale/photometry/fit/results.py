@@ -85,6 +85,7 @@ def crowded(sky, flux, *, radius=2 * u.arcsec):
         i, j, _, _ = sky[placed].search_around_sky(sky[placed], radius)
         i = placed[i]
         j = placed[j]
+        # one magnitude fainter
         limit = np.maximum(flux[i], 0.0) * 10**-0.4
         is_crowded[i[(i != j) & (flux[j] > limit)]] = True
     return is_crowded
@@ -268,6 +269,7 @@ class ForcedPhotometryResult(Tabular):
         """
         image = self.residual_image
         usable = ~image.mask
+        # mean of chi^2 over usable pixels, weighted with a Gaussian
         square = np.where(usable, image.data / image.uncertainty.array, 0.0) ** 2
         width = self.psf_fwhm.to_value(ANGLE) / pixel_scale(image.wcs) / np.sqrt(8 * np.log(2))
         total = scipy.ndimage.gaussian_filter(square, width, mode="constant")

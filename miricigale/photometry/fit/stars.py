@@ -8,12 +8,14 @@ from astropy.wcs.utils import pixel_to_pixel
 from scipy.spatial import KDTree
 
 from miricigale.filters import Filter
+from miricigale.photometry.fit.exposure_kernels import mean_kernel
 from miricigale.photometry.images.arrays import (
     fine_wcs,
     image_arrays,
     lengths,
     pixel_scale,
     sky_pixels,
+    sky_to_pixels,
 )
 from miricigale.psf import KernelField, _core
 from miricigale.psf.star_fit import TERMS, WHOLE, Star, StarPSF, fitted_stars
@@ -127,9 +129,7 @@ def kernel_stars(kernel, image, highres, catalog, *, grid=None, min_stars=1):
     ----------
     Anderson & King 2000, PASP 112, 1360.
     """
-    mean = kernel
-    if isinstance(kernel, KernelField):
-        mean = kernel.mean
+    mean = mean_kernel(kernel)
     if grid is None and highres is not None:
         grid = highres.wcs
     if grid is None:
@@ -137,13 +137,15 @@ def kernel_stars(kernel, image, highres, catalog, *, grid=None, min_stars=1):
     sky = catalog["sky"]
     ids = catalog["id"]
     rows = np.arange(len(catalog))
-    place = 2 * np.stack(image.wcs.world_to_pixel(sky), axis=1) / image.shape[::-1] - 1
+    # from -1 to 1 across the image
+    place = 2 * sky_to_pixels(sky, image.wcs) / image.shape[::-1] - 1
     fits = {}
     flux = {}
     table = []
     for name, picture in (("prior", highres), ("image", image)):
         if picture is None:
             continue
+        # stars of the prior are looked for on the image too
         psf = mean.source if name == "prior" else mean.target
         rows, stars = _stars(image_arrays(picture, name), grid, psf, sky, rows, place)
         if flux and _in_the_tail(highres, picture):
@@ -160,6 +162,7 @@ def kernel_stars(kernel, image, highres, catalog, *, grid=None, min_stars=1):
         for k, before, after in zip(rows, fit.before, fit.after, strict=True):
             table.append((name, ids[k], before.snr, before.width[0], before.chi2, after.chi2))
     names = ("on", "id", "snr", "width", "chi2_model", "chi2")
+    # a row for each star
     table = QTable(rows=table, names=names) if table else QTable(names=names)
     if any(fit.kind != "model" for fit in fits.values()):
         kernel = _corrected(kernel, fits, image)
@@ -168,7 +171,7 @@ def kernel_stars(kernel, image, highres, catalog, *, grid=None, min_stars=1):
 
 def with_stars(photometer, image, sources, highres=None, grid=None):
     """
-    A `~miricigale.photometry.ForcedPhotometer` with the kernel that the stars give, and these.
+    Return a `~miricigale.photometry.ForcedPhotometer` with the kernel that the stars give, and these.
 
     ``sources`` has the columns ``id`` and ``sky``; the other arguments are those of `kernel_stars`. Without the
     prior only the image's PSF is corrected.
@@ -186,7 +189,7 @@ def with_stars(photometer, image, sources, highres=None, grid=None):
 
 
 def _in_the_tail(prior, image):
-    """Whether stars are fainter in the image's band by their spectrum."""
+    """Return whether stars are fainter in the image's band by their spectrum."""
     prior_band = prior.meta.get("filter")
     band = image.meta.get("filter")
     if prior_band not in Filter.names() or band not in Filter.names():
@@ -205,6 +208,7 @@ def _stars(arrays, grid, psf, sky, rows, place):
     on_image = np.flatnonzero(np.isfinite(xy[:, 0]))
     light = np.zeros(len(xy))
     at = tuple(np.rint(xy[on_image, ::-1]).astype(int).T)
+    # signal of a fit of the PSF: light by the central pixel, times the root of the PSF's power
     light[on_image] = arrays.flux[at] * np.sqrt(np.sum(psf**2)) / (step * psf.max())
     snr = light[rows] / arrays.sigma[tuple(np.rint(np.nan_to_num(xy[rows, ::-1])).astype(int).T)]
     rows = rows[np.argsort(-snr)][: np.count_nonzero(snr > _SNR)]
@@ -261,6 +265,7 @@ def _without_others(fit):
     """Return a star without pixels that other sources brighten."""
     sigma = fit.star.sigma.copy()
     use = np.isfinite(fit.star.sigma)
+    # noise, and a part of the star's own light
     limit = _CLIP * np.hypot(sigma[use], _OTHERS * (fit.star.data[use] - fit.residual))
     sigma[use] = np.where(fit.residual > limit, np.inf, sigma[use])
     return dataclasses.replace(fit.star, sigma=sigma)
@@ -283,5 +288,5 @@ def _corrected(kernel, fits, image):
 
     if not isinstance(kernel, KernelField):
         return changed(kernel, (0.0, 0.0))
-    places = 2 * np.stack(image.wcs.world_to_pixel(kernel.sky), axis=1) / image.shape[::-1] - 1
+    places = 2 * sky_to_pixels(kernel.sky, image.wcs) / image.shape[::-1] - 1
     return dataclasses.replace(kernel, kernels=list(map(changed, kernel.kernels, places)))

@@ -50,6 +50,7 @@ def fit_covariances(fit, correlation):
         solution = changes.fit
         xy = np.concatenate([xy, changes.xy])
         if correlation is None:
+            # the priors are no noise
             white = (solution.matrix - scipy.sparse.diags_array(changes.prior)).tocsr()
             fillings = [(white, solution.border, solution.corner)]
         no_border = np.zeros((len(solution.rhs), g))
@@ -101,6 +102,7 @@ def psf_errors(fit, image):
         if settings.size_scatter is None:
             return np.zeros(len(fit.flux))
         fraction = image * np.max(np.abs(kernel.encircled_energy_error()))
+    # power of a point source on the image's pixels: extended sources are less concerned
     point = np.sum(kernel.target**2) * (fit.scale / kernel.pixel_scale.to_value(ANGLE)) ** 2
     return fraction * np.minimum(fit.power / point, 1.0) * np.abs(fit.flux)
 
@@ -242,6 +244,7 @@ class TemplateFit:
             self.columns += gradients
         white = list(map(self.arrays.whitened, self.columns))
         data = self.arrays.whitened(self.arrays.flux)
+        # normal equations of the sources, and their products with the common parameters
         matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
         self.light = light / bank.full_light()[:, None]
         self.power = power
@@ -250,10 +253,12 @@ class TemplateFit:
         with np.errstate(divide="ignore", invalid="ignore"):
             excess = bank.noise_terms() / np.where(power > 0, power, np.inf)
         self.noisy = excess > 0.5
+        # errors in variables: the noise of the templates adds to their power
         correction = scipy.sparse.diags_array(np.minimum(excess, 0.5) * diagonal)
         self.degenerate = duplicates(matrix, rows, bank.order)
         matrix = (matrix - correction).tocsr()
         self._find_pairs(matrix, rows & ~self.degenerate)
+        # rows that can be fitted
         self.rows = np.flatnonzero(rows & ~self.degenerate & ~self.inseparable)
         matrix = matrix[self.rows][:, self.rows]
         corner = inner_products(white, white)
@@ -296,6 +301,7 @@ class TemplateFit:
         second = np.flatnonzero(self.host[order] != order)
         first = row[self.host[order[second]]]
         power = matrix.diagonal()
+        # the squared cosine between the components
         overlap = matrix_elements(matrix, first, second)
         is_separable = overlap**2 < _SEPARABLE * power[first] * power[second]
         is_separable &= rows[first] & rows[second]
@@ -324,6 +330,7 @@ class TemplateFit:
 
     def _fit_step(self, bank):
         """Fit with the templates of a bank and a small step of all of them: the step (x, y) in pixels."""
+        # a small shift adds the model's gradient
         dy, dx = np.gradient(self.model())
         self._solve(bank, [-dx, -dy])
         return self.fit.common[self.places["shift"]]
@@ -411,11 +418,11 @@ def inner(first, second):
     return float(np.einsum("ij,ij->", first, second, dtype=float, casting="same_kind"))
 
 
-def inner_products(left, right):
-    """Sum the products of each of some images with each of others, shape (n, m)."""
-    products = np.empty((len(left), len(right)))
-    for i, first in enumerate(left):
-        for j, second in enumerate(right):
+def inner_products(images, other_images):
+    """Sum the products of each of n images with each of m others, shape (n, m)."""
+    products = np.empty((len(images), len(other_images)))
+    for i, first in enumerate(images):
+        for j, second in enumerate(other_images):
             products[i, j] = inner(first, second)
     return products
 
@@ -432,6 +439,7 @@ def duplicates(matrix, rows, order):
     """Find templates that equal another one's; the first in the catalog is kept."""
     coo = matrix.tocoo()
     scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
+    # the cosine between two templates is 1
     is_same = coo.data > (1 - 1e-6) * scale[coo.row] * scale[coo.col]
     is_same &= rows[coo.row] & rows[coo.col] & (order[coo.row] > order[coo.col])
     is_duplicate = np.zeros(len(rows), bool)

@@ -151,6 +151,7 @@ def _require_same_pixels(image, highres):
     ny, nx = image.shape
     x = np.array([0.0, nx - 1.0, 0.0])
     y = np.array([0.0, 0.0, ny - 1.0])
+    # three corners fix a linear map
     offsets = np.stack(pixel_to_pixel(image.wcs, highres.wcs, x, y)) - [x, y]
     whole_pixels = np.rint(offsets[:, :1])
     if not np.all(np.abs(offsets - whole_pixels) < 0.02):

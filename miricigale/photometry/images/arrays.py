@@ -43,15 +43,17 @@ class FitArrays:
     noise_correction: float = 1.0  # As the image states it (`ImageFacts`).
 
     def new(self, dtype=np.float32):
-        """A new image of zeros."""
+        """Make a new image of zeros."""
         return np.zeros(self.usable.shape, dtype)
 
     def areas(self, out=None):
-        """The ``area`` of `ImageArrays`, made anew."""
-        return _areas(self.wcs, self.new() if out is None else out)
+        """Calculate the ``area`` of `ImageArrays` (uJy per MJy/sr) once more."""
+        if out is None:
+            out = self.new()
+        return _areas(self.wcs, out)
 
     def whitened(self, image):
-        """An image over the noise, zero where not usable."""
+        """Divide an image by the noise; zero where not usable."""
         return np.multiply(image, self.inverse_sigma, out=self.new())
 
 
@@ -93,10 +95,11 @@ def image_arrays(image, name, dtype=float):
     `~miricigale.utils.exceptions.PhotometryWarning`
         If areas that are exactly 0 are taken as without data.
     """
-    *scaled, usable = _checked(image, name)
+    (data, factor), (noise, noise_factor), usable = _checked(image, name)
     area = _areas(image.wcs, np.empty(usable.shape, dtype))
-    # in place, for images can be large
-    flux, sigma = (np.multiply(*values, dtype=dtype, casting="same_kind") for values in scaled)
+    # in the wanted precision at once, for images can be large
+    flux = np.multiply(data, factor, dtype=dtype, casting="same_kind")
+    sigma = np.multiply(noise, noise_factor, dtype=dtype, casting="same_kind")
     # a surface brightness, and not the flux in each pixel
     if not image.unit.is_equivalent(FNU):
         flux *= area
@@ -110,12 +113,18 @@ def fit_arrays(image, name):
     """Take a `~astropy.nddata.CCDData` apart for a fit of templates; see `image_arrays`."""
     arrays = image_arrays(image, name, np.float32)
     inverse = np.divide(np.float32(1), arrays.sigma, out=arrays.sigma)
-    facts = image.uncertainty is None, ImageFacts.of(image).noise_correction
-    return FitArrays(arrays.flux, inverse, arrays.usable, arrays.wcs, *facts)
+    return FitArrays(
+        flux=arrays.flux,
+        inverse_sigma=inverse,
+        usable=arrays.usable,
+        wcs=arrays.wcs,
+        measured_noise=image.uncertainty is None,
+        noise_correction=ImageFacts.of(image).noise_correction,
+    )
 
 
 def _checked(image, name):
-    """Data and noise, each with its factor to MJy/sr or to uJy in a pixel, and which pixels are usable."""
+    """Return data and noise, each with its factor to MJy/sr or to uJy in a pixel, and the usable pixels."""
     if not isinstance(image, CCDData):
         msg = f"'{name}' must be a CCDData, got {type(image).__name__}"
         raise TypeError(msg)
@@ -125,11 +134,14 @@ def _checked(image, name):
         raise argument_error(name, "an image with a celestial WCS", "one without")
     unit = FNU if image.unit.is_equivalent(FNU) else SURFACE_BRIGHTNESS
     factor = float(to_array(1 * image.unit, unit, name))
+    # pixels with a value, a positive noise, and no mark
     usable = np.isfinite(data)
     if image.mask is not None:
         usable &= ~np.asarray(image.mask, bool)
     if image.uncertainty is None:
-        spread = mad_std(np.asarray(data[usable], float)) if usable.any() else 0.0
+        spread = 0.0
+        if usable.any():
+            spread = mad_std(np.asarray(data[usable], float))
         noise = np.broadcast_to(np.float64(spread), data.shape), factor
     else:
         # which takes the size of what is below 0
@@ -137,8 +149,10 @@ def _checked(image, name):
         wanted = "an image with uncertainties of 0 (no data) or more"
         check_that(not negative, name, wanted, f"{negative} pixels below 0")
         sigma = image.uncertainty.represent_as(StdDevUncertainty)
-        scale = factor if sigma.unit is None else (1 * sigma.unit).to_value(unit)
-        noise = np.asarray(sigma.array), float(scale)
+        scale = factor
+        if sigma.unit is not None:
+            scale = float((1 * sigma.unit).to_value(unit))
+        noise = np.asarray(sigma.array), scale
     usable &= np.isfinite(noise[0]) & (noise[0] > 0)
     mask_filled(data, usable, f"'{name}'")
     check_that(usable.any(), name, "an image with usable pixels", "none (masked, NaN or no noise)")
@@ -146,7 +160,7 @@ def _checked(image, name):
 
 
 def pixel_scale(wcs):
-    """Mean pixel scale of a WCS at its reference, in arcsec."""
+    """Return the mean pixel scale of a WCS at its reference, in arcsec."""
     return float(np.sqrt(np.prod(proj_plane_pixel_scales(wcs.celestial))) * 3600.0)
 
 
@@ -160,8 +174,13 @@ def pixels_to_sky(xy, wcs):
     return wcs.pixel_to_world(xy[:, 0], xy[:, 1])
 
 
+def sky_to_pixels(sky, wcs):
+    """Return the pixels (x, y), shape (n, 2), of coordinates."""
+    return np.stack(wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
+
+
 def same_grid(first, second):
-    """Whether two WCSs put a square of pixels at the same places (to 1e-3 pixel)."""
+    """Return whether two WCSs put a square of pixels at the same places (to 1e-3 pixel)."""
     x = np.array([0.0, 1000.0, 0.0, 1000.0])
     y = np.array([0.0, 0.0, 1000.0, 1000.0])
     place = second.world_to_pixel(first.pixel_to_world(x, y))
@@ -169,24 +188,25 @@ def same_grid(first, second):
 
 
 def fine_wcs(image_wcs, shape, scale):
-    """North-up grid of pixels of ``scale`` arcsec about the middle of an image."""
+    """Make a north-up grid of pixels of ``scale`` arcsec about the middle of an image."""
     middle = image_wcs.pixel_to_world((shape[1] - 1) / 2, (shape[0] - 1) / 2).icrs
     return north_up_wcs(middle, scale * u.arcsec, (1, 1))
 
 
 def sky_pixels(sky, wcs, shape, margin):
     """
-    Pixels (x, y) of those coordinates that are on or near an image, shape (n, 2).
+    Return pixels (x, y) of those coordinates that are on or near an image, shape (n, 2).
 
     NaN for positions outside of the image, of a shape, and of a rim of ``margin`` pixels.
     """
     xy = np.full((len(sky), 2), np.nan)
     ny, nx = shape
     middle = wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2)
+    # a circle about the image: a WCS may fail, or wrap, far from it
     radius = 1.05 * (np.hypot(nx, ny) / 2 + margin) * pixel_scale(wcs)
     is_near = sky.separation(middle).arcsec < radius
     if is_near.any():
-        xy[is_near] = np.stack(wcs.world_to_pixel(sky[is_near]), axis=-1)
+        xy[is_near] = sky_to_pixels(sky[is_near], wcs)
     low = -0.5 - margin
     x, y = xy.T
     # a NaN fails every comparison
@@ -196,7 +216,7 @@ def sky_pixels(sky, wcs, shape, margin):
 
 
 def nearest_values(plane, xy):
-    """Values of a plane at the nearest pixels, (n, 2) (0 outside), and whether a position is on it."""
+    """Return values of a plane at the nearest pixels, (n, 2) (0 outside), and whether a position is on it."""
     ny, nx = plane.shape
     column, row = np.rint(np.where(np.isfinite(xy), xy, -1.0)).astype(int).T
     inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
@@ -207,7 +227,7 @@ def nearest_values(plane, xy):
 
 def local_maps(xy, half, image_wcs, grid_wcs):
     """
-    Quadratic maps from pixel offsets on an image to positions on a finer grid, shape (n, 2, 6).
+    Calculate quadratic maps from pixel offsets on an image to positions on a finer grid, shape (n, 2, 6).
 
     Coefficients of 1, u, v, u^2, u v, v^2 for x and y on the grid. They expand about the image positions
     ``xy``, (n, 2), and are exact at offsets of ``half`` pixels, (n,).
@@ -221,10 +241,13 @@ def local_maps(xy, half, image_wcs, grid_wcs):
     fine = pixel_to_pixel(image_wcs, grid_wcs, x.ravel(), y.ravel())
     poly = np.empty((len(xy), 2, 6))
     for axis, values in enumerate(fine):
-        f = np.asarray(values).reshape(-1, 3, 3)  # [source, v, u]
+        # differences of the 3 x 3 positions about each source, [source, v, u]
+        f = np.asarray(values).reshape(-1, 3, 3)
         poly[:, axis, 0] = f[:, 1, 1]
+        # first derivatives along u and v
         poly[:, axis, 1] = (f[:, 1, 2] - f[:, 1, 0]) / (2 * step)
         poly[:, axis, 2] = (f[:, 2, 1] - f[:, 0, 1]) / (2 * step)
+        # halves of the second derivatives, and the mixed one
         poly[:, axis, 3] = (f[:, 1, 2] - 2 * f[:, 1, 1] + f[:, 1, 0]) / (2 * step**2)
         poly[:, axis, 4] = (f[:, 2, 2] - f[:, 2, 0] - f[:, 0, 2] + f[:, 0, 0]) / (4 * step**2)
         poly[:, axis, 5] = (f[:, 2, 1] - 2 * f[:, 1, 1] + f[:, 0, 1]) / (2 * step**2)

@@ -26,7 +26,7 @@ _BASES = (u.electron, u.ct, u.adu, u.DN, u.ph)
 
 def parsed_unit(text):
     """
-    The unit that a header's text means, such as ``10.0*nanoJansky`` or ``ELECTRONS/S``.
+    Parse the unit in a header, such as ``10.0*nanoJansky`` or ``ELECTRONS/S``.
 
     Without pixels, as values are of one; None if it means none.
     """
@@ -37,8 +37,10 @@ def parsed_unit(text):
     replaced = text
     for pattern, name in _COUNTS:
         replaced = re.sub(pattern, name, replaced, flags=re.IGNORECASE)
+    if not text:
+        return None
     # S alone would be siemens
-    for name in (replaced, text) if text else ():
+    for name in (replaced, text):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", u.UnitsWarning)
             with contextlib.suppress(TypeError, ValueError):
@@ -50,7 +52,7 @@ def parsed_unit(text):
 
 def calibration(path, text, zero_point, keywords):
     """
-    What one unit of a pixel's value is, in MJy/sr, or in MJy for fluxes in pixels, and where that is from.
+    Calibrate one unit of a pixel's value in MJy/sr, or in MJy for fluxes in pixels, and say by what.
 
     Parameters
     ----------
@@ -68,6 +70,7 @@ def calibration(path, text, zero_point, keywords):
     ValueError
         If a zero point is given for fluxes, or is not finite.
     """
+    # a unit of brightness or flux needs no calibration
     unit = parsed_unit(text)
     if unit is not None and not unit.is_equivalent(u.dimensionless_unscaled):
         for target in (SURFACE_BRIGHTNESS, u.MJy):
@@ -84,17 +87,19 @@ def calibration(path, text, zero_point, keywords):
     )
     check_data(unit is not None and not unit.is_equivalent(u.dimensionless_unscaled), path, problem)
     time = 1.0
-    said = ""
-    if any(unit.is_equivalent(base) for base in _BASES):
+    note = ""
+    if _count_base(unit) is not None:
         time = keywords["EXPTIME"]
         problem = "no rate, and its header no EXPTIME: counts need 'zero_point'"
         check_data(time and time > 0, path, f"has pixels in {unit}, {problem}")
         unit = unit / u.s
-        said = f", EXPTIME {time:g} s"
-    rate = next((base / u.s for base in _BASES if unit.is_equivalent(base / u.s)), None)
+        note = f", EXPTIME {time:g} s"
+    base = _count_base(unit * u.s)
     problem = "and wanted is a surface brightness, a flux, counts or a rate of counts"
-    check_data(rate is not None, path, f"has pixels in {unit}, {problem}")
-    scale = unit.to(rate) / time
+    check_data(base is not None, path, f"has pixels in {unit}, {problem}")
+    # counts over the exposure time are a rate
+    scale = unit.to(base / u.s) / time
+    # exactly one calibration of count rates must be there
     calibrations = _header_calibrations(keywords)
     problem = (
         "has both PHOTMJSR and PHOTFLAM" if calibrations else "has neither PHOTMJSR nor PHOTFLAM"
@@ -105,11 +110,19 @@ def calibration(path, text, zero_point, keywords):
         f"has pixels in {unit}, its header {problem}: give 'zero_point'",
     )
     name, factor = calibrations[0]
-    return factor * scale, name + said
+    return factor * scale, name + note
+
+
+def _count_base(unit):
+    """Return the unit of counts that a unit is equivalent to, or None."""
+    for base in _BASES:
+        if unit.is_equivalent(base):
+            return base
+    return None
 
 
 def _header_calibrations(keywords):
-    """Brightness or flux of one count a second, by each calibration that a header has."""
+    """Return the brightness or flux of one count a second, by each calibration that a header has."""
     calibrations = []
     value = keywords["PHOTMJSR"]
     if value:

@@ -28,7 +28,7 @@ class Plane:
     @classmethod
     def over(cls, wcs, images):
         """
-        A plane with coordinates (and ``pixel_shape``) over exposures.
+        Make a plane with coordinates (and ``pixel_shape``) over exposures.
 
         ``images`` are pairs of coordinates and shape, one for each exposure.
         """
@@ -38,7 +38,7 @@ class Plane:
 
     def mean(self, images, weights):
         """
-        Weighted mean of images of the exposures.
+        Average images of the exposures with weights.
 
         Parameters
         ----------
@@ -62,11 +62,14 @@ class Plane:
 
 
 def _nearest(wcs, shape, image_wcs, size):
-    """Flat numbers of the pixels of an image that are nearest to those of a plane; -1 beyond the image."""
-    nodes = [np.arange(0, n + _STEP, _STEP) for n in shape]
-    y, x = np.meshgrid(*nodes, indexing="ij")
+    """Return flat numbers of the pixels of an image that are nearest to those of a plane; -1 beyond the image."""
+    ny, nx = shape
+    y, x = np.meshgrid(
+        np.arange(0, ny + _STEP, _STEP), np.arange(0, nx + _STEP, _STEP), indexing="ij"
+    )
     positions = pixel_to_pixel(wcs, image_wcs, x.ravel(), y.ravel())
     rows, columns = np.indices(shape, np.float32)
+    # bilinear between the nodes
     at = np.stack([rows, columns]) / _STEP
     pixel = []
     for values in positions:

@@ -7,23 +7,31 @@ from numpy.polynomial import legendre
 
 
 def n_terms(order):
-    """Number of terms of a polynomial of two variables."""
+    """Return the number of terms of a polynomial of two variables."""
     return (order + 1) * (order + 2) // 2
 
 
 def legendre_terms(x, y, shape, order):
     """
-    Products of Legendre polynomials up to a total order, of size 1 at most on an image.
+    Return products of Legendre polynomials up to a total order, of size 1 at most on an image.
 
     Positions are in pixels, ``shape`` is that of the image, (ny, nx), whose edges are at -1 and 1. A list of
     ``(order + 1) (order + 2) / 2`` arrays of the shape of ``x * y``, the constant first.
     """
-    u, v = (
-        2.0 * np.asarray(a, float) / n - (n - 1) / n
-        for a, n in zip((x, y), shape[::-1], strict=True)
-    )
-    px, py = (legendre.legvander(a.ravel(), order).reshape(*a.shape, -1) for a in (u, v))
-    return [px[..., total - k] * py[..., k] for total in range(order + 1) for k in range(total + 1)]
+    ny, nx = shape
+    px = _legendre(x, nx, order)
+    py = _legendre(y, ny, order)
+    terms = []
+    for total in range(order + 1):
+        for k in range(total + 1):
+            terms.append(px[..., total - k] * py[..., k])
+    return terms
+
+
+def _legendre(positions, n, order):
+    """Return Legendre polynomials of positions along an axis of n pixels, shape (..., order + 1)."""
+    u = 2.0 * np.asarray(positions, float) / n - (n - 1) / n
+    return legendre.legvander(u.ravel(), order).reshape(*u.shape, -1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,6 +62,6 @@ class SmoothField:
     order: int
 
     def __call__(self, x, y):
-        """Value at positions in pixels, shape (..., m) or that of the positions."""
+        """Return the value at positions in pixels, shape (..., m) or that of the positions."""
         terms = np.stack(legendre_terms(x, y, self.shape, self.order), axis=-1)
         return terms @ self.coefficients

@@ -18,13 +18,15 @@ from miricigale.utils.options import check_data
 
 
 def _exact(has_cd):
-    """Names of the numbers of a WCS that a header rounds."""
-    return ("crpix", "crval", "cd") if has_cd else ("crpix", "crval", "cdelt", "pc")
+    """Return the names of the numbers of a WCS that a header rounds."""
+    if has_cd:
+        return "crpix", "crval", "cd"
+    return "crpix", "crval", "cdelt", "pc"
 
 
 def grid_text(wcs):
     """
-    A WCS as text.
+    Write a WCS as text.
 
     Parameters
     ----------
@@ -54,7 +56,7 @@ def grid_text(wcs):
 
 def text_grid(text):
     """
-    The WCS that `grid_text` wrote.
+    Read the WCS that `grid_text` wrote.
 
     Parameters
     ----------
@@ -101,7 +103,7 @@ def open_image(path, wanted):
 
 def extension_index(hdus, extension, path):
     """
-    Index of an extension that is named by its number, its name, or name and EXTVER (``"SCI,2"``).
+    Find the index of an extension by its number, its name, or name and EXTVER (``"SCI,2"``).
 
     Raises
     ------
@@ -122,7 +124,7 @@ def extension_index(hdus, extension, path):
 
 def find_image(hdus, extension, path, names, *, no_images=()):
     """
-    Index of the extension with the image.
+    Find the index of the extension with the image.
 
     Parameters
     ----------
@@ -202,20 +204,25 @@ def open_map(path, wanted, role, names, image):
 
 
 def filter_name(get):
-    """The filter that a header (``get(keyword)``) names, ``instrument.filter``; None if it names none."""
+    """Return the filter that a header (``get(keyword)``) names, ``instrument.filter``; None if it names none."""
     instrument = str(get("INSTRUME") or "").strip().lower()
-    names = [str(get(key) or "").strip().lower() for key in ("FILTER", "FILTER1", "FILTER2")]
-    names = [name for name in names if name and not name.startswith("clear")]
+    names = []
+    for key in ("FILTER", "FILTER1", "FILTER2"):
+        name = str(get(key) or "").strip().lower()
+        if name and not name.startswith("clear"):
+            names.append(name)
     pupil = str(get("PUPIL") or "").strip().lower()
     # NIRCam's narrow filters are in the pupil wheel, in front of a wide one
     if instrument == "nircam" and re.fullmatch(r"f\d{3}[a-z]\d?", pupil):
         names = [pupil]
-    return f"{instrument}.{names[0]}" if instrument and len(names) == 1 else None
+    if not instrument or len(names) != 1:
+        return None
+    return f"{instrument}.{names[0]}"
 
 
 def cut_wcs(wcs, section, path):
     """
-    The coordinates of a part (slices of rows and columns) of an image, exact.
+    Cut the coordinates of an image to a part of it (slices of rows and columns), exactly.
 
     Raises
     ------
@@ -223,8 +230,10 @@ def cut_wcs(wcs, section, path):
         If they have distortions by tables, which cannot be cut.
     """
     cut = wcs.slice(section)
-    y, x = (np.array([0.0, axis.stop - axis.start - 1.0]) for axis in section)
-    corners = wcs.pixel_to_world(x + section[1].start, y + section[0].start)
+    rows, columns = section
+    y = np.array([0.0, rows.stop - rows.start - 1.0])
+    x = np.array([0.0, columns.stop - columns.start - 1.0])
+    corners = wcs.pixel_to_world(x + columns.start, y + rows.start)
     problem = "has coordinates with tables of distortion, and cannot be read in parts"
     check_data(
         np.all(cut.pixel_to_world(x, y).separation(corners) < 1e-4 * u.arcsec), path, problem
@@ -251,6 +260,8 @@ def check_same_grid(wcs, reference, shape, path, reference_path):
     place = pixel_to_pixel(reference, wcs, x, y)
     distance = np.hypot(place[0] - x, place[1] - y)
     if not np.all(distance <= 0.1):
-        far = np.nanmax(distance) if np.isfinite(distance).any() else np.inf
+        far = np.inf
+        if np.isfinite(distance).any():
+            far = np.nanmax(distance)
         problem = f"is not on the pixels of {reference_path}: by their coordinates up to {far:.4g} pixels apart"
         raise data_error(path, problem)

@@ -75,7 +75,7 @@ def read_mosaic(path, **options):
 
 def as_mosaic(image, argument="image"):
     """
-    Image of whatever holds one.
+    Make an image of whatever holds one.
 
     Parameters
     ----------
@@ -222,11 +222,13 @@ class MosaicFile:
         check_data(wcs is not None, self.path, "has no celestial coordinates (WCS) in its header")
         if self.section is not None:
             wcs = cut_wcs(wcs, self.section, self.path)
-            shape = tuple(axis.stop - axis.start for axis in self.section)
+            rows, columns = self.section
+            shape = rows.stop - rows.start, columns.stop - columns.start
 
         def get(key):
             return header.get(key, first.get(key))
 
+        # facts that the package's own files carry, then those of the header
         check_kind_of_exposure(get, self.path)
         meta = {}
         # of another program it may be no JSON
@@ -241,26 +243,36 @@ class MosaicFile:
             "pa_aper": get("PA_APER"),
             "subarray": get("SUBARRAY"),
         }
-        values = {key: meta.get(key) if value is None else value for key, value in values.items()}
+        for key, value in values.items():
+            if value is None:
+                values[key] = meta.get(key)
+            if values[key] is not None:
+                meta[key] = values[key]
+        unit = _unit_of(header)
+        if self.unit is not None:
+            unit = str(self.unit)
         return MosaicHeader(
             index=index,
             shape=shape,
             wcs=wcs,
             filter=values["filter"],
             pa_aper=self._checked_angle(values["pa_aper"]),
-            unit=_unit_of(header) if self.unit is None else str(self.unit),
+            unit=unit,
             exposure=is_exposure(get),
             keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM", "EXPTIME")},
-            meta={**meta, **{key: value for key, value in values.items() if value is not None}},
+            meta=meta,
         )
 
     def _checked_angle(self, header_angle):
-        """The position angle that was given or that the header states (deg, or None), which must agree."""
-        header_angle = None if header_angle is None else np.asarray(header_angle, float) * u.deg
+        """Return the position angle (deg) that was given or that the header states, which must agree; or None."""
+        if header_angle is not None:
+            header_angle = np.asarray(header_angle, float) * u.deg
         if self.pa_aper is None:
             return header_angle
         angle = float(to_array(self.pa_aper, u.deg, "pa_aper", finite=True)) * u.deg
-        difference = 0.0 if header_angle is None else (angle - header_angle).to_value(u.deg)
+        if header_angle is None:
+            return angle
+        difference = (angle - header_angle).to_value(u.deg)
         if np.max(np.abs((difference + 180) % 360 - 180)) > 1:
             wanted = f"PA_APER of {self.path}, {np.round(header_angle.value, 2)} deg"
             raise argument_error("pa_aper", wanted, angle)
@@ -306,6 +318,7 @@ class MosaicFile:
         """
         from miricigale.instrument import pixel_area_map
 
+        # pixels as they are, and the factor to MJy/sr
         header = self.header
         meta = {**header.meta, "source": str(self.path)}
         with open_image(self.path, "an image") as (hdus, _):
@@ -322,19 +335,21 @@ class MosaicFile:
         meta.update(source_unit=header.unit, calibration=how)
         sigma = None
         if kind is None:
-            zeros = float(np.mean(data[usable] == 0)) if usable.any() else 0.0
-            extra = f", and {zeros:.0%} of its pixels are exactly 0" if zeros > 1e-3 else ""
-            msg = f"{self.path} has no map of the noise, which will be measured on the image{extra}"
+            msg = f"{self.path} has no map of the noise, which will be measured on the image"
+            n_zero = np.count_nonzero(data[usable] == 0)
+            if n_zero > 1e-3 * np.count_nonzero(usable):
+                msg += f", and {n_zero / np.count_nonzero(usable):.0%} of its pixels are exactly 0"
             warn(msg, PhotometryWarning)
             meta["noise"] = "none"
         else:
-            negative = 0 if kind == "weight" else np.count_nonzero(values[usable] < 0)
+            negative = np.count_nonzero(values[usable] < 0)
             wanted = "a map of 0 (no data) or more"
             got = f"{negative} pixels below 0 in {source}, for {self.path}"
-            check_that(not negative, kind, wanted, got)
+            check_that(kind == "weight" or not negative, kind, wanted, got)
             sigma = _sigma(kind, values)
             usable &= np.isfinite(sigma) & (sigma > 0)
             meta["noise"] = f"{kind} ({source})"
+        # areas without data that nothing marks
         filled = mask_filled(data, usable, self.path)
         if filled:
             meta["n_filled"] = filled
@@ -342,6 +357,7 @@ class MosaicFile:
             return None
         problem = "has no usable pixel: all are masked, not finite or without weight"
         check_data(usable.any(), self.path, problem)
+        # to MJy/sr, then what is measured on the image
         data *= factor
         if added is not None:
             data += added
@@ -350,6 +366,7 @@ class MosaicFile:
 
             data -= background(data, ~usable, self.background_box)[0]
             meta["background_box"] = int(self.background_box)
+        # noise of the sky in units of the errors
         relative = np.where(usable, data, 0)
         if sigma is not None:
             sigma *= factor
@@ -371,19 +388,23 @@ class MosaicFile:
             check_data(scale > 0, self.path, problem)
             meta["weight_scale"] = meta["noise_scale"]
             sigma *= sigma.dtype.type(scale)
+        # facts of the image
         meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
         meta["n_masked"] = int(np.count_nonzero(~usable))
+        uncertainty = None
+        if sigma is not None:
+            uncertainty = StdDevUncertainty(sigma)
         return Image(
             data,
             unit=SURFACE_BRIGHTNESS,
             wcs=header.wcs,
             mask=~usable,
-            uncertainty=None if sigma is None else StdDevUncertainty(sigma),
+            uncertainty=uncertainty,
             meta=meta,
         )
 
     def _noise_map(self, hdus, header, usable):
-        """Kind, values and place of the map of the noise; the kind is None if there is none."""
+        """Read the map of the noise: its kind, values and place; the kind is None if there is none."""
         # a unit given by the caller holds for the map too
         stated_unit = "" if self.unit is not None else header.unit
         for kind, names in NOISE_MAPS.items():
@@ -392,8 +413,8 @@ class MosaicFile:
                 continue
             whole_header = self.replace(section=None).header
             image = whole_header.shape, whole_header.wcs, self.path
-            roles = f"a map of the {kind.replace('_', ' ')}", f"the {kind} of {self.path}"
-            with open_map(path, *roles, names, image) as hdu:
+            wanted = f"a map of the {kind.replace('_', ' ')}"
+            with open_map(path, wanted, f"the {kind} of {self.path}", names, image) as hdu:
                 own_kind = noise_kind(hdu)
                 # inverse variances are weights too
                 is_other = own_kind not in (None, kind) and {own_kind, kind} != {
@@ -402,15 +423,15 @@ class MosaicFile:
                 }
                 if is_other:
                     said = hdu.header.get("UTYPE", hdu.name)
-                    wanted = f"a map of the {kind.replace('_', ' ')}"
                     got = f"{path}, whose extension is {said}: give it as '{own_kind}'"
                     raise argument_error(kind, wanted, got)
                 return kind, self._in_unit(hdu, kind, stated_unit, path), str(path)
         return self._own_noise_map(hdus, header, usable, stated_unit)
 
     def _own_noise_map(self, hdus, header, usable, stated_unit):
-        """As `_noise_map`, of the image's own file."""
+        """Read the map of the noise as `_noise_map`, of the image's own file."""
         shape = plane_shape(hdus[header.index])
+        # maps of the file, the first that holds noise
         empty = []
         for kind, hdu in noise_planes(hdus, header.index):
             if plane_shape(hdu) is None and not hdu.shape:
@@ -425,14 +446,19 @@ class MosaicFile:
                 msg = f"{self.path}: {', '.join(empty)} holds no noise; {hdu.name} ({kind}) is used"
                 warn(msg, PhotometryWarning)
             return kind, values, f"extension {hdu.name}"
-        parts = [companion(hdus, header.index, name) for name in VARIANCE_PARTS]
-        parts = [hdu for hdu in parts if hdu is not None and plane_shape(hdu) == shape]
-        if parts:
-            planes = [self._in_unit(hdu, "variance", stated_unit, self.path) for hdu in parts]
-            total = np.sum([np.where(np.isfinite(plane), plane, 0) for plane in planes], axis=0)
+        # the variance of JWST is the sum of its parts
+        names = []
+        planes = []
+        for name in VARIANCE_PARTS:
+            hdu = companion(hdus, header.index, name)
+            if hdu is not None and plane_shape(hdu) == shape:
+                plane = self._in_unit(hdu, "variance", stated_unit, self.path)
+                names.append(hdu.name)
+                planes.append(np.where(np.isfinite(plane), plane, 0))
+        if planes:
+            total = np.sum(planes, axis=0)
             if self._has_noise(total, usable, None):
-                names = " + ".join(hdu.name for hdu in parts)
-                return "variance", total.astype(planes[0].dtype), f"extensions {names}"
+                return "variance", total, f"extensions {' + '.join(names)}"
         if any("nowhere" in text for text in empty):
             problem = f"holds no noise in {', '.join(empty)}, and no other map of it"
             raise data_error(
@@ -441,7 +467,7 @@ class MosaicFile:
         return None, None, None
 
     def _has_noise(self, values, usable, hdu):
-        """Whether a map of the noise has a value above 0 (or one below, which is refused later)."""
+        """Return whether a map of the noise has a value above 0 (or one below, which is refused later)."""
         has_value = np.isfinite(values) & (values != 0)
         if np.any(has_value):
             return True
@@ -452,7 +478,7 @@ class MosaicFile:
         return bool(np.any(np.isfinite(plane) & (plane != 0)))
 
     def _marked_good(self, hdus, index, meta):
-        """Pixels that no extension of marks or weights excludes; notes the scheme of the bits in ``meta``."""
+        """Find pixels that no extension of marks or weights excludes; note the scheme of the bits in ``meta``."""
         header = hdus[index].header
 
         def get(key):
@@ -460,6 +486,7 @@ class MosaicFile:
 
         good = True
         for name in _MARKS:
+            # weights and plain masks by their value, others by their bits
             hdu = companion(hdus, index, name)
             if hdu is None or not hdu.is_image or (not hdu.shape and plane_shape(hdu) is None):
                 continue
@@ -479,7 +506,7 @@ class MosaicFile:
         return good
 
     def _in_unit(self, hdu, kind, unit, path):
-        """A map of the noise in the unit that the image states, as far as both do."""
+        """Read a map of the noise in the unit that the image states, as far as both do."""
         values = _native(plane_data(hdu, self.section))
         text = _unit_of(hdu.header)
         power = _POWERS.get(kind)
@@ -519,10 +546,11 @@ def _unit_of(header):
 
 
 def _native(data):
-    """A copy in native byte order; single precision stays single."""
+    """Copy data in native byte order; single precision stays single."""
     data = np.asarray(data)
-    single = data.dtype.kind == "f" and data.dtype.itemsize <= 4
-    return np.array(data, dtype=np.float32 if single else np.float64)
+    if data.dtype.kind == "f" and data.dtype.itemsize <= 4:
+        return np.array(data, dtype=np.float32)
+    return np.array(data, dtype=np.float64)
 
 
 #: Power of the image's unit that a map of the noise has; the scale of weights is measured.
@@ -532,7 +560,7 @@ _MARKS = ("MASK", "DQ", "WHT")
 
 
 def _sigma(kind, values):
-    """1-sigma errors in the unit of the image, infinite where there are none."""
+    """Return 1-sigma errors in the unit of the image, infinite where there are none."""
     with np.errstate(divide="ignore", invalid="ignore"):
         if kind == "error":
             return values

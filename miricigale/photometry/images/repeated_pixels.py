@@ -10,7 +10,7 @@ from miricigale.utils.exceptions import PhotometryWarning, warn
 
 def own_pixels(image):
     """
-    An image without copies of its pixels.
+    Remove copies of pixels from an image.
 
     Images are enlarged by repeating each pixel n x n times. A template has another value in each of these, and
     their noise is one.
@@ -34,16 +34,16 @@ def own_pixels(image):
     data = np.asarray(image.data)
     if data.ndim != 2 or min(data.shape) < 8:
         return image
-    ends = [_first_lines(lines) for lines in (data, data.T)]
-    n = np.diff(ends[0])[0]
-    if n == 1 or any(np.any(np.diff(lines) != n) for lines in ends):
+    # lines at which the values change: one of each n
+    rows = _first_lines(data)
+    columns = _first_lines(data.T)
+    n = np.diff(rows)[0]
+    if n == 1 or np.any(np.diff(rows) != n) or np.any(np.diff(columns) != n):
         return image
     msg = f"the image has each of its pixels {n} x {n} times: it is measured on the pixels that it had before"
     warn(msg, PhotometryWarning)
-    first = [lines[0] % n for lines in ends]
-    part = tuple(
-        slice(k, k + (size - k) // n * n, n) for k, size in zip(first, data.shape, strict=True)
-    )
+    ny, nx = data.shape
+    part = _whole_copies(rows[0] % n, ny, n), _whole_copies(columns[0] % n, nx, n)
     # a flux in a pixel is that of all its copies
     factor = n**2 if image.unit.is_equivalent(u.Jy) else 1
     parts = {"unit": image.unit, "wcs": image.wcs.slice(part)}
@@ -56,9 +56,15 @@ def own_pixels(image):
     return Image(data[part] * factor, **parts)
 
 
+def _whole_copies(first, size, n):
+    """Return one line of each n copies, those that are cut by the edge left out."""
+    return slice(first, first + (size - first) // n * n, n)
+
+
 def _first_lines(lines):
-    """Numbers of the lines, from 1 on, with other values than the one before."""
+    """Return numbers of the lines, from 1 on, with other values than the one before."""
     sampled = np.asarray(lines[:, :: max(1, lines.shape[1] // 256)], float)
+    # differences from line to line, over the values
     step = np.abs(np.diff(sampled, axis=0))
     size = np.abs(sampled[1:])
     # a solid angle that changes by 1e-6 may have been divided out

@@ -59,7 +59,7 @@ def weight_scale(data, weight, *, mask=None):
 
 def filled_areas(values, usable):
     """
-    Areas of pixels that are exactly 0 for want of data, such as the corners of drizzled images.
+    Find areas of pixels that are exactly 0 for want of data, such as the corners of drizzled images.
 
     ``usable`` are the pixels that count as data so far. Nowhere True if the pixels next to such areas have
     no noise either (their median is below a tenth of that of all others): then the image is a noiseless
@@ -78,8 +78,11 @@ def filled_areas(values, usable):
     is_other = usable & (values != 0)
     if np.count_nonzero(is_beside) < 8:
         return np.zeros_like(usable)
-    noise = [np.median(np.abs(values[members])) for members in (is_beside, is_other)]
-    return filled if noise[0] > 0.1 * noise[1] else np.zeros_like(usable)
+    noise_beside = np.median(np.abs(values[is_beside]))
+    noise = np.median(np.abs(values[is_other]))
+    if not noise_beside > 0.1 * noise:
+        return np.zeros_like(usable)
+    return filled
 
 
 def mask_filled(values, usable, name):
@@ -98,7 +101,7 @@ def mask_filled(values, usable, name):
 
 def sky_noise(values, usable, *, significance=3.5):
     """
-    Median and robust rms of the source-free pixels, and which they are.
+    Measure the median and robust rms of the source-free pixels, and find these.
 
     What is significant after smoothing is left out with a rim, until that changes nothing.
 
@@ -138,7 +141,8 @@ def sky_noise(values, usable, *, significance=3.5):
         if np.array_equal(is_sky, is_free):
             break
         is_free = is_sky
-    return *_median_rms(values[is_free]), is_free
+    level, rms = _median_rms(values[is_free])
+    return level, rms, is_free
 
 
 def _median_rms(values):
@@ -147,7 +151,7 @@ def _median_rms(values):
 
 
 def _median(values):
-    """Median of a million of the values, or of all."""
+    """Return the median of a million of the values, or of all."""
     return np.median(values[:: max(1, len(values) // 1_000_000)])
 
 
@@ -173,6 +177,7 @@ def warn_of_background(result, kernel):
     target = kernel.target
     area = target.sum() ** 2 / np.sum(target**2) * kernel.pixel_scale**2
     added = (level * area).to(FNU)
+    # the error of a typical source
     error = np.median(error)
     # the errors of an image without noise are those of its model
     if abs(added) > error and abs(level.value) > 0.05 * _median(sigma[is_free]):
@@ -196,9 +201,8 @@ def warn_of_sky(arrays, segments):
     level = _median(arrays.flux[is_free])
     member = arrays.usable & (segments > 0)
     label = segments[member]
-    light, variance = (
-        np.bincount(label, values) for values in (arrays.flux[member], arrays.sigma[member] ** 2)
-    )
+    light = np.bincount(label, arrays.flux[member])
+    variance = np.bincount(label, arrays.sigma[member] ** 2)
     good = light > 5 * np.sqrt(variance)
     if not good.any():
         return

@@ -191,6 +191,7 @@ def divided(image, origin, labels, members, core, variance):
     shares : `~numpy.ndarray`, shape (n,)
         Parts of the light of all pieces; zero for those without.
     """
+    # the cell of each piece: pixels nearest to its segment
     inside = np.isin(labels, members)
     nearest = scipy.ndimage.distance_transform_edt(
         ~inside, return_distances=False, return_indices=True

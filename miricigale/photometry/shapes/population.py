@@ -93,6 +93,7 @@ class Population:
         z[..., :2] -= off[:, None, None] * self.line[1]
         inverse, log_det = self._inverse
         chi2 = np.sum((z @ inverse) * z, axis=-1) + log_det
+        # likelihood times prior over the density of the nodes
         galaxy = nodes[..., 0] - 0.5 * chi2 + np.log((1.0 - self.point) / nodes.shape[1])
         probability = np.concatenate([galaxy, (points + np.log(self.point))[:, None]], axis=1)
         probability = np.exp(probability - probability.max(axis=1, keepdims=True))
@@ -120,6 +121,7 @@ class Population:
             moments[0] += _WORTH * self.line[0]
             line = np.linalg.solve(power, moments)
             z = shapes[..., :2] - (x @ line)[:, None]
+            # scatter about the line, with the prior worth some sources
             covariance = np.einsum("nk,nki,nkj->ij", weight, z, z) + _WORTH * self.covariance
             square = np.einsum("nk,nkj->", weight, shapes[..., 2:] ** 2) / 2
             n = total.sum() + _WORTH

@@ -33,6 +33,7 @@ class ShapeModels:
             half = min(middle, size // 2 - 1)
             cut = self._psf[middle - half : middle + half + 1, middle - half : middle + half + 1]
             padded[: 2 * half + 1, : 2 * half + 1] = cut
+            # the center on the first pixel
             shifted = np.roll(padded, (-half, -half), axis=(0, 1))
             self._transforms[size] = scipy.fft.rfft2(shifted)
         return self._transforms[size]

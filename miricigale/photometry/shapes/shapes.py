@@ -78,6 +78,7 @@ class Shape:
     @property
     def axes(self):
         """Half-light radius along the major axis (pixels), axis ratio, angle from x (rad)."""
+        # the ellipticity ln(major / minor) as a vector of twice the angle
         g1, g2 = self.parameters[4:]
         eta = np.hypot(g1, g2)
         return np.exp(self.parameters[2] + eta / 2), np.exp(-eta), 0.5 * np.arctan2(g2, g1)
@@ -87,7 +88,7 @@ class Shape:
         return dataclasses.replace(self, parameters=self.parameters + center_change(shift))
 
     def drawn(self, light, farthest):
-        """The profile on its grid (a `Cutout`), before the PSF, up to a semi-major axis (pixels) at most."""
+        """Draw the profile on its grid (a `Cutout`), before the PSF, up to a semi-major axis (pixels) at most."""
         radius, axis_ratio, angle = self.axes
         x, y, _, log_index = self.parameters[:4]
         stamp, origin = sersic_stamp(
@@ -102,6 +103,7 @@ class Shape:
             odds = odds / odds.sum()
         else:
             odds = np.full(len(odds), 1.0 / len(odds))
+        # mean and covariance of flux and shape over the nodes
         mean = odds @ self.nodes[:, 1:]
         off = self.nodes[:, 1:] - mean
         shape_covariance = (off * odds[:, None]).T @ off
@@ -120,7 +122,7 @@ class Shape:
         )
 
     def semi_major(self, size, origin):
-        """Semi-major axis (pixels) of the ellipse through each pixel of an image at an origin (y, x)."""
+        """Return the semi-major axis (pixels) of the ellipse through each pixel of an image at (y, x)."""
         _, axis_ratio, angle = self.axes
         y, x = np.indices(size)
         x = x + origin[1] - self.parameters[0]
@@ -152,7 +154,7 @@ def not_fitted(n):
 
 @cached
 def normal_nodes():
-    """Points of a normal distribution in four dimensions: of zero mean and unit covariance."""
+    """Return points of a normal distribution in four dimensions, of zero mean and unit covariance."""
     from scipy.stats import norm, qmc
 
     z = norm.ppf(qmc.Sobol(4, scramble=True, rng=np.random.default_rng(1)).random(_NODES))
@@ -208,6 +210,7 @@ class ShapeFitter(ShapeModels):
         population = population or self.expected
         mean, precision = _prior(xy, population)
         half = _HALF if start is None else _half_width(start.parameters)
+        # the best of some sizes to begin with
         inner = self._stamp(data, weight, mean[None], half)
         if start is None:
             starts = [mean + [0, 0, step, 0, 0, 0] for step in _STARTS]
@@ -233,6 +236,7 @@ class ShapeFitter(ShapeModels):
         flux, parameters, evidence, covariance = extended
         if not nodes:
             return Shape(flux, parameters, 0.0, covariance)
+        # what else the source may be: shapes about the best, and a point
         changes = inner.changes(neighbors)
         nodes = inner.nodes(parameters, flux, covariance[3:, 3:], mean, changes)
         start = parameters.copy()
@@ -297,7 +301,7 @@ class ShapeFitter(ShapeModels):
         return Population.expected(np.exp(self._log_scale))
 
     def unfitted(self, xy, population):
-        """What is known beforehand of a source at a position: the typical shape, or a point."""
+        """Return the shape that is expected of a source at a position: the typical one, or a point."""
         covariance = np.zeros((7, 7))
         covariance[3:, 3:] = population.spread
         covariance[1, 1] = covariance[2, 2] = _OFFSET**2
@@ -305,7 +309,7 @@ class ShapeFitter(ShapeModels):
         return Shape(np.nan, parameters, population.point, covariance)
 
     def _stamp(self, data, weight, means, half):
-        """The pixels within some distance of the middles, (n, 6), on the rectangle that holds all."""
+        """Cut out the pixels within some distance of the middles, (n, 6): the rectangle that holds all."""
         corners = np.round(means[:, :2]).astype(int) - half
         size = 2 * half + 1
         (x0, y0) = corners.min(axis=0)
@@ -342,7 +346,7 @@ class _Stamp:
         return np.array([low, [np.inf, np.inf, size, index[1], 2.0, 2.0]])
 
     def minimum(self, start, mean, precision, steps=_STEPS):
-        """As `~miricigale.photometry._core.shape_fits.minimum`; None if nothing is found."""
+        """Fit as `~miricigale.photometry._core.shape_fits.minimum`; None if nothing is found."""
         solution = minimum(*self.pixels, start, mean, precision, self.limits, steps, _GAIN)
         if not np.isfinite(solution[0]):
             return None
@@ -380,11 +384,12 @@ class _Stamp:
 
     def nodes(self, parameters, flux, covariance, mean, changes):
         """
-        Shapes about the best as `Population.odds` takes them: likelihood over density, flux, shape.
+        Calculate shapes about the best as `Population.odds` takes them: likelihood over density, flux, shape.
 
         The likelihood is that of the best light, center and neighbors: these change along ``beside``, (m, p), the
         whitened change of their light by the independent unit normal deviates of what is possible.
         """
+        # nodes are drawn from a normal distribution wider than that of the fit
         root = np.linalg.cholesky(covariance) * _WIDER
         z = normal_nodes()
         shapes = parameters[2:] + z @ root.T

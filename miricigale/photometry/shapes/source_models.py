@@ -49,6 +49,7 @@ class Segments:
         totals = self.totals.copy()
         ratio = self.ratio.copy()
         with np.errstate(divide="ignore", invalid="ignore"):
+            # noise from light and signal-to-noise
             variance = np.where(self.ratio > 0, (self.totals / self.ratio) ** 2, 0.0)
         for group in groups:
             leader = group[0]

@@ -5,7 +5,6 @@ import dataclasses
 import itertools
 
 import numpy as np
-import scipy.ndimage
 
 from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.images.flags import ForcedFlags
@@ -25,6 +24,7 @@ from miricigale.photometry.shapes.rectangles import (
     within,
 )
 from miricigale.photometry.shapes.shapes import POINT_SIZE, ShapeFitter, not_fitted
+from miricigale.photometry.shapes.smoothing import SMOOTHED_NOISE, smooth_image
 from miricigale.photometry.shapes.source_models import (
     DividedGalaxy,
     Segments,
@@ -32,20 +32,13 @@ from miricigale.photometry.shapes.source_models import (
     segment_cutout,
 )
 from miricigale.photometry.shapes.wings import adjust_wings
-from miricigale.utils.parallel import chunks, parallel_map
-
-#: Width (pixels) of the Gaussian that smooths the image, and signal-to-noise of the smoothed image in a core.
-_WIDTH = 1.5
-_CORE_SNR = 4.0
+from miricigale.utils.parallel import parallel_map
 
 #: Standard deviations of chi^2 by which a profile may miss the core.
 _EXCESS = 3.0
 
 #: Least signal-to-noise of a segment that is a source, and no peak of the noise.
 _SOURCE_SNR = 4.0
-
-#: Noise of the image smoothed with it over that of the pixels.
-_GAIN = 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
 
 #: Error of a profile, as a fraction of the brightness: no galaxy is one to better than that.
 _MISFIT = 0.1
@@ -128,6 +121,7 @@ def cutouts(
     whose pixels hold light of others' models are fitted again without that light; the profiles of up to five that
     overlap are fitted together, on the pixels of all of them.
     """
+    # sources whose segment is bright enough to be looked at
     segments = Segments.of(data, variance, segmentation)
     flags = np.zeros(len(label), int)
     snr = np.full(len(label), np.nan)
@@ -149,6 +143,7 @@ def cutouts(
         for k in chosen:
             templates[k] = segment_cutout(data, variance, segments, label[k])
         return templates, flags, snr, fitted
+    # fits of all sources, and galaxies that the segmentation divides
     lights = _Lights(data, variance, ShapeFitter(psf, scale), segments, select, executor)
     sources = [(label[k], xy[k]) for k in chosen]
     models, population = lights.fit(sources)
@@ -165,6 +160,7 @@ def cutouts(
             fitted[k] = (*model.record, 0.0, 1.0)
         elif templates[k] is None or row not in in_pieces:
             flags[k] |= int(ForcedFlags.NOISY_SEGMENT)
+    # sources without a fit have the shape that is expected of them
     lacking = int(ForcedFlags.NOISY_SEGMENT | ForcedFlags.SHREDDED)
     for k in np.flatnonzero(flags & lacking == int(ForcedFlags.NOISY_SEGMENT)):
         shape = lights.fitter.unfitted(xy[k], population.at(segments.brightness(label[k])))
@@ -182,12 +178,12 @@ class _Lights:
         self.segments = segments
         self.select = select
         self.executor = executor
-        self.light, self.core = _smooth(data, variance, executor)
+        self.light, self.core = smooth_image(data, variance, executor)
         # what is no more than a peak of the noise hides nothing
         self.is_source = segments.ratio >= _SOURCE_SNR
 
     def fit(self, sources):
-        """The model of each (label, position); None where no light fits."""
+        """Fit the model of each (label, position); None where no light fits."""
         # the population is that of some of the sources, of all parts of the list
         step = max(1, len(sources) // _POPULATION_SIZE)
 
@@ -196,6 +192,7 @@ class _Lights:
             return self._draft(label, xy, nodes=k % step == 0)
 
         models = parallel_map(draft, range(len(sources)), executor=self.executor)
+        # the prior of each shape is that of all sources
         population = self._population(models, sources)
         models = self._joined(models, sources, population)
         return self._refined(models, sources, population), population
@@ -203,6 +200,7 @@ class _Lights:
     def _refined(self, models, sources, population, first=0):
         """Fit models again without the light of others; those that hold none of it in the first pass only."""
         for turn in range(first, _PASSES):
+            # light of sources that are not in the group is subtracted
             sum_of_all = self._paint(models)
 
             def refit(pair, sum_of_all=sum_of_all, turn=turn):
@@ -275,17 +273,17 @@ class _Lights:
     @property
     def as_seen(self):
         """Variance, labels of sources, and the smoothed image with its noise: as `continued_groups` takes them."""
-        return self.variance, self.is_source, (self.light, _GAIN)
+        return self.variance, self.is_source, (self.light, SMOOTHED_NOISE)
 
     def _of_galaxies(self, groups):
-        """The same sources, groups of labels as one segment each."""
+        """Return a copy with groups of labels as one segment each."""
         lights = copy.copy(self)
         lights.segments = self.segments.merged(groups)
         lights.is_source = lights.segments.ratio >= _SOURCE_SNR
         return lights
 
     def _put_together(self, models, sources, population, groups):
-        """Models and sources with those of each group (row numbers) in its first row."""
+        """Put models and sources of each group (row numbers) together in its first row."""
         models = list(models)
         sources = list(sources)
         gone = {sources[k][0] for group in groups for k in group}
@@ -325,10 +323,11 @@ class _Lights:
 
     def _divided(self, model, rows, labels, *, cut):
         """
-        The `DividedGalaxy` of a model of several segments, None if nothing is left of its light.
+        Divide the model of several segments (a `DividedGalaxy`), None if nothing is left of its light.
 
         ``rows`` and ``labels`` are those of the pieces. With ``cut`` it has no light on the segments of others.
         """
+        # the rectangle that holds the light of the galaxy
         template = model.cutout
         place = model.stamp
         reach = int(self.fitter.reach)
@@ -354,6 +353,7 @@ class _Lights:
             remainder = template.correction
             image += padded(remainder.data, remainder.origin, corner, shape, 0.0)
             core = padded(remainder.data != 0, remainder.origin, corner, shape, False)
+        # which segment each of its pixels is in
         labels_around = padded(self.segments.labels, (0, 0), corner, shape, 0)
         total = model.shape.flux / model.light
         if cut:
@@ -373,7 +373,8 @@ class _Lights:
         return DividedGalaxy(rows, pieces, shares, record)
 
     def _joined(self, models, sources, population):
-        """The models, profiles that hold light of each other fitted together."""
+        """Fit profiles that hold light of each other together, and return all models."""
+        # the row of each label, but for bright sources
         rows = np.full(len(self.segments.ratio), -1)
         for k, (model, (label, _)) in enumerate(zip(models, sources, strict=True)):
             if model is not None and self.segments.ratio[label] < _BRIGHT_SNR:
@@ -388,6 +389,7 @@ class _Lights:
                 return []
             labels = self.segments.labels[model.stamp]
             variance = self.variance[model.stamp]
+            # chi^2 of the model's light on each segment
             power = np.bincount(labels.ravel(), (model.image**2 / variance).ravel())
             row_links = []
             for other_label in np.flatnonzero(power > _LINKED_CHI2):
@@ -445,7 +447,7 @@ class _Lights:
         return models
 
     def _population(self, models, sources):
-        """The distribution of the shapes of all sources."""
+        """Measure the distribution of the shapes of all sources."""
         nodes = []
         points = []
         brightness = []
@@ -459,7 +461,7 @@ class _Lights:
         return self.fitter.expected.fitted(np.array(nodes), np.array(points), np.array(brightness))
 
     def _paint(self, models):
-        """The light of all models."""
+        """Draw the light of all models."""
         image = np.zeros(self.data.shape, np.float32)
         for model in models:
             if model is not None:
@@ -467,13 +469,13 @@ class _Lights:
         return image
 
     def _image(self, stamp, shape):
-        """The light of a profile on a stamp."""
+        """Draw the light of a profile on a stamp."""
         rows, columns = stamp
         size = rows.stop - rows.start, columns.stop - columns.start
         return np.float32(shape.flux) * self.fitter.profiles(size, shape.parameters)[0]
 
     def _weight(self, stamp, label, together=()):
-        """Inverse noise of the pixels that are free of others, the same for a profile, and own pixels."""
+        """Return the inverse noise of pixels that are free of others, the same for a profile, and own pixels."""
         labels = self.segments.labels[stamp]
         usable = self.segments.usable[stamp]
         is_own = usable & (labels == label)
@@ -481,12 +483,13 @@ class _Lights:
         for other_label in together:
             is_free |= usable & (labels == other_label)
         weight = 1.0 / np.sqrt(np.where(is_free, self.variance[stamp], np.inf), dtype=float)
+        # no profile is right to better than a part of the brightness
         misfit = _MISFIT * np.maximum(self.light[stamp], 0.0) * weight
         looser = weight / np.sqrt(1.0 + misfit * misfit)
         return weight, looser, is_own
 
     def _draft(self, label, xy, nodes):
-        """The profile of one source, whatever others there are; of no template yet."""
+        """Fit the profile of one source, whatever others there are; there is no template yet."""
         stamp = source_stamp(self.segments.places[label - 1], xy, self.data.shape)
         _, weight, _ = self._weight(stamp, label)
         data = self.data[stamp].astype(float)
@@ -498,6 +501,7 @@ class _Lights:
     def _model(self, label, xy, neighbor_light, population, last):
         """Fit one source again, ``others`` being the light of others on its stamp, ``last`` its last model."""
         stamp = last.stamp
+        # the profile, without the light of neighbors
         weight, looser, is_own = self._weight(stamp, label, last.labels)
         data = self.data[stamp].astype(float) - neighbor_light
         corner = rectangle_corner(stamp)
@@ -516,12 +520,15 @@ class _Lights:
         new = dataclasses.replace(last, **fitted, cutout=None, light=1.0)
         if self.select and shape.point > 0.5:
             return new
+        # is the profile as good as the image in the core?
         core = is_own & self.core[stamp]
         n = np.count_nonzero(core)
         if self.select:
+            # chi^2 of the profile on the core beyond that of noise
             excess = np.sum(((data - new.image) * weight)[core] ** 2) - n
             if excess < _EXCESS * np.sqrt(2 * max(n, 1)):
                 return self._as_profile(new)
+        # the image in the core, the profile beyond, scaled to what is seen
         profile = self._profile(shape, corner, light=shape.flux)
         origin = np.subtract(profile.origin, corner[::-1])
 
@@ -539,6 +546,7 @@ class _Lights:
         light = profile.data * scale
         image = convolve(light[None])[0]
         remainder = np.where(core, data - image, 0.0)
+        # light of the profile, of the core's difference from it, and beyond the stamp
         total = light.sum() + remainder.sum() + outer * (shape.flux - profile.data.sum())
         if not total > 0:
             return self._as_profile(new)
@@ -553,37 +561,12 @@ class _Lights:
         )
 
     def _as_profile(self, model):
-        """The same with its profile as the template."""
+        """Return a copy with its profile as the template."""
         return dataclasses.replace(
             model, cutout=self._profile(model.shape, rectangle_corner(model.stamp))
         )
 
     def _profile(self, shape, corner, light=1.0):
-        """A fitted profile on the fine grid, as far as the PSF reaches at least: steps at its edge show."""
+        """Draw a fitted profile on the fine grid, as far as the PSF reaches at least: steps at its edge show."""
         reach = min(_DRAWN_RADII * shape.axes[0], _MAX_DRAWN)
         return shape.moved(corner).drawn(light, max(self.fitter.reach, reach))
-
-
-def _smooth(data, variance, executor):
-    """The image smoothed, and where its signal-to-noise is that of a core."""
-    light = np.empty(data.shape, np.float32)
-    core = np.empty(data.shape, bool)
-    rim = round(16 * _WIDTH) + 1
-
-    def smooth(rows):
-        first = max(rows.start - rim, 0)
-        part = slice(first, rows.stop + rim)
-        inner = slice(rows.start - first, rows.stop - first)
-        usable = np.isfinite(variance[part])
-
-        def filtered(image, width):
-            values = np.where(usable, image[part], 0.0)
-            return scipy.ndimage.gaussian_filter(values, width, output=float)[inner]
-
-        smoothed = filtered(data, _WIDTH)
-        noise = filtered(variance, 4 * _WIDTH)
-        light[rows] = smoothed
-        core[rows] = (noise > 0) & (smoothed > _CORE_SNR * _GAIN * np.sqrt(noise))
-
-    parallel_map(smooth, chunks(len(data), 256), executor=executor)
-    return light, core

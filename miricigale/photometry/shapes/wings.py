@@ -40,6 +40,7 @@ def adjust_wings(stamp, radius, core, *, convolve, data, weight):
     """
     last = radius.max()
     n_nodes = max(int(np.ceil(np.log(max(last / core, 1.0)) / np.log(_NODE_RATIO))), 1)
+    # nodes at equal steps in ln radius
     place = np.log(np.maximum(radius, 1e-3) / core) / np.log(_NODE_RATIO)
     # node 0 is the core's edge, where the scale is 1
     hats = [np.clip(1.0 - np.abs(place - k), 0.0, 1.0) for k in range(1, n_nodes + 1)]

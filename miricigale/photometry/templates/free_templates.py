@@ -72,6 +72,7 @@ class FreeTemplates:
         same_source = source[matrix.row] == source[matrix.col]
         entries = matrix.data[same_source], (matrix.row[same_source], matrix.col[same_source])
         blocks = scipy.sparse.coo_array(entries, shape=matrix.shape).tocsr()
+        # the Schur complement of a source's changes
         side = blocks[n:, :n].sum(axis=1)
         lost = np.bincount(self.owner, side * factorize(blocks[n:, n:])(side), minlength=n)
         return 1.0 - lost / matrix.diagonal()[:n]
@@ -85,6 +86,7 @@ class FreeTemplates:
         total = scipy.sparse.diags_array(self.prior).tocsr()
         noisy = np.flatnonzero(self.noise > 0)
         if len(noisy):
+            # a template whose flux is off by a factor moves the right-hand side along its column
             sides = middle.tocsc()[:, noisy] @ scipy.sparse.diags_array(
                 self.flux[noisy] * np.sqrt(self.noise[noisy])
             )
@@ -152,6 +154,7 @@ def free_templates(fit, fitted):
     changes_matrix, projection, _, _ = normal_matrix(change_bank, fit.inverse_sigma, images)
     cross = cross_matrix(bank, change_bank, fit.inverse_sigma).tocsr()[rows]
     owner = owner[~fixed]
+    # changes have unit width in units of the flux of their source
     prior = np.concatenate([np.zeros(len(rows)), scale[owner] ** -2.0])
     matrix = joined_matrix(
         plain_fit.matrix, cross, changes_matrix, basis
@@ -197,6 +200,7 @@ def find_changes(fit, fitted, parts, executor):
     plain_fit = fit.fit
     kernel = fit.settings.mean_kernel
     finder = TemplateChanges(kernel.source, kernel.target, fit.settings.errors.size_scatter)
+    # only templates of enough signal can change by more than the noise
     snr = np.abs(plain_fit.flux) * np.sqrt(plain_fit.matrix.diagonal())
     is_known = np.isfinite(fitted["parameters"][:, 0]) & (fitted["galaxy"] == 0)
     wanted = np.flatnonzero(is_known & (snr > LEAST) & (plain_fit.flux > 0))
@@ -253,6 +257,7 @@ def change_basis(n, owner, light, fixed):
         Of templates and all changes, for templates and the m changes that are fitted.
     """
     k = np.arange(len(owner))
+    # a fixed change stands in the column of its template, others have one each
     column = np.where(fixed, owner, n + np.cumsum(~fixed) - 1)
     is_fitted = ~fixed
     rows = np.concatenate([np.arange(n), n + k, owner[is_fitted]])

@@ -52,6 +52,7 @@ def correlated_draws(covariance, keys, size, seed):
     draws = np.full((size, len(error)), np.nan)
     if not len(rows):
         return draws
+    # correlations instead of covariances
     inverse = scipy.sparse.diags_array(1.0 / error[rows])
     unit = (inverse @ covariance[rows][:, rows] @ inverse).tocoo()
     lone = unit.row == unit.col
@@ -71,7 +72,7 @@ def correlated_draws(covariance, keys, size, seed):
 
 
 def _cholesky(matrix):
-    """Lower factor of a sparse matrix and the place of each row in it, None if it is not positive."""
+    """Factorize a sparse matrix: lower factor and the place of each row in it, None if it is not positive."""
     try:
         lu = symmetric_lu(matrix)
     except RuntimeError:
@@ -115,6 +116,7 @@ def noise_correlation(residual, usable, weight, *, executor=None):
     step = np.s_[:: max(1, np.count_nonzero(usable) // _SOME)]
     white = residual.reshape(-1)[step] * weight.reshape(-1)[step]
     white = white[usable.reshape(-1)[step]]
+    # pixels far from the median are no noise
     middle = np.median(white)
     far = _CLIP * mad_std(white)
     level = residual.dtype.type(white[np.abs(white - middle) <= far].mean(dtype=float))
@@ -131,6 +133,7 @@ def noise_correlation(residual, usable, weight, *, executor=None):
     covariance, error = autocorrelation(rows, strips, lag, in_threads)
     if not covariance[lag, lag] > 0:
         return np.zeros((1, 1))
+    # rings of equal separation, from the outermost inward until one is significant
     index = np.arange(-lag, lag + 1)
     ring = np.maximum(np.abs(index)[:, None], np.abs(index)[None])
     for outer in range(lag, 0, -1):
@@ -148,7 +151,7 @@ def noise_correlation(residual, usable, weight, *, executor=None):
 
 def stated_correlation(factor):
     """
-    Covariance of pixels' noise of a mosaic that is too small for it to be measured.
+    Return the covariance of pixels' noise of a mosaic that is too small for it to be measured.
 
     Parameters
     ----------
@@ -188,7 +191,7 @@ _SOME = 4_000_000
 
 
 def _whitened(bank, block, inverse_sigma):
-    """A block's stamps over the noise, and their sums as `whiten_stamps` makes them."""
+    """Divide a block's stamps by the noise, and return their sums as `whiten_stamps` makes them."""
     white = dataclasses.replace(block, values=np.empty_like(block.values))
     sums = np.empty((len(block.box), 4))
 
@@ -201,7 +204,7 @@ def _whitened(bank, block, inverse_sigma):
 
 
 def _projected(bank, block, images):
-    """Sums of a block's stamps times images, shape (n, len(images))."""
+    """Sum a block's stamps times images, shape (n, len(images))."""
     out = np.empty((len(images), len(block.box)))
 
     def project_part(part):
@@ -214,7 +217,7 @@ def _projected(bank, block, images):
 
 
 def _products(bank, left_block, right_block, pairs):
-    """Sums of the products of pairs of stamps of two blocks."""
+    """Sum the products of pairs of stamps of two blocks."""
     out = np.empty(len(pairs))
 
     def multiply(part):
@@ -226,7 +229,7 @@ def _products(bank, left_block, right_block, pairs):
 
 def _walk(bank, inverse_sigma, images, spread=None):
     """
-    Products of all pairs of the whitened stamps, and their projections on images.
+    Sum products of all pairs of the whitened stamps, and their projections on images.
 
     At most those blocks are in memory that can still overlap. ``spread`` is what is done to the right-hand block
     of a pair; stamps grow by its ``lag``. Returns the matrix, (n, n), the projection, and the stamps' sums.
@@ -241,6 +244,7 @@ def _walk(bank, inverse_sigma, images, spread=None):
     live = []
     for block in bank.blocks():
         rows = slice(block.first, block.last)
+        # stamps over the noise, and their projections
         white, sums[rows] = _whitened(bank, block, inverse_sigma)
         projection[rows] = _projected(bank, white, images)
         mine = white
@@ -252,6 +256,7 @@ def _walk(bank, inverse_sigma, images, spread=None):
         live = [held for held in live if held.end + grow > block.box[0, 0]]
         live.append(white)
         for left_block in live:
+            # pairs whose stamps are in these two blocks
             low, high = np.searchsorted(pairs[:, 0], [left_block.first, left_block.last])
             met = low + np.flatnonzero(
                 (pairs[low:high, 1] >= block.first) & (pairs[low:high, 1] < block.last)
@@ -259,6 +264,7 @@ def _walk(bank, inverse_sigma, images, spread=None):
             if len(met):
                 local = pairs[met] - np.array([left_block.first, block.first], pairs.dtype)
                 products[met] = _products(bank, left_block, mine, local)
+    # the matrix is symmetric: each pair stands twice
     i, j = pairs.T.astype(np.int64)
     places = np.concatenate([np.arange(n), i, j]), np.concatenate([np.arange(n), j, i])
     data = np.concatenate([diagonal, products, products])
@@ -316,6 +322,7 @@ class _Spread:
         lag = self.lag
         if lag == 0:
             return dataclasses.replace(block, values=block.values * self._kernel[0, 0])
+        # stamps grow by the lag on each side
         box = block.box + np.array([-lag, -lag, 2 * lag, 2 * lag])
         start = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
         values = np.empty(int(start[-1]), np.float32)
@@ -337,7 +344,7 @@ class _Spread:
 
 def cross_matrix(bank, other_bank, inverse_sigma, correlation=None):
     """
-    Products, (n, m), of the whitened stamps of two banks.
+    Build the matrix, (n, m), of products of the whitened stamps of two banks.
 
     With a ``correlation`` (as of `sandwich_matrix`) the other bank's stamps are convolved with it.
     """
@@ -350,6 +357,7 @@ def cross_matrix(bank, other_bank, inverse_sigma, correlation=None):
     waiting = bank.blocks()
     live = []
     for block in other_bank.blocks():
+        # both banks go down the image together
         right_block = _whitened(other_bank, block, inverse_sigma)[0]
         if spread is not None:
             right_block = spread(right_block)
@@ -398,6 +406,7 @@ class LinearFit:
             z = solve(self.border)
         # the Schur complement of the sources, and its solution
         q = np.linalg.inv(self.corner - self.border.T @ z)
+        # the common parameters first, then the sources
         common = q @ (self.corner_rhs - z.T @ self.rhs)
         results = {"solve": solve, "_z": z, "_q": q, "common": common}
         results["flux"] = solve(self.rhs) - z @ common
@@ -411,7 +420,7 @@ class LinearFit:
 
     def covariances(self, xy, fillings, *, core, halo, pattern=None):
         """
-        Covariances of sources that overlap, and of the common parameters.
+        Calculate covariances of sources that overlap, and of the common parameters.
 
         Parameters
         ----------
@@ -445,7 +454,7 @@ class LinearFit:
         return covariances, blending
 
     def _with_common(self, local, filling):
-        """The sources' covariance with what the common parameters add, and that of those."""
+        """Add to the sources' covariance what the common parameters add, and return that of those."""
         z = self._z
         q = self._q
         if not len(q):

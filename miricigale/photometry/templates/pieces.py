@@ -26,7 +26,7 @@ class Galaxy:
 
     def of_largest(self, change):
         """
-        A change of the whole galaxy as one of its largest piece.
+        Return a change of the whole galaxy as one of its largest piece.
 
         Changes that are fitted have an amplitude of their own, in units of the galaxy's flux; a fixed one has that
         of the piece, which is its share of it.
@@ -38,14 +38,15 @@ class Galaxy:
         return dataclasses.replace(change, cutout=larger)
 
     def signal(self, matrix):
-        """Signal-to-noise of the whole galaxy by a normal matrix."""
+        """Return the signal-to-noise of the whole galaxy by a normal matrix."""
+        # power of the sum of the pieces
         block = matrix[self.rows][:, self.rows]
         return self.flux * np.sqrt(self.shares @ (block @ self.shares))
 
 
 def divided_galaxies(fitted, flux):
     """
-    Galaxies of which two pieces or more are fitted, and whose flux is positive.
+    Find galaxies of which two pieces or more are fitted, and whose flux is positive.
 
     Parameters
     ----------

@@ -4,7 +4,14 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.photometry.images.arrays import fine_wcs, local_maps, pixel_scale, sky_pixels
+from miricigale.photometry.images.arrays import (
+    fine_wcs,
+    local_maps,
+    pixel_scale,
+    pixels_to_sky,
+    sky_pixels,
+    sky_to_pixels,
+)
 from miricigale.photometry.templates.templates import BankSources, FineTemplates, TemplateBank
 from miricigale.psf import KernelField
 from miricigale.utils.units import ANGLE
@@ -32,23 +39,24 @@ class Placement:
         return cls(settings, arrays, scale, margin, xy, np.flatnonzero(np.isfinite(xy[:, 0])))
 
     def grid(self, templates):
-        """The grid (a WCS) on which templates are made."""
+        """Return the grid (a WCS) on which templates are made."""
         if templates.wcs is not None:
             return templates.wcs
         scale = self.settings.mean_kernel.pixel_scale.to_value(ANGLE)
         return fine_wcs(self.arrays.wcs, self.arrays.flux.shape, scale)
 
     def bank(self, rows, templates, executor):
-        """The `TemplateBank` of some of the sources, whose templates are given."""
+        """Make the `TemplateBank` of some of the sources, whose templates are given."""
         settings = self.settings
         wcs = self.arrays.wcs
         xy = self.xy[rows]
         shape = self.arrays.flux.shape
         grid = self.grid(templates)
-        fine_xy = np.stack(grid.world_to_pixel(templates.sky), axis=-1).reshape(-1, 2)
+        fine_xy = sky_to_pixels(templates.sky, grid)
         # points are where the high-resolution image shows them
         point = np.isfinite(templates.fitted["parameters"][:, 0]) & (templates.kind == "point")
         fine_xy[point] = templates.fitted["parameters"][point, :2]
+        # maps from image to fine pixels about each source
         poly = local_maps(xy, np.full(len(xy), self.margin / 2), wcs, grid)
         sides = None
         if settings.integrate:
@@ -60,7 +68,7 @@ class Placement:
             kernels = settings.kernel.kernels
 
             def weigh(xy):
-                return settings.kernel.weights(wcs.pixel_to_world(*xy.T).icrs)
+                return settings.kernel.weights(pixels_to_sky(xy, wcs).icrs)
 
         arrays = np.stack([kernel.array for kernel in kernels])
         targets = np.stack([kernel.target for kernel in kernels])

@@ -18,7 +18,13 @@ from miricigale.photometry.detection.catalogs import (
 )
 from miricigale.photometry.detection.cutouts import Cutout, own_segments, saturated_cores
 from miricigale.photometry.detection.prior_catalog import check_labels
-from miricigale.photometry.images.arrays import image_arrays, nearest_values, pixel_scale, same_grid
+from miricigale.photometry.images.arrays import (
+    image_arrays,
+    nearest_values,
+    pixel_scale,
+    same_grid,
+    sky_to_pixels,
+)
 from miricigale.photometry.images.fits_images import grid_text, text_grid
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.photometry.images.sky_noise import warn_of_sky
@@ -113,6 +119,7 @@ class SourceTemplates:
         n = len(self.id)
         object.__setattr__(self, "light", tuple(self.light))
         unique_ids(self.id, "id")
+        # values of columns that are not given
         nothing = {
             "sersic": np.full((n, 4), np.nan), "flags": np.zeros(n, int), "snr": np.full(n, np.nan),
             "fitted": not_fitted(n),
@@ -180,7 +187,7 @@ class SourceTemplates:
         segments = _segments(segmentation, fine.flux.shape)
         scale = pixel_scale(highres.wcs)
         psf = _psf_array(psf, scale)
-        xy = np.stack(highres.wcs.world_to_pixel(columns["sky"]), axis=-1).reshape(-1, 2)
+        xy = sky_to_pixels(columns["sky"], highres.wcs)
         warn_of_sky(fine, segments)
         label, _ = nearest_values(segments, xy)
         if "label" in catalog.colnames:
@@ -330,6 +337,7 @@ class SourceTemplates:
                 psf = part.psf
             light += part.light
             names.append(str(part.meta.get("template")))
+        # columns that all parts have
         rows = {}
         for name in _ROWS + OPTIONAL:
             values = [getattr(part, name) for part in parts]

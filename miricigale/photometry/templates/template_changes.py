@@ -102,6 +102,7 @@ class TemplateChanges:
         odds = fitted["point"]
         base = np.ones_like(profile) if cutout is None else profile
         mean = (1.0 - odds) * curves.mean(axis=0) + odds
+        # deviations of the nodes from the mean, of point and profile, and of size between bands
         steps = np.sqrt((1.0 - odds) / len(nodes)) * (curves - mean)
         scatter = (1.0 - odds) * (larger - smaller)
         steps = np.concatenate([steps, [np.sqrt(odds) * (1.0 - mean), scatter]])
@@ -111,6 +112,7 @@ class TemplateChanges:
         cxx, cxy, _, cyy = fitted["covariance"][1:3, 1:3].ravel()
         blur = np.exp(-0.5 * (cxx * kx * kx + 2 * cxy * kx * ky + cyy * ky * ky))
         limit = min_power**2 * np.sum(plan.weight * base**2)
+        # directions that are independent in the image: eigenvectors of the products of the steps
         value, vector = np.linalg.eigh((steps * plan.weight) @ steps.T)
         is_strong = value > limit
         directions = np.concatenate([vector.T[is_strong] @ steps, [mean * blur - base]])
@@ -129,7 +131,7 @@ class TemplateChanges:
         return changes, 0.0
 
     def _of_image(self, cutout, fitted, min_power):
-        """The same where the core is the image: its own noise, and the profile elsewhere."""
+        """Find changes as `of`, where the core is the image: its own noise, and the profile elsewhere."""
         profile, remainder = cutout.layers
         shape = remainder.data.shape
         corner = np.array(remainder.origin)
@@ -164,7 +166,7 @@ class TemplateChanges:
         return changes, float(pixel_variance * np.sum(weight[core] ** 2))
 
     def pixel_noise(self, cutout):
-        """Variance of ln flux by the noise of a cutout's pixels."""
+        """Return the variance of ln flux by the noise of a cutout's pixels."""
         template = self._blurred(cutout.data.astype(float))
         has_light = cutout.data != 0
         weight = 1.0 - self._blurred(template) / np.sum(template**2)
@@ -176,7 +178,7 @@ class TemplateChanges:
 
 
 def _gaussian_variance(psf):
-    """Variance along an axis (pixels^2) of a Gaussian as peaked as a PSF."""
+    """Return the variance along an axis (pixels^2) of a Gaussian as peaked as a PSF."""
     return np.sum(psf) ** 2 / (4 * np.pi * np.sum(psf**2))
 
 
@@ -189,5 +191,6 @@ def _root(covariance):
 def _steps(root, derivatives, min_power):
     """Find steps of the parameters that are independent in the image, and have enough power there."""
     flat = np.reshape(derivatives, (len(derivatives), -1))
+    # eigenvectors of the products of the images of unit deviations
     value, vector = np.linalg.eigh(root.T @ (flat @ flat.T) @ root)
     return [root @ vector[:, k] for k in range(len(value)) if value[k] > min_power]

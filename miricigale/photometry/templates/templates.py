@@ -76,6 +76,7 @@ class FineTemplates:
     @cached(maxsize=256)
     def _transfer(self, shape, convolved, place):
         if convolved:
+            # light with the sharp PSF is convolved with the matching kernel
             transfer = scipy.fft.rfft2(self.kernel[place], s=shape)
         else:
             # a profile is integrated over fine pixels already, which the PSF's samples are not
@@ -163,6 +164,7 @@ def _pieces(start, size):
     first = 0
     n = len(start) - 1
     while first < n:
+        # at least one stamp, at most so many pixels
         last = int(np.searchsorted(start, start[first] + size, side="right")) - 1
         last = min(max(last, first + 1), n)
         yield slice(first, last)
@@ -243,6 +245,7 @@ class TemplateBank:
     def _boxes(self, shape):
         """Return boxes on the image that hold the fine stamps, cut to the image."""
         half = self.fine.target.shape[1] // 2 + 1
+        # the fine rectangle that the light reaches: that of the PSF for points
         low = self.sources.fine_xy - half
         high = self.sources.fine_xy + half
         for k, cutout in enumerate(self.sources.cutout):
@@ -283,25 +286,25 @@ class TemplateBank:
         fine = dataclasses.replace(self.fine, kernel=unit, target=unit)
         return dataclasses.replace(self, sources=sources, fine=fine, weigh=None)
 
-    def reuse(self, other):
+    def reuse(self, bank):
         """
         Take the templates of another bank that are the same here: of the same numbers and places.
 
         The other forgets its own. Nothing is taken where memory does not hold both.
         """
-        kept_blocks = other._kept
-        n = min(len(self.order), len(other.order))
-        other.forget()
+        kept_blocks = bank._kept
+        n = min(len(self.order), len(bank.order))
+        bank.forget()
         if kept_blocks is None or 8.0 * self.start[-1] > self.max_bytes:
             return
         mine = self.sources
-        theirs = other.sources
+        theirs = bank.sources
         is_same = (mine.xy[:n] == theirs.xy[:n]).all(axis=1)
         is_same &= (mine.poly[:n] == theirs.poly[:n]).all(axis=(1, 2))
         self._same = {}
         for block in kept_blocks:
             for row, (start, end) in enumerate(itertools.pairwise(block.start)):
-                source = other.order[block.first + row]
+                source = bank.order[block.first + row]
                 if source < n and is_same[source]:
                     self._same[source] = block.values[start:end]
 
@@ -329,6 +332,7 @@ class TemplateBank:
         for k, cutout in enumerate(self.sources.cutout):
             if cutout is not None:
                 noise[k] = cutout.noise
+        # image pixels in fine pixels
         area = np.abs(np.linalg.det(self.sources.poly[:, :, 1:3]))
         # sums of squares of each source's kernel
         power = np.einsum("nk,kl,nl->n", self._weights, self.fine.kernel_power, self._weights)
@@ -359,6 +363,7 @@ class TemplateBank:
         start = self.start[first : last + 1] - self.start[first]
         block = Block(first, self.box[first:last], start, np.zeros(int(start[-1]), np.float32))
         sources = self.order[first:last]
+        # rows on the image, but for those that another bank has made already
         needed = (block.box[:, 2] > 0) & (block.box[:, 3] > 0)
         is_point = np.zeros(len(sources), bool)
         layers = []
@@ -392,6 +397,7 @@ class TemplateBank:
                 return
             point, member = fine.points(weights[rows])
             middle = (np.array(point.shape[2:0:-1]) - 1) / 2
+            # the middle of the PSF's coefficients is the source
             origin = self.sources.fine_xy[sources[rows]] - middle
             add(point, member, np.ones(len(rows)), rows, origin)
 
