@@ -136,11 +136,8 @@ def rim_pixels(usable):
     -------
     rim : `~numpy.ndarray` of bool, shape (ny, nx)
     """
-    (first, last), (lowest, highest) = _ends(usable)
     rows, columns = np.ogrid[: usable.shape[0], : usable.shape[1]]
-    is_beyond = (columns < first[rows]) | (columns > last[rows])
-    is_beyond |= (rows < lowest[columns]) | (rows > highest[columns])
-    return usable & binary_dilation(is_beyond)
+    return usable & binary_dilation(_beyond(_ends(usable), rows, columns))
 
 
 def _light_on(mask, values, boxes, starts):
@@ -167,6 +164,13 @@ def _ends(usable):
     return ends
 
 
+def _beyond(ends, rows, columns):
+    """Return whether pixels are before the first or after the last usable pixel of their row or column."""
+    (first, last), (lowest, highest) = ends
+    is_beyond = (columns < first[rows]) | (columns > last[rows])
+    return is_beyond | (rows < lowest[columns]) | (rows > highest[columns])
+
+
 def _cut_by_rim(usable, boxes):
     """
     Find boxes (row, column, height, width) whose unusable pixels are mostly beyond the image's data.
@@ -177,11 +181,10 @@ def _cut_by_rim(usable, boxes):
     is_cut = np.zeros(len(boxes), bool)
     if not len(boxes):
         return is_cut
-    (first, last), (lowest, highest) = _ends(usable)
+    ends = _ends(usable)
     for k, (y, x, ny, nx) in enumerate(boxes):
         rows, columns = np.ogrid[y : y + ny, x : x + nx]
-        is_beyond = (columns < first[rows]) | (columns > last[rows])
-        is_beyond |= (rows < lowest[columns]) | (rows > highest[columns])
+        is_beyond = _beyond(ends, rows, columns)
         is_cut[k] = np.sum(is_beyond) > 0.5 * np.sum(~usable[y : y + ny, x : x + nx])
     return is_cut
 

@@ -191,23 +191,13 @@ def _plane(arrays):
 
 
 @dataclasses.dataclass(eq=False)
-class _Offsets:
+class _ExposureView:
     """What `source_offsets` needs of an exposure."""
 
-    part: ExposurePart
+    bank: object
+    psf_width: float
+    inverse_sigma: np.ndarray
     flux: np.ndarray  # Of the rows of its bank.
-
-    @property
-    def bank(self):
-        return self.part.bank
-
-    @property
-    def psf_width(self):
-        return self.part.psf_width
-
-    @property
-    def inverse_sigma(self):
-        return self.part.inverse_sigma
 
 
 class _Joint:
@@ -421,7 +411,8 @@ class _Joint:
                 continue
             model = fit.model(k)
             residual = fit.residual(k, model)
-            view = _Offsets(part, fit.flux[part.row_source])
+            flux = fit.flux[part.row_source]
+            view = _ExposureView(part.bank, part.psf_width, part.inverse_sigma, flux)
             rows = np.arange(len(part.source))
             step, error, neighbor_light = source_offsets(view, residual, model, rows)
             good = np.isfinite(error) & np.isfinite(step).all(axis=1) & (error > 0)

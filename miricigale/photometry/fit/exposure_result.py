@@ -17,7 +17,7 @@ from miricigale.photometry.fit.diagnostics import canceling
 from miricigale.photometry.fit.exposure_fit import gaussian_width
 from miricigale.photometry.fit.result_table import new_source_table
 from miricigale.photometry.fit.results import ForcedPhotometryResult, crowded
-from miricigale.photometry.fit.template_fit import BLOCK_CORE, BLOCK_HALO, psf_errors
+from miricigale.photometry.fit.template_fit import psf_covariance, row_covariances
 from miricigale.photometry.images.arrays import lengths
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.utils.exceptions import PhotometryWarning, warn
@@ -335,45 +335,12 @@ def _covariances(fit):
     blending = np.full(len(fit.xy), np.nan)
     if not len(fit.rows):
         return [], None, blending
-    n = len(fit.rows)
-    fixed = fit.fit
-    changes = fit.free
-    solution = fixed
-    xy = fit.xy[fit.rows]
-    noise_filling = fit.noise_filling()
-    fillings = [noise_filling]
-    if changes is not None:
-        solution = changes.fit
-        xy = np.concatenate([xy, changes.xy])
-        if noise_filling is None:
-            # the priors are no noise
-            white = (solution.matrix - scipy.sparse.diags_array(changes.prior)).tocsr()
-            fillings = [(white, solution.border, solution.corner)]
-        n_common = len(solution.corner_rhs)
-        no_border = np.zeros((len(solution.rhs), n_common))
-        no_corner = np.zeros((n_common, n_common))
-        fillings.append((changes.filling(fixed.matrix), no_border, no_corner))
-    coo = fixed.matrix.tocoo()
-    pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=solution.matrix.shape)
-    covariances, all_blending = solution.covariances(
-        xy, fillings, core=BLOCK_CORE / fit.scale, halo=BLOCK_HALO / fit.scale, pattern=pattern
-    )
-    # by noise, of fluxes alone: those of changes do not count
-    noise, common = covariances[0]
-    noise = noise[:n][:, :n]
-    blending[fit.rows] = all_blending[:n]
-    template = scipy.sparse.csr_array((n, n))
-    if changes is not None:
-        blending[fit.rows] *= np.sqrt(changes.remaining_power())
-        template, change_common = covariances[1]
-        template = template[:n][:, :n]
-        common = common + change_common
-    is_image = [light is not None and light.kind == "cutout" for light in fit.cutouts()]
-    error = psf_errors(fit, np.array(is_image, bool))[fit.rows]
-    coo = noise.tocoo()
-    # errors by the PSF are fully correlated
-    data = error[coo.row] * error[coo.col]
-    psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
+    filling = fit.noise_filling()
+    if filling is None and fit.free is not None:
+        filling = fit.free.white_filling()
+    noise, template, common, row_blending = row_covariances(fit, fit.xy[fit.rows], filling)
+    blending[fit.rows] = row_blending
+    psf = psf_covariance(fit, fit.cutouts(), noise)
     return [noise, template, psf], common, blending
 
 

@@ -335,10 +335,11 @@ class ForcedPhotometryResult(Tabular):
 
     def _row(self, key):
         """Return the row of the source of an id."""
-        if not np.any(self.id == key):
+        rows = np.flatnonzero(self.id == key)
+        if not len(rows):
             msg = f"no source with the id {key!r}"
             raise KeyError(msg)
-        return int(np.argmax(self.id == key))
+        return int(rows[0])
 
     def correlation(self, first, second):
         """

@@ -37,26 +37,61 @@ def fit_covariances(fit, correlation):
     blending : `~numpy.ndarray`, shape (n,)
         Formal error over that of the source alone.
     """
-    n = len(fit.rows)
-    g = len(fit.columns)
-    fixed = fit.fit
-    changes = fit.free
-    solution = fixed
-    xy = fit.bank.xy[fit.rows]
-    fillings = [None]
+    filling = None
     if correlation is not None:
-        fillings = [_sandwich(fit, correlation)]
+        filling = _sandwich(fit, correlation)
+    elif fit.free is not None:
+        filling = fit.free.white_filling()
+    noise, template, common, blending = row_covariances(fit, fit.bank.xy[fit.rows], filling)
+    if len(fit.pairs):
+        # that of the sum of two components
+        first, second = np.searchsorted(fit.rows, fit.pairs.T)
+        matrix = fit.fit.matrix
+        middle = matrix
+        if filling is not None:
+            middle = filling[0]
+        formal_error = np.sqrt(middle.diagonal()[: len(fit.rows)]) / matrix.diagonal()
+        cross_terms = matrix_elements(noise, first, second)
+        variance = noise.diagonal()
+        blending[first] = (
+            np.sqrt(variance[first] + variance[second] + 2 * cross_terms) / formal_error[first]
+        )
+        blending[second] = blending[first]
+    parts = fit.bank.parts(np.arange(len(fit.flux)))
+    return noise, template, psf_covariance(fit, parts, noise), common, blending
+
+
+def row_covariances(fit, xy, filling):
+    """
+    Calculate the covariances of the fitted rows by noise and by errors of the templates.
+
+    Parameters
+    ----------
+    fit : `TemplateFit` or `~miricigale.photometry.fit.exposure_fit.ExposureFit`
+        The fit.
+    xy : `~numpy.ndarray`, shape (n, 2)
+        Positions of the rows in pixels.
+    filling : tuple or None
+        Covariance of the right-hand side by noise: matrix, border, corner; None for the normal equations' own.
+
+    Returns
+    -------
+    noise, template : `~scipy.sparse.csr_array`, shape (n, n)
+    common : `~numpy.ndarray`, shape (g, g)
+        Of the common parameters.
+    blending : `~numpy.ndarray`, shape (n,)
+        Formal error over that of the source alone.
+    """
+    n = len(fit.rows)
+    changes = fit.free
+    solution = fit.fit
+    fillings = [filling]
     if changes is not None:
         solution = changes.fit
         xy = np.concatenate([xy, changes.xy])
-        if correlation is None:
-            # the priors are no noise
-            white = (solution.matrix - scipy.sparse.diags_array(changes.prior)).tocsr()
-            fillings = [(white, solution.border, solution.corner)]
-        no_border = np.zeros((len(solution.rhs), g))
-        no_corner = np.zeros((g, g))
-        fillings.append((changes.filling(fixed.matrix), no_border, no_corner))
-    coo = fixed.matrix.tocoo()
+        fillings.append(changes.filling(fit.fit.matrix))
+    # elements for pairs of sources, not for their changes
+    coo = fit.fit.matrix.tocoo()
     pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=solution.matrix.shape)
     covariances, blending = solution.covariances(
         xy, fillings, core=BLOCK_CORE / fit.scale, halo=BLOCK_HALO / fit.scale, pattern=pattern
@@ -70,27 +105,20 @@ def fit_covariances(fit, correlation):
         template, change_common = covariances[1]
         template = template[:n][:, :n]
         common = common + change_common
-    if len(fit.pairs):
-        # that of the sum of two components
-        first, second = np.searchsorted(fit.rows, fit.pairs.T)
-        middle = fixed.matrix
-        if fillings[0] is not None:
-            middle = fillings[0][0]
-        formal_error = np.sqrt(middle.diagonal()[:n]) / fixed.matrix.diagonal()
-        cross_terms = matrix_elements(noise, first, second)
-        variance = noise.diagonal()
-        blending[first] = (
-            np.sqrt(variance[first] + variance[second] + 2 * cross_terms) / formal_error[first]
-        )
-        blending[second] = blending[first]
-    parts = fit.bank.parts(np.arange(len(fit.flux)))
-    image = np.array([cutout is not None and cutout.kind == "cutout" for cutout in parts], bool)
-    # errors of fluxes by the PSF are fully correlated
+    return noise, template, common, blending
+
+
+def psf_covariance(fit, cutouts, noise):
+    """
+    Calculate the covariance of the fitted rows by the error of the PSF, which is fully correlated.
+
+    ``cutouts`` are the templates of all rows, None for points; ``noise``, (n, n), has the pairs that are wanted.
+    """
+    is_image = [cutout is not None and cutout.kind == "cutout" for cutout in cutouts]
+    error = psf_errors(fit, np.array(is_image, bool))[fit.rows]
     coo = noise.tocoo()
-    error = psf_errors(fit, image)[fit.rows]
     data = error[coo.row] * error[coo.col]
-    psf = scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
-    return noise, template, psf, common, blending
+    return scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=noise.shape).tocsr()
 
 
 def psf_errors(fit, image):

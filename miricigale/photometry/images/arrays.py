@@ -42,9 +42,9 @@ class FitArrays:
     measured_noise: bool  # Whether the noise was measured on the image for want of an uncertainty.
     noise_correction: float = 1.0  # As the image states it (`ImageFacts`).
 
-    def new(self, dtype=np.float32):
+    def new(self):
         """Make a new image of zeros."""
-        return np.zeros(self.usable.shape, dtype)
+        return np.zeros(self.usable.shape, np.float32)
 
     def areas(self, out=None):
         """Calculate the ``area`` of `ImageArrays` (uJy per MJy/sr) once more."""

@@ -30,15 +30,15 @@ def parsed_unit(text):
 
     Without pixels, as values are of one; None if it means none.
     """
+    if not text:
+        return None
     # nanomaggies, which astropy ties to no flux
-    flux = flux_unit(text) if text else None
+    flux = flux_unit(text)
     if isinstance(flux, u.UnitBase):
         return flux
     replaced = text
     for pattern, name in _COUNTS:
         replaced = re.sub(pattern, name, replaced, flags=re.IGNORECASE)
-    if not text:
-        return None
     # S alone would be siemens
     for name in (replaced, text):
         with warnings.catch_warnings():

@@ -79,7 +79,7 @@ class FreeTemplates:
 
     def filling(self, middle):
         """
-        Return the covariance that errors of templates add to the right-hand side, shape (n + m, n + m).
+        Return the covariance that errors of templates add to the right-hand side: matrix, border and corner.
 
         ``middle`` is the normal matrix of the templates, (n, n).
         """
@@ -95,7 +95,14 @@ class FreeTemplates:
             total = total + scipy.sparse.coo_array(
                 (block.data, (block.row, block.col)), shape=(n, n)
             )
-        return total.tocsr()
+        n_common = len(self.fit.corner_rhs)
+        no_border = np.zeros((len(self.prior), n_common))
+        return total.tocsr(), no_border, np.zeros((n_common, n_common))
+
+    def white_filling(self):
+        """Return the covariance of the right-hand side by white noise: the priors are no noise."""
+        matrix = (self.fit.matrix - scipy.sparse.diags_array(self.prior)).tocsr()
+        return matrix, self.fit.border, self.fit.corner
 
     def sandwich(self, fit, correlation, middle, border, images):
         """
