@@ -98,28 +98,31 @@ class FittedStar:
         at = (y + half, x + half)
         light, dx, dy, *terms = _core.cubic_splines(images, *at)
         light = light + (slope @ star.place) @ terms[:_SLOPED]
-        own = star.area * np.stack([light, -dx, -dy, np.ones_like(x)], axis=1)
+        columns = star.area * np.stack([light, -dx, -dy, np.ones_like(x)], axis=1)
         weight = 1.0 / sigma
         for _ in range(2):
-            found = np.linalg.lstsq(own * weight[:, None], data * weight)[0]
-            weight = 1.0 / np.hypot(sigma, _SCATTER * found[0] * own[:, 0])
+            solution = np.linalg.lstsq(columns * weight[:, None], data * weight)[0]
+            weight = 1.0 / np.hypot(sigma, _SCATTER * solution[0] * columns[:, 0])
+        flux = solution[0]
+        # the shifts are in units of the flux; steps are of a cell at most
+        shift = solution[1:3] / (flux if flux > 0 else np.inf)
         self.star = star
         self.at = at
-        self.flux = found[0]
+        self.flux = flux
         self.weight = weight
-        self.offset = offset + np.clip(found[1:3] / np.where(found[0] > 0, found[0], np.inf), -1, 1)
-        self.residual = data - own @ found
+        self.offset = offset + np.clip(shift, -1, 1)
+        self.residual = data - columns @ solution
         #: What a change of the PSF by 1 is in each weighted pixel.
-        self.scale = found[0] * star.area * weight
-        self._basis = np.linalg.qr(own * weight[:, None])[0]
-        self._left = self._apart(self.residual * weight)
+        self.scale = flux * star.area * weight
+        self._basis = np.linalg.qr(columns * weight[:, None])[0]
+        self._open_residual = self._without_own(self.residual * weight)
         sloped = np.multiply.outer(star.place, terms[:_SLOPED]).reshape(-1, x.size)
-        self.columns = self._apart((self.scale * np.concatenate([terms, sloped])).T)
+        self.columns = self._without_own((self.scale * np.concatenate([terms, sloped])).T)
         self.normal = self.columns.T @ self.columns
-        self.right = self.columns.T @ self._left
+        self.right = self.columns.T @ self._open_residual
         light = np.maximum(light, 0.0)
         self.chi2 = float(light @ (self.residual * weight) ** 2 / light.sum())
-        self.snr = found[0] * np.sqrt(np.sum((own[:, 0] / sigma) ** 2))
+        self.snr = flux * np.sqrt(np.sum((columns[:, 0] / sigma) ** 2))
 
     @property
     def dof(self):
@@ -132,13 +135,13 @@ class FittedStar:
         power = max(self.normal[0, 0], 1e-30)
         return self.right[0] / power, power**-0.5
 
-    def _apart(self, values):
+    def _without_own(self, values):
         """What the star's own parameters leave of weighted pixels."""
         return values - self._basis @ (self._basis.T @ values)
 
     def misfit(self, change=0.0):
         """Chi-square if the weighted pixels of the model change by this."""
-        return float(np.sum(self._apart(self._left - change) ** 2))
+        return float(np.sum(self._without_own(self._open_residual - change) ** 2))
 
 
 def fitted_stars(psf, stars, *, slope=None, offsets=None):
@@ -170,10 +173,11 @@ def fitted_stars(psf, stars, *, slope=None, offsets=None):
         offsets = np.zeros((len(stars), 2))
     else:
         steps = 1
-        offsets = offsets
     for _ in range(steps):
-        fits = [FittedStar(*image, images, slope) for image in zip(stars, offsets, strict=True)]
-        offsets = [image.offset for image in fits]
+        fits = []
+        for star, offset in zip(stars, offsets, strict=True):
+            fits.append(FittedStar(star, offset, images, slope))
+        offsets = [fit.offset for fit in fits]
     return fits
 
 
@@ -226,32 +230,39 @@ class StarPSF:
         if len(stars) >= WHOLE:
             units = stars
         else:
-            units = [half for one in stars for half in one.halves()]
+            units = [half for star in stars for half in star.halves()]
         self.kind = "model"
         self._cells = 0.0
         self._state = np.zeros(len(_SPREAD))
         self.before = self._fitted(stars)
         fits, without, inverse = self._solved(units, 0)
-        self.chi2 = {"model": sum(one.misfit() for one in fits)}
-        self.dof = sum(one.dof for one in fits)
+        self.chi2 = {"model": sum(fit.misfit() for fit in fits)}
+        self.dof = sum(fit.dof for fit in fits)
         for kind, n, k in (("terms", 1, len(TERMS)), ("field", _FIELD, len(_SPREAD))):
             if len(stars) < max(n, least):
                 continue
-            kept = self._state
-            found = self._solved(units, k)
-            left = zip(*found[:2], strict=True)
-            if self._better(kind, sum(fit.misfit(fit.columns @ step) for fit, step in left)):
-                fits, without, inverse = found
+            state_before = self._state
+            kind_fits, kind_without, kind_inverse = self._solved(units, k)
+            # each star is judged by the correction that the others ask for
+            chi2 = 0.0
+            for fit, step in zip(kind_fits, kind_without, strict=True):
+                chi2 += fit.misfit(fit.columns @ step)
+            if self._better(kind, chi2):
+                fits = kind_fits
+                without = kind_without
+                inverse = kind_inverse
             else:
-                self._state = kept
+                self._state = state_before
         image = self.at()
         changes = np.tensordot(without[:, : len(TERMS)], derivatives(image, self._fwhm), 1)
         if self.kind != "model" and len(stars) >= _EFFECTIVE:
-            whole, cells = self._common_cells(fits, image)
-            at = [f.scale * map_coordinates(one, f.at) for one, f in zip(cells, fits, strict=True)]
-            if self._better("effective", sum(map(FittedStar.misfit, fits, at))):
-                self._cells = whole
-                changes = changes + cells - whole
+            common, cells = self._common_cells(fits, image)
+            chi2 = 0.0
+            for fit, cells_of_others in zip(fits, cells, strict=True):
+                chi2 += fit.misfit(fit.scale * map_coordinates(cells_of_others, fit.at))
+            if self._better("effective", chi2):
+                self._cells = common
+                changes = changes + cells - common
         self.after = self._fitted(stars)
         self.terms = self._state[: len(TERMS)]
         self.terms_err = np.sqrt(np.diag(inverse))
@@ -283,9 +294,11 @@ class StarPSF:
         # in steps, since changes are linear for small ones
         for _ in range(_STEPS if terms.any() else 0):
             image = image + np.tensordot(terms / _STEPS, derivatives(image, self._fwhm), 1)
-        more = self.slope @ place
-        if more.any():
-            image = image + np.tensordot(more, derivatives(image, self._fwhm)[:_SLOPED], 1)
+        terms_at_place = self.slope @ place
+        if terms_at_place.any():
+            image = image + np.tensordot(
+                terms_at_place, derivatives(image, self._fwhm)[:_SLOPED], 1
+            )
         return image + self._cells
 
     @property
@@ -301,29 +314,29 @@ class StarPSF:
         self._state = np.zeros(len(_SPREAD))
         offsets = np.zeros((len(units), 2))
         prior = np.diag(_SPREAD**-2.0)
-        free = np.ix_(*[np.arange(k)] * 2)
+        fitted_terms = np.ix_(np.arange(k), np.arange(k))
         inverse = np.zeros_like(prior)
 
         def step(normal, right):
-            inverse[free] = np.linalg.inv((normal + prior)[free])
+            inverse[fitted_terms] = np.linalg.inv((normal + prior)[fitted_terms])
             return inverse @ (right - prior @ self._state)
 
         for last in np.arange(_STEPS + 1) == _STEPS:
             fits = self._fitted(units, offsets)
-            offsets = [one.offset for one in fits]
-            normal = sum(one.normal for one in fits)
-            right = sum(one.right for one in fits)
+            offsets = [fit.offset for fit in fits]
+            normal = sum(fit.normal for fit in fits)
+            right = sum(fit.right for fit in fits)
             if not last:
                 self._state = self._state + step(normal, right)
-        without = np.array([step(normal - one.normal, right - one.right) for one in fits])
+        without = np.array([step(normal - fit.normal, right - fit.right) for fit in fits])
         step(normal, right)
         return fits, without, inverse[: len(TERMS), : len(TERMS)].copy()
 
     def _better(self, kind, chi2):
         """Whether a kind of correction is confirmed, which is then the kind."""
         self.chi2[kind] = chi2
-        known = self.chi2[self.kind]
-        better = chi2 < known - max(_EVIDENCE, _PART * known)
+        chi2_before = self.chi2[self.kind]
+        better = chi2 < chi2_before - max(_EVIDENCE, _PART * chi2_before)
         if better:
             self.kind = kind
         return better
@@ -342,12 +355,18 @@ class StarPSF:
                 cell = np.ravel_multi_index((corner + [[dy], [dx]])[:, inside], shape)
                 weight = (share * fit.scale**2)[inside]
                 values = fit.residual[inside] / (fit.flux * fit.star.area)
-                pair += [np.bincount(cell, one, image.size) for one in (weight * values, weight)]
+                pair[0] += np.bincount(cell, weight * values, image.size)
+                pair[1] += np.bincount(cell, weight, image.size)
             sums.append(pair.reshape(2, *shape))
         # a PSF that ends within its grid is 0 beyond
         light = np.maximum(gaussian_filter(image, self._fwhm / 2.3548), 1e-9 * image.max())
         prior = (_CELLS * light) ** -2.0
         total = np.sum(sums, axis=0)
-        found = [(total[0] - a) / (total[1] - b + prior) for a, b in ((0, 0), *sums)]
-        found = [one - one.sum() * image for one in found]
-        return found[0], np.array(found[1:])
+
+        def mean_change(values, weight):
+            """Weighted mean of the residuals by cell, at constant light."""
+            mean = values / (weight + prior)
+            return mean - mean.sum() * image
+
+        without_each = [mean_change(total[0] - part[0], total[1] - part[1]) for part in sums]
+        return mean_change(total[0], total[1]), np.array(without_each)
