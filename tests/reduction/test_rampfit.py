@@ -94,6 +94,43 @@ def test_neighbors_of_a_large_jump_are_cut_at_the_same_group():
     assert_array_equal(alone.flags == DQ.JUMP_DET, expected == DQ.JUMP_DET)
 
 
+def ray_tracks(n_rays, n_group, n, *, seed):
+    """Charge in DN of straight tracks that fade towards their end, by the group in which they come."""
+    rng = np.random.default_rng(seed)
+    charge = np.zeros((n_group, n, n))
+    for _ in range(n_rays):
+        length = rng.exponential(2.5)
+        angle = rng.uniform(0, 2 * np.pi)
+        n_steps = max(int(20 * length), 1)
+        steps = np.linspace(0, length, n_steps)
+        # charge diffuses by a third of a pixel, and a particle that stops releases less and less
+        x, y = rng.uniform(3, n - 3, (2, 1)) + rng.normal(0, 0.35, (2, n_steps))
+        x += steps * np.cos(angle)
+        y += steps * np.sin(angle)
+        weight = np.linspace(1, 0.03, n_steps) * rng.gamma(2, 0.5, n_steps)
+        inside = (x > 0) & (x < n) & (y > 0) & (y < n)
+        total = 10 ** rng.normal(3.2, 0.5) * max(length, 0.3) / GAIN
+        place = (rng.integers(1, n_group), y[inside].astype(int), x[inside].astype(int))
+        np.add.at(charge, place, (total * weight / weight.sum())[inside])
+    return charge
+
+
+def test_faint_ends_of_tracks_are_cut_with_their_neighbors():
+    """Pulls of the pixels that rays hit, of rays that are not those of the simulated detector."""
+    charge = ray_tracks(700, 40, 160, seed=3)
+    data = simulate(np.full((160, 160), 10.0), 1, 40, seed=2, dtype=np.float32)
+    data[0] += np.cumsum(charge, axis=0)
+    hit = charge.sum(axis=0) * GAIN > 30
+    scatter = {}
+    for threshold in (5.0, None):
+        fit = fitted(data, **OPTIONS, neighbor_threshold=threshold)
+        pull = (fit.rate - 10.0) / np.sqrt(fit.var_poisson + fit.var_read)
+        scatter[threshold] = pull[hit].std()
+        assert pull[~hit].std() == pytest.approx(1, abs=0.02)
+    assert scatter[5.0] < 1.05
+    assert scatter[None] > 1.1
+
+
 def test_what_leaked_into_a_pixel_does_not_cut_its_neighbors():
     data = simulate(np.full((9, 11), 10.0), 1, 30, seed=1)
     # a hit of some 300 sigma whose leak of 3 % stands above 10 sigma, and beside it a hit of its own

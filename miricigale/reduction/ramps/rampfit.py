@@ -126,7 +126,7 @@ def fit_groups(
     first_group=0,
     last_group=None,
     jump_threshold=5.0,
-    neighbor_threshold=10.0,
+    neighbor_threshold=5.0,
     shower_threshold=None,
     poisson_factor=1.0,
     n_frames=1,
@@ -250,9 +250,9 @@ def fit_groups(
     elif np.shape(group_dq) != data.shape or np.asarray(group_dq).dtype != np.uint8:
         got = f"{np.asarray(group_dq).dtype}, shape {np.shape(group_dq)}"
         raise argument_error("group_dq", f"uint8, of shape {data.shape}", got)
-    group_dq = _plain(group_dq)
+    group_dq = _read_only(group_dq)
 
-    data = _plain(data)
+    data = _read_only(data)
     variance = read_variance(read_noise, n_frames, rounded=data.dtype.kind in "iu")
     out = tuple(np.full((ny, nx), np.nan, np.float32) for _ in range(3))
     out += tuple(np.zeros((ny, nx), kind) for kind in (np.int16, np.int16, np.int64))
@@ -283,13 +283,13 @@ def fit_groups(
             showers = find_showers(
                 data, events, usable, shower, first_group=first_group, last_group=last_group
             )
-        parts = list(_again(events, neighbor, usable, n_diff, showers))
+        parts = list(_cut_again(events, neighbor, usable, n_diff, showers))
         parallel_map(fit_part, parts, executor=executor)
 
     return fit_result(*out, events, first_group)
 
 
-def _plain(array):
+def _read_only(array):
     """One type of array for the compiled kernels, also of arrays that own no memory."""
     array = np.ascontiguousarray(array).view()
     array.flags.writeable = False
@@ -336,14 +336,14 @@ def _drift(values, shape):
 def _groups(values, name, shape, *, n_least=0):
     """Maps of groups and integrations, float32; what is not finite there is taken as zero."""
     if values is None:
-        return _plain(np.zeros((1, 0, 1, 1), np.float32))
+        return _read_only(np.zeros((1, 0, 1, 1), np.float32))
     values = np.asarray(values, np.float32)
     if values.ndim != 4 or values.shape[2:] != shape[2:] or values.shape[1] < n_least:
         wanted = f"of shape (n, {n_least} or more, {shape[2]}, {shape[3]})"
         raise argument_error(name, wanted, f"shape {values.shape}")
     if not np.isfinite(values).all():
         values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
-    return _plain(values)
+    return _read_only(values)
 
 
 def fit_result(rate, var_poisson, var_read, n_used, n_jump, flags, events, first_group):
@@ -364,7 +364,7 @@ def threshold(value, name):
     return float(value)
 
 
-def _again(events, threshold, usable, n_diff, showers):
+def _cut_again(events, threshold, usable, n_diff, showers):
     """
     Yield the pixels that are fitted once more, and where they are to be cut.
 

@@ -42,10 +42,10 @@ class RampSettings:
     --------
     >>> from miricigale.reduction import RampSettings, Reducer
     >>> Reducer(ramps=RampSettings(shower_threshold=5)).ramps.neighbor_threshold
-    10.0
+    5.0
     """
 
-    neighbor_threshold: float | None = 10.0
+    neighbor_threshold: float | None = 5.0
     shower_threshold: float | None = None
     reference_correction: bool | str | None = None
     ipc: bool | None = None
