@@ -15,7 +15,7 @@ from miricigale.instrument import (
 )
 from miricigale.reduction.combine.align import align_images, visit_of
 from miricigale.reduction.combine.combine import combine, drizzle, subtract_dithers
-from miricigale.reduction.images.files import opened, several
+from miricigale.reduction.images.files import as_exposure, exposure_list
 from miricigale.reduction.images.images import own_grid, with_data
 from miricigale.reduction.images.repeats import ExposureRecord
 from miricigale.reduction.ramps.slopes import fit_slopes
@@ -175,7 +175,7 @@ class Reducer(Interactive):
         ValueError
             If it is no ramp, or fewer than two groups are left.
         """
-        ramp = opened(ramp)
+        ramp = as_exposure(ramp)
         return fit_slopes(self, ramp, maps_of(self, ramp), progress_bar)
 
     def fit_ramp(self, ramp, *, planes=False, progress_bar=False):
@@ -201,7 +201,7 @@ class Reducer(Interactive):
             ``planes`` it is the ``image`` of an `ImageFile`, whose ``planes`` are ``VAR_POISSON``
             and ``VAR_RNOISE``, (DN/s)^2: what `write_image` writes as a ``_rate``.
         """
-        ramp = opened(ramp)
+        ramp = as_exposure(ramp)
         maps = maps_of(self, ramp)
         rate = rate_image(self, ramp, maps, fit_slopes(self, ramp, maps, progress_bar))
         if planes:
@@ -225,7 +225,7 @@ class Reducer(Interactive):
             As `fit_ramp` returns them, one for each integration; the references are those of
             the exposure. `write_image` makes a ``_rateints`` of the list.
         """
-        ramp = opened(ramp)
+        ramp = as_exposure(ramp)
         check_that(isinstance(ramp, Ramp), "ramp", "a Ramp", type(ramp).__name__)
         maps = maps_of(self, ramp)
         rates = []
@@ -263,7 +263,7 @@ class Reducer(Interactive):
         cal : `~astropy.nddata.CCDData`
             MJy/sr.
         """
-        rate = opened(rate)
+        rate = as_exposure(rate)
         facts = ImageFacts.of(rate)
         for key in ("filter", "subarray"):
             if getattr(facts, key) is None:
@@ -296,7 +296,7 @@ class Reducer(Interactive):
         background : `Background`
             What was taken off, a level of 0 if it is not known.
         """
-        image = opened(image)
+        image = as_exposure(image)
         background = subtractable(estimate_background(image, **self.background.mesh))
         return remove_background(image, background, **self.background.negative), background
 
@@ -344,7 +344,7 @@ class Reducer(Interactive):
             If the images are not surface brightness of one filter, or the grid has no shape
             or lies elsewhere on the sky.
         """
-        images = [opened(image) for image in several(images)]
+        images = [as_exposure(image) for image in exposure_list(images)]
         if wcs is None:
             wcs = own_grid(images, _SCALE)
         else:
@@ -384,7 +384,7 @@ class Reducer(Interactive):
             MJy/sr, background subtracted.
         background : `Background`
         """
-        exposure = opened(exposure)
+        exposure = as_exposure(exposure)
         if isinstance(exposure, (Ramp, Charge)):
             exposure = self.fit_ramp(exposure)
         wanted = "a Ramp, a Charge, CCDData or a path"
@@ -444,8 +444,10 @@ class Reducer(Interactive):
         backgrounds = []
         name = None
         record = ExposureRecord()
-        for number, ramp in enumerate(progress(several(ramps), show=progress_bar, desc="reduce")):
-            ramp = opened(ramp)
+        for number, ramp in enumerate(
+            progress(exposure_list(ramps), show=progress_bar, desc="reduce")
+        ):
+            ramp = as_exposure(ramp)
             record.check(f"exposure {number + 1}", ramp)
             rate, subtracted, background = self.reduce(ramp)
             del ramp

@@ -54,15 +54,20 @@ def drizzle(settings, images, wcs, variances=()):
     return drizzle_images(images, wcs, pixfrac=settings.pixfrac, **options), images
 
 
-def subtract_dithers(reducer, images, alone=None, wcs=None):
-    """As `~miricigale.reduction.Reducer.subtract_dithers`; ``alone`` is the background of each image by itself."""
-    if alone is None:
-        alone = [estimate_background(im, warn=False, **reducer.background.mesh) for im in images]
+def subtract_dithers(reducer, images, single_backgrounds=None, wcs=None):
+    """As `~miricigale.reduction.Reducer.subtract_dithers`, also with the background of each image by itself."""
+    if single_backgrounds is None:
+        single_backgrounds = []
+        for image in images:
+            background = estimate_background(image, warn=False, **reducer.background.mesh)
+            single_backgrounds.append(background)
     backgrounds = []
-    for background in dither_backgrounds(images, alone, wcs=wcs):
+    for background in dither_backgrounds(images, single_backgrounds, wcs=wcs):
         backgrounds.append(subtractable(background))
-    pairs = zip(images, backgrounds, strict=True)
-    return [remove_background(*pair, **reducer.background.negative) for pair in pairs], backgrounds
+    subtracted = []
+    for image, background in zip(images, backgrounds, strict=True):
+        subtracted.append(remove_background(image, background, **reducer.background.negative))
+    return subtracted, backgrounds
 
 
 def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes=()):

@@ -370,8 +370,8 @@ def _meta(header, path):
     name, readout, part, meta["dither"] = exposure_keywords(header)
     if part not in subarrays():
         part = None
-    stated = {"filter": name, "subarray": part, "readout": readout}
-    meta |= {key: value for key, value in stated.items() if value is not None}
+    mode = {"filter": name, "subarray": part, "readout": readout}
+    meta |= {key: value for key, value in mode.items() if value is not None}
     meta |= ExposureHistory.from_header(header).meta()
     meta["source"] = path.name
     return meta
@@ -396,16 +396,16 @@ def _wcs(hdus, header, meta):
     return wcs
 
 
-def opened(given):
+def as_exposure(exposure):
     """An exposure of its file or data model; anything else itself."""
-    if is_data_model(given):
-        return read_data_model(given, open_exposure)
-    if isinstance(given, (str, os.PathLike)):
-        return open_exposure(given)
-    return given
+    if is_data_model(exposure):
+        return read_data_model(exposure, open_exposure)
+    if isinstance(exposure, (str, os.PathLike)):
+        return open_exposure(exposure)
+    return exposure
 
 
-def several(exposures):
+def exposure_list(exposures):
     """Exposures of one, of a pattern of files, or of several."""
     if isinstance(exposures, str) and glob.has_magic(exposures) and not os.path.exists(exposures):
         paths = sorted(glob.glob(os.path.expanduser(exposures)))

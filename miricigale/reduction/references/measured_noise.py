@@ -149,10 +149,10 @@ def measure_noise(ramp):
     n_int, n_group = ramp.shape[:2]
     check_that(n_group >= 9, "ramp", "one of nine groups at least, to measure its noise", n_group)
     dq = ramp.pixel_dq.astype(np.int64)
-    pixels = _few((dq & (_BAD | DQ.REFERENCE_PIXEL)) == 0)
+    pixels = _sampled_pixels((dq & (_BAD | DQ.REFERENCE_PIXEL)) == 0)
     wanted = f"one with {_FEWEST} usable pixels, to measure its noise"
     check_that(pixels[0].size >= _FEWEST, "ramp", wanted, pixels[0].size)
-    blind = _few((dq & (_BAD_REFERENCE | DQ.REFERENCE_PIXEL)) == DQ.REFERENCE_PIXEL)
+    blind = _sampled_pixels((dq & (_BAD_REFERENCE | DQ.REFERENCE_PIXEL)) == DQ.REFERENCE_PIXEL)
     rows = []
     dark = []
     # the first integration settles, and is left out where there are others
@@ -204,7 +204,7 @@ def measure_noise(ramp):
     )
 
 
-def _few(mask):
+def _sampled_pixels(mask):
     """Rows and columns of at most so many pixels of a mask, evenly."""
     ys, xs = np.nonzero(mask)
     chosen = slice(None, None, max(1, ys.size // _PIXELS))

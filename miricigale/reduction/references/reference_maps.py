@@ -30,7 +30,7 @@ def _wanted(name, extension):
     return f"a {name.replace('_', ' ')} reference of CRDS (FITS with {extension})"
 
 
-def _other(path, name, problem):
+def _mismatch(path, name, problem):
     """Error that says why a file is no reference for an exposure."""
     return data_error(
         path, f"is no {name.replace('_', ' ')} reference for this exposure: {problem}"
@@ -60,10 +60,10 @@ def _header(hdus, path, name, extension, exposure=None):
         else:
             allowed = _ANY
         if keyword_value not in (value, *allowed):
-            raise _other(path, name, f"its {key} is {keyword_value}, not {value}")
+            raise _mismatch(path, name, f"its {key} is {keyword_value}, not {value}")
     for key, values in {"NFRAMES": _frame_counts(exposure), "GROUPGAP": (0,)}.items():
         if name in ("reset", "dark") and header.get(key, values[0]) not in values:
-            raise _other(path, name, f"its {key} is {header[key]}, not {values[0]}")
+            raise _mismatch(path, name, f"its {key} is {header[key]}, not {values[0]}")
     return header
 
 
@@ -93,7 +93,7 @@ def _cut(path, name, array, header, exposure):
     ny, nx = part.shape
     if x < 0 or y < 0 or y + ny > array.shape[-2] or x + nx > array.shape[-1]:
         covered = f"{array.shape[-2:]} pixels from column {origin[0] + 1}, row {origin[1] + 1} on"
-        raise _other(path, name, f"it covers {covered}, and not {part.name}")
+        raise _mismatch(path, name, f"it covers {covered}, and not {part.name}")
     return array[..., y : y + ny, x : x + nx]
 
 

@@ -235,9 +235,9 @@ def estimate_background(image, *, method="masked", box=64, filter_size=3, plane=
     data = np.where(mask, 0, data if data.dtype.kind == "f" else data.astype(float))
     correlation = ImageFacts.of(image).noise_correction
     if method == "sep":
-        background = _plain(data, mask, int(box), int(filter_size), correlation)
+        background = _sep_background(data, mask, int(box), int(filter_size), correlation)
     else:
-        noise_map = _stated(image, mask)
+        noise_map = _error_map(image, mask)
         mesh = (int(box), int(filter_size), plane)
         background = _masked(data, mask, noise_map, mesh, correlation)
     if warn:
@@ -285,7 +285,7 @@ def _masked(data, mask, noise_map, mesh, correlation):
     # an image without any has that of its numbers
     noise = np.maximum(noise, np.float32(1e-6 * np.abs(mesh.level).max() or 1))
     shift, dark, light = light_left(mesh, sources_mask, noise * np.float32(correlation), step)
-    if shift + np.median(_some(light)) > _DOUBT * np.median(_some(noise)):
+    if shift + np.median(_thinned(light)) > _DOUBT * np.median(_thinned(noise)):
         flags |= BackgroundFlags.CONFUSED
     error = np.sqrt((mesh.error * np.float32(correlation)) ** 2 + dark**2 + light**2)
     level = mesh.level - shift
@@ -296,13 +296,13 @@ def _masked(data, mask, noise_map, mesh, correlation):
 
 def _is_unknown(level, error, noise):
     """Whether the level of the sky is too uncertain to be taken off."""
-    brightness = abs(np.median(_some(level)))
-    pixel_noise = np.median(_some(noise))
+    brightness = abs(np.median(_thinned(level)))
+    pixel_noise = np.median(_thinned(noise))
     # the sky is off already: its share of the error says nothing, and what is taken off changes nothing
     if brightness < pixel_noise:
         return False
     limit = max(_UNKNOWN * brightness, _UNKNOWN_NOISE * pixel_noise)
-    return np.median(_some(error)) > limit
+    return np.median(_thinned(error)) > limit
 
 
 def _search(mesh, noise_map):
@@ -331,7 +331,7 @@ def _averaged(data, mask, noise_map, step, correlation):
     return np.where(small, 0, mean), small, noise_map
 
 
-def _stated(image, mask):
+def _error_map(image, mask):
     """Errors of an image, and where it has them; None without any."""
     if image.uncertainty is None:
         return None
@@ -340,7 +340,7 @@ def _stated(image, mask):
     return error, ~mask & (error > 0) & np.isfinite(error)
 
 
-def _some(values):
+def _thinned(values):
     """Every so many rows and columns of a large image."""
     step = max(1, int(np.sqrt(values.size / _SOME)))
     return values[::step, ::step]
@@ -348,9 +348,9 @@ def _some(values):
 
 def _noise(noise_map, rms, mask):
     """Noise about the mesh, larger where the errors are: no mesh follows the seams of mosaics."""
-    if noise_map is None or not (sampled := _some(noise_map[1] & ~mask)).any():
+    if noise_map is None or not (sampled := _thinned(noise_map[1] & ~mask)).any():
         return rms
-    scale = np.median(_some(rms)[sampled] / _some(noise_map[0])[sampled])
+    scale = np.median(_thinned(rms)[sampled] / _thinned(noise_map[0])[sampled])
     return np.fmax(rms, noise_map[0] * np.float32(scale))
 
 
@@ -370,7 +370,7 @@ def warn_of(background, mask, unit):
     warn(text, ReductionWarning)
 
 
-def _plain(data, mask, box, filter_size, correlation):
+def _sep_background(data, mask, box, filter_size, correlation):
     """The mesh of sep as it is."""
     level, rms = sep_tools.background(data, mask, box, filter_size)
     # sep takes boxes of which half is left, and gives 0 and 1 where there is none

@@ -44,7 +44,7 @@ class SkyBoxes:
     center: tuple
 
     @property
-    def used(self):
+    def covered(self):
         """Boxes with enough sky to speak for their place."""
         full = self.count > 0
         if not full.any():
@@ -70,8 +70,8 @@ class SkyBoxes:
         # in units of the image, about its middle
         y, x = (v / edge[-1] - 0.5 for v, edge in zip(self.center, self.edges, strict=True))
         everywhere = np.stack([np.ones_like(y), y, x, y * y, y * x, x * x], axis=-1)
-        terms = everywhere[self.used]
-        level = values[self.used]
+        terms = everywhere[self.covered]
+        level = values[self.covered]
         if level.size >= 20:
             number = 6
         elif level.size >= 6:
@@ -116,7 +116,7 @@ class SkyBoxes:
         surface : `~numpy.ndarray` of float32, shape (ny, nx)
             Bicubic spline through the centers of the boxes, linear beyond the outermost.
         """
-        filtered = _filled(_filtered(np.where(self.used, values, np.nan), filter_size))
+        filtered = _filled(_filtered(np.where(self.covered, values, np.nan), filter_size))
         filtered = filtered.astype(np.float32)
         for axis, edge in enumerate(self.edges):
             filtered = np.moveaxis(_spline(edge, shape[axis]) @ filtered, 0, 1)
@@ -318,5 +318,5 @@ class SkyMesh:
         """What noise leaves open of the level."""
         error = self._over(self._boxes.error)
         # that of a median of so many boxes
-        number = np.clip(np.count_nonzero(self._boxes.used), 1, self.filter_size**2)
+        number = np.clip(np.count_nonzero(self._boxes.covered), 1, self.filter_size**2)
         return np.maximum(error, 0) * np.float32(min(1.0, 1.2533 / np.sqrt(number)))
