@@ -133,7 +133,7 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     `~astropy.units.UnitsError`
         If the unit cannot be converted or is missing.
     ValueError
-        If it is no number, the number of dimensions is wrong or a value is not finite; with ``finite`` masked
+        If it is no real number, the number of dimensions is wrong or a value is not finite; with ``finite`` masked
         values are not.
     """
     unit = u.Unit(unit)
@@ -158,13 +158,19 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         else:
             got = type(value).__name__
         raise argument_error(name, wanted, got) from None
+    if quantity.dtype.kind == "c":
+        raise argument_error(name, "real numbers", "complex numbers")
     is_bare = not hasattr(value, "unit") and quantity.unit == u.dimensionless_unscaled
     if is_bare and unit != u.dimensionless_unscaled:
         raise units_error(name, f"a quantity convertible to {unit}", "a bare number")
     try:
         array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)
     except u.UnitConversionError:
-        raise units_error(name, f"convertible to {unit}", getattr(value, "unit", None)) from None
+        if unit == u.dimensionless_unscaled:
+            wanted = "a number without a unit"
+        else:
+            wanted = f"convertible to {unit}"
+        raise units_error(name, wanted, getattr(value, "unit", None)) from None
     if mask is not None:
         array = np.where(mask, np.nan, array)
     if ndim is not None and array.ndim != ndim:

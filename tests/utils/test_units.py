@@ -71,3 +71,9 @@ def test_spellings_of_jansky_that_leave_no_choice(name, factor):
 
 def test_mjy_may_be_two_units():
     assert flux_unit("mjy") is None
+
+
+def test_complex_numbers_and_units_of_numbers_without_one_are_refused():
+    refuses("'redshift' must be real numbers, got complex", to_array, [1j], u.one, "redshift")
+    message = "'redshift' must be a number without a unit, got km / s"
+    refuses(message, to_array, [1] * u.km / u.s, u.one, "redshift", error=u.UnitsError)
