@@ -32,7 +32,7 @@ from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
 from miricigale.utils.region_files import region_table
-from miricigale.utils.text_tables import csv_layout, drop_repeated, is_sextractor
+from miricigale.utils.text_tables import csv_layout, drop_repeated, is_sextractor, without_comments
 from miricigale.utils.units import flux_unit
 
 _PIECE = 1 << 20
@@ -185,10 +185,18 @@ def _largest(column):
 
 
 def _table_read(hdus, chosen):
-    """The table of a FITS file that astropy reads by an extension, or None for the first one."""
+    """The table of a FITS file that astropy reads by an extension, or None for the first one (a `ValueError`)."""
     if chosen is not None:
-        return hdus[chosen]
-    return next(hdu for hdu in hdus if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU)))
+        try:
+            return hdus[chosen]
+        except (IndexError, KeyError):
+            names = [hdu.name or "PRIMARY" for hdu in hdus]
+            msg = f"it has no extension {chosen!r}, only {names}"
+            raise ValueError(msg) from None
+    tables = [hdu for hdu in hdus if isinstance(hdu, (fits.BinTableHDU, fits.TableHDU))]
+    if not tables:
+        raise ValueError("it has no table")
+    return tables[0]
 
 
 def names_in_header(hdu):
@@ -385,6 +393,8 @@ def _read_text(path, form, id_names):
         start = _start(path)
         if _DS9.search(start[:_PIECE]):
             return region_table(path)
+        if start.lstrip()[:1] in (b"{", b"["):
+            raise ValueError("it is JSON, and wanted are columns of text")
         source = str(path)
         options = {"format": form}
         n_comments = 0
@@ -394,6 +404,8 @@ def _read_text(path, form, id_names):
             # a mark at the start is no part of the first name, and of archives astropy reads no text
             with packed_open(path) as stream:
                 source = stream.read().decode("utf-8-sig").splitlines()[n_comments:]
+        if form == "ascii.csv":
+            source = without_comments(source, path, options["delimiter"])
         with warnings.catch_warnings():
             # what 64 bits do not hold is read as text
             warnings.filterwarnings("ignore", "OverflowError converting to IntType", AstropyWarning)

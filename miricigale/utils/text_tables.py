@@ -91,6 +91,55 @@ def _is_number(cell):
     return True
 
 
+def without_comments(source, path, separator):
+    """
+    Leave lines of comment between and after the rows of a CSV out.
+
+    Parameters
+    ----------
+    source : str or list of str
+        The file, or its lines from the names of the columns on.
+    path : path-like
+        The file.
+    separator : str
+        Between the cells.
+
+    Returns
+    -------
+    source : str or list of str
+        The same if there is no such line: one that begins with ``#`` and has not as many cells as the first line,
+        so that ids such as ``#1`` stay.
+    """
+    if isinstance(source, str):
+        if not _has_mark(path):
+            return source
+        with packed_open(path) as stream:
+            lines = stream.read().decode("utf-8-sig").splitlines()
+    else:
+        lines = source
+    header = next((line for line in lines if line.strip()), "")
+    n_cells = header.count(separator)
+    kept = []
+    for line in lines:
+        is_comment = (
+            line.startswith("#") and line is not header and line.count(separator) != n_cells
+        )
+        if not is_comment:
+            kept.append(line)
+    return kept
+
+
+def _has_mark(path):
+    """Whether a line after the first begins with the mark of a comment."""
+    last = b""
+    with packed_open(path) as stream:
+        while piece := stream.read(_HEAD):
+            if b"\n#" in last + piece:
+                return True
+            last = piece[-1:]
+    return False
+
+
 def drop_repeated(table, path):
     """
     Refuse columns of one name, of which astropy calls the second ``NAME_1``; leave copies out.

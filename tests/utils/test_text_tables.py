@@ -43,6 +43,7 @@ id f f
         "# made by a program, of one field\n# id: its number\nid,f\n7,2.5\n9,3.5\n",
         "# made by a program\n#id,f\n7,2.5\n9,3.5\n",
         "#id,f\n7,2.5\n9,3.5\n",
+        "id,f\n7,2.5\n# half\n9,3.5\n# end, of, all\n",
         "\ufeff# made by a program\nid,f\r\n7,2.5\r\n9,3.5\r\n",
     ],
 )
@@ -129,3 +130,25 @@ def test_two_columns_of_one_name_are_refused_in_frames():
     frame = pandas.DataFrame([[1, 5.0, 6.0]], columns=["id", "f", "f"])
     refuses("'photometry' must be a frame whose columns have different names, got .*'f'", as_table,
             frame, "photometry")  # fmt: skip
+
+
+def test_ids_may_begin_with_the_mark_of_a_comment(tmp_path):
+    path = tmp_path / "c.csv"
+    path.write_text("id,f\n#7,2.5\n# end\n#9,3.5\n")
+    assert read_table(path, wanted="a catalog")["id"].tolist() == ["#7", "#9"]
+
+
+def test_what_is_no_table_is_refused_in_a_sentence(tmp_path):
+    image = tmp_path / "i.fits"
+    fits.PrimaryHDU(np.zeros((3, 3))).writeto(image)
+    table = tmp_path / "t.fits"
+    Table({"id": [1]}).write(table)
+    text = tmp_path / "c.json"
+    text.write_text('{"id": [1, 2]}')
+    for path, message in (
+        (image, r"i\.fits .* it has no table"),
+        (f"{table}[7]", r"t\.fits .* it has no extension 7, only \['PRIMARY', "),
+        (text, r"c\.json .* it is JSON"),
+    ):
+        with pytest.raises(DataError, match=message):
+            read_table(path, wanted="a catalog")
