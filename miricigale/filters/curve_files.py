@@ -206,7 +206,7 @@ def _of_text(path, unit):
         if kinds:
             unit = u.AA
         else:
-            unit = _unit_of(comments, path)
+            unit = unit_of_comments(comments, path)
     said = _DETECTOR.search("\n".join(comments))
     energy = kinds[:1] == ["energy"] or (said is not None and said[1].lower() in _ENERGY)
     wave, throughput = data.T
@@ -233,12 +233,28 @@ def _two_columns(rows):
     return np.array([row[:2] for row in rows], dtype=float).reshape(len(rows), 2)
 
 
-def _unit_of(comments, path):
+def unit_of_comments(comments, path):
     """
     Unit of the wavelengths that comments name.
 
     That of the line of the columns, which speaks of wavelengths, counts before that of other lines, and a unit
     after a number, which measures something, counts for nothing.
+
+    Parameters
+    ----------
+    comments : list of str
+        Lines.
+    path : path-like
+        The file, for messages.
+
+    Returns
+    -------
+    unit : `~astropy.units.Unit`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If they name none, or several.
     """
     about_wave = [text for text in comments if _WAVE_WORD.search(text)]
     for lines in (about_wave, comments):

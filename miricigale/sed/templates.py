@@ -12,6 +12,7 @@ from miricigale.filters import FilterSet
 from miricigale.sed.components.igm import Meiksin2006
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
+from miricigale.sed.stated_units import stated_units
 from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, file_errors, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats, plain_floats
@@ -42,8 +43,9 @@ def read_spectra(path):
     path : path-like
         A file, or a folder of files with one of the usual suffixes: FITS tables or text. The first column is the
         wavelength in vacuum (Angstrom where it has no unit), the second the flux density (F_lambda where it has
-        no unit), or several of them in a column of vectors; all others are left alone. That is how STScI
-        distributes the atlas of Pickles (1998). In its model atmospheres (Castelli & Kurucz, PHOENIX) each column
+        no unit, of the column or in the comments of a text, as in ``# wave(um) flux(uJy)``), or
+        several of them in a column of vectors; all others are left alone. That is how STScI distributes the atlas
+        of Pickles (1998). In its model atmospheres (Castelli & Kurucz, PHOENIX) each column
         ``g00`` to ``g55`` is one of another surface gravity: all that have light are read.
 
     Returns
@@ -92,7 +94,9 @@ def _read_file(file):
     gravities = [name for name in fluxes if re.fullmatch(r"g\d\d", name)]
     with file_errors(file, "cannot be read as a spectrum"):
         # NaN where a value is lacking, which is none of a spectrum
-        wave = plain_floats(table[first], first, "spectrum") * _unit(table[first], u.AA)
+        stated = _stated(file, table)
+        wave_unit = stated[0] or u.AA
+        wave = plain_floats(table[first], first, "spectrum") * _unit(table[first], wave_unit)
         endings = "|".join(map(re.escape, _SUFFIXES))
         stem = re.sub(rf"({endings})?(\.gz)?$", "", file.name, flags=re.I)
         out = {}
@@ -111,8 +115,15 @@ def _read_file(file):
                         name = stem
                     else:
                         name = f"{stem}[{part}]"
-                    out[name] = SED(wave, flux * _unit(table[column], _FLAM))
+                    out[name] = SED(wave, flux * _unit(table[column], stated[1] or _FLAM))
         return out
+
+
+def _stated(file, table):
+    """Units of wavelengths and fluxes in the comments of a text; None for those of columns that have their own."""
+    if any(column.unit is not None for column in table.itercols()):
+        return None, None
+    return stated_units(file, table.colnames)
 
 
 def _unit(column, default):
