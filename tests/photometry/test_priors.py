@@ -135,8 +135,9 @@ def test_catalogues_that_cannot_be_used_are_refused(prior, tmp_path):
     refuses(r"a.csv' must be a table with positions: 'sky'", read_prior, image, catalog=path)
     with pytest.raises(ValueError, match="ids are unique"):
         read_prior(image, catalog=write_csv(tmp_path / "b.csv", [1, 1, 2, 3], sky))
-    Table({"ra": ["10:00:00"], "dec": ["-27:00:00"]}).write(tmp_path / "c.csv")
-    refuses("'ra'", read_prior, image, catalog=tmp_path / "c.csv")
+    Table({"ra": ["10:61:00"], "dec": ["-27:00:00"]}).write(tmp_path / "c.csv")
+    match = "angles in 'ra', got 10:61:00 in row 0"
+    refuses(match, read_prior, image, catalog=tmp_path / "c.csv")
     with pytest.raises(DataError, match=r"absent.csv cannot be read as a table: no such file"):
         read_prior(image, catalog=tmp_path / "absent.csv")
     refuses("'segmentation' or 'catalog' must be given", read_prior, image)
