@@ -54,33 +54,6 @@ from miricigale.utils.units import FNU, check_count
 
 logger = logging.getLogger(__name__)
 
-#: Arguments of `BayesFitter`.
-_OPTIONS = (
-    "model", "filters", "priors", "engine", "axes", "model_error", "error_floor", "template_error", "outliers",
-    "calibration", "scale_error", "n_bands_min", "compat", "nuclei", "settings",
-)  # fmt: skip
-#: Arguments of its method fit.
-_OF_FIT = (
-    "photometry",
-    "unit",
-    "redshift",
-    "redshift_prior",
-    "pairs",
-    "seed",
-    "executor",
-    "progress_bar",
-    "chunk_size",
-)
-#: Arguments of its method sample, besides the number of draws.
-_OF_SAMPLE = (
-    "photometry",
-    "unit",
-    "seed",
-    "redshift",
-    "redshift_prior",
-    "executor",
-    "progress_bar",
-)
 #: Attributes of a fitter that depend on its bands.
 _OF_BANDS = ("backend", "bands", "grid", "model_errors", "priors", "zero_points")
 
@@ -250,19 +223,43 @@ class BayesFitter(Interactive):
         settings=None,
     ):
         on_grid = engine == "grid"
-        axes = grid_name(axes) if isinstance(axes, str) else axes
+        if isinstance(axes, str):
+            axes = grid_name(axes)
         model, filters = models_and_bands(model, filters, axes)
         self.curves = own_curves(filters)
-        self._given = {name: value for name, value in locals().items() if name in _OPTIONS}
-        kind = GridSettings if on_grid else SamplerSettings
+        self._options = {
+            "model": model,
+            "filters": filters,
+            "priors": priors,
+            "engine": engine,
+            "axes": axes,
+            "model_error": model_error,
+            "error_floor": error_floor,
+            "template_error": template_error,
+            "outliers": outliers,
+            "calibration": calibration,
+            "scale_error": scale_error,
+            "n_bands_min": n_bands_min,
+            "compat": compat,
+            "nuclei": nuclei,
+            "settings": settings,
+        }
+        kind = SamplerSettings
+        if on_grid:
+            kind = GridSettings
         settings = settings or kind()
         wanted = f"{kind.__name__} with engine={engine!r}"
         check_that(isinstance(settings, kind), "settings", wanted, type(settings).__name__)
-        axes, self.grid_name = axes_of(model, axes) if on_grid else (axes, None)
+        self.grid_name = None
+        if on_grid:
+            axes, self.grid_name = axes_of(model, axes)
         if on_grid and compat is None:
-            of_model = self.grid_name, model_error, template_error
-            known = model.filters if filters is None and isinstance(model, ModelGrid) else filters
-            calibration = chosen_calibration(calibration, *of_model, bands=known)
+            catalog_bands = filters
+            if filters is None and isinstance(model, ModelGrid):
+                catalog_bands = model.filters
+            calibration = chosen_calibration(
+                calibration, self.grid_name, model_error, template_error, bands=catalog_bands
+            )
         elif isinstance(calibration, str):
             calibration = None
         of_grid = {"axes": axes, "compat": compat, "calibration": calibration}
@@ -271,55 +268,85 @@ class BayesFitter(Interactive):
             for name, value in of_grid.items():
                 check_that(value is None, name, "left out with a sampler", repr(value))
             get_sampler(engine)
-        names = None if filters is None and on_grid else filter_names("filters", filters or ())
-        predict = () if on_grid else filter_names("predict", settings.predict)
-        asked = (*(names or ()), *predict)
-        if names is not None and (not names or len(set(asked)) < len(asked)):
-            raise argument_error("filters", "different names, at least one", f"{list(asked)}")
+        names = None
+        if not (filters is None and on_grid):
+            names = filter_names("filters", filters or ())
+        predict = ()
+        if not on_grid:
+            predict = filter_names("predict", settings.predict)
+        if names is not None:
+            all_names = list(names) + list(predict)
+            is_unique = len(set(all_names)) == len(all_names)
+            wanted = "different names, at least one"
+            check_that(names and is_unique, "filters", wanted, f"{all_names}")
         if scale_error not in (None, True, False) or (compat and scale_error):
-            wanted = "False with compat='cigale'" if compat else "True, False or None"
+            wanted = "True, False or None"
+            if compat:
+                wanted = "False with compat='cigale'"
             raise argument_error("scale_error", wanted, repr(scale_error))
         if calibration is not None:
             if template_error is None:
                 of_grid["template_error"] = calibration.template_error
             if settings.mass_function is None:
                 settings = replace(settings, mass_function=calibration.mass_function)
-        self.engine, self.calibration = engine, calibration
+        self.engine = engine
+        self.calibration = calibration
         check_that(isinstance(nuclei, bool), "nuclei", "True or False", repr(nuclei))
         check_that(on_grid or not nuclei, "nuclei", "False with a sampler", repr(nuclei))
         self.nuclei = nuclei
         self.template_error = of_grid["template_error"]
-        self.model = None if isinstance(model, ModelGrid) else model
-        self.filters, self.n_bands_min = names, check_count(n_bands_min, "n_bands_min")
-        self._made = {}
+        self.model = None
+        if not isinstance(model, ModelGrid):
+            self.model = model
+        self.filters = names
+        self.n_bands_min = check_count(n_bands_min, "n_bands_min")
+        self._fitters = {}
         if on_grid and names is None and isinstance(model, SEDModel):
             # the grid is made for the bands of the photometry
             return
-        scale_error = compat is None if scale_error is None else bool(scale_error)
-        kind, more = (GridFit, of_grid) if on_grid else (SamplerFit, {"sampler": engine})
-        more["scale_error"] = scale_error
-        self.backend = kind.of_model(model, filters, priors, settings, **more)
-        self.bands, self.priors = self.backend.filters, self.backend.priors
-        self.grid = self.backend.grid if on_grid else None
+        if scale_error is None:
+            scale_error = compat is None
+        else:
+            scale_error = bool(scale_error)
+        if on_grid:
+            self.backend = GridFit.of_model(
+                model, filters, priors, settings, scale_error=scale_error, **of_grid
+            )
+            self.grid = self.backend.grid
+        else:
+            self.backend = SamplerFit.of_model(
+                model, filters, priors, settings, scale_error=scale_error, sampler=engine
+            )
+            self.grid = None
+        self.bands = self.backend.filters
+        self.priors = self.backend.priors
         if names is not None:
             names = tuple(known_filter(name, self.bands, "filter of the grid") for name in names)
         self.filters = names
-        of_bands = self.bands if on_grid else names
-        given = {}
+        error_bands = names
+        if on_grid:
+            error_bands = self.bands
+        corrections = {}
         if calibration is not None:
             for name in ("zero_point", "error_factor"):
-                given[name] = calibration.of_bands(name, of_bands, 1.0)
+                corrections[name] = calibration.of_bands(name, error_bands, 1.0)
             if model_error is None:
-                model_error = calibration.of_bands("error_part", of_bands, 0.0)
-        model_error = 0.1 if model_error is None else model_error
-        for name, value in (("model_error", model_error), ("error_floor", error_floor)):
-            given[name] = per_band(value, of_bands, name)
-        self._reader = PhotometryReader(self.bands, names, n_bands_min=self.n_bands_min, **given)
+                model_error = calibration.of_bands("error_part", error_bands, 0.0)
+        if model_error is None:
+            model_error = 0.1
+        self._reader = PhotometryReader(
+            self.bands,
+            names,
+            model_error=per_band(model_error, error_bands, "model_error"),
+            error_floor=per_band(error_floor, error_bands, "error_floor"),
+            n_bands_min=self.n_bands_min,
+            **corrections,
+        )
         self.zero_points = self._reader.zero_point
         self.model_errors = self._reader.model_error
 
     def __getattr__(self, name):
-        if name in _OF_BANDS and "_made" in self.__dict__:
+        if name in _OF_BANDS and "_fitters" in self.__dict__:
             wanted = "the bands are those of the photometry: name them, BayesFitter(model, bands), or take"
             msg = f"BayesFitter has no {name!r} yet; {wanted} fitter.for_bands(bands)"
             raise AttributeError(msg, name=name, obj=self)
@@ -332,7 +359,7 @@ class BayesFitter(Interactive):
 
     def for_bands(self, bands):
         """
-        Fitter of the same models and options for these bands.
+        Return a fitter of the same models and options for these bands.
 
         Parameters
         ----------
@@ -351,13 +378,13 @@ class BayesFitter(Interactive):
         """
         check_that(self.waits, "bands", "left to the fitter, which has some", bands)
         names = filter_names("bands", bands)
-        if names not in self._made:
-            self._made[names] = type(self)(**self._given | {"filters": bands})
-        return self._made[names]
+        if names not in self._fitters:
+            self._fitters[names] = type(self)(**self._options | {"filters": bands})
+        return self._fitters[names]
 
     def for_photometry(self, photometry):
         """
-        Fitter for a catalog: this one, or `for_bands` of those in the catalog if it was given no bands.
+        Return a fitter for a catalog: this one, or `for_bands` of its bands if the fitter has none.
 
         Parameters
         ----------
@@ -382,25 +409,29 @@ class BayesFitter(Interactive):
 
     def replace(self, **options):
         """Return a fitter of the same models with other options, named as for `BayesFitter`."""
-        given = self._given | options
+        arguments = self._options | options
         if self.waits:
-            return type(self)(**given)
+            return type(self)(**arguments)
         if self.grid is not None:
-            given |= {"model": self.grid, "axes": None}
-            errors = given["model_error"], given["template_error"]
-            if given["compat"] is None:
-                chosen = given["calibration"], self.grid_name, *errors
-                bands = given["filters"] or self.bands
-                given["calibration"] = chosen_calibration(*chosen, bands=bands)
-        new = type(self)(**given)
+            arguments |= {"model": self.grid, "axes": None}
+            if arguments["compat"] is None:
+                arguments["calibration"] = chosen_calibration(
+                    arguments["calibration"],
+                    self.grid_name,
+                    arguments["model_error"],
+                    arguments["template_error"],
+                    bands=arguments["filters"] or self.bands,
+                )
+        new = type(self)(**arguments)
         new.grid_name = self.grid_name
         new.model = self.model
         # errors that are given later take the place of a calibration by default
-        new._given["calibration"] = (self._given | options)["calibration"]
-        known = getattr(self.backend, "between", None)
-        if known and new.backend.between:
+        new._options["calibration"] = (self._options | options)["calibration"]
+        between = getattr(self.backend, "between", None)
+        if between and new.backend.between:
             # the finer grid is that of the same models
-            new.backend = replace(new.backend, between=replace(known, engine=new.backend.engine))
+            between = replace(between, engine=new.backend.engine)
+            new.backend = replace(new.backend, between=between)
         return new
 
     def _facts(self):
@@ -418,17 +449,21 @@ class BayesFitter(Interactive):
         }
 
     def __repr__(self):
-        bands = "bands of the photometry" if self.filters is None else f"{len(self.filters)} bands"
+        bands = "bands of the photometry"
+        if self.filters is not None:
+            bands = f"{len(self.filters)} bands"
         if self.waits:
             return f"<BayesFitter of {self.model!r}, {bands}>"
         if self.engine == "grid":
             return f"<BayesFitter of {self.grid!r}, {bands}>"
-        free = ", ".join(self.priors)
-        return f"<BayesFitter of {self.model!r}, {bands}, {self._engine_name}, free: {free}>"
+        names = ", ".join(self.priors)
+        return f"<BayesFitter of {self.model!r}, {bands}, {self._engine_name}, free: {names}>"
 
     @property
     def _engine_name(self):
-        return self.engine if isinstance(self.engine, str) else repr(self.engine)
+        if isinstance(self.engine, str):
+            return self.engine
+        return repr(self.engine)
 
     def fit(
         self,
@@ -509,12 +544,26 @@ class BayesFitter(Interactive):
             If a flux column has no unit of flux density, and ``unit`` does not say it.
         """
         if self.waits:
-            given = {name: value for name, value in locals().items() if name in _OF_FIT}
-            return self.for_photometry(photometry).fit(**given)
-        known = {"redshift": redshift, "redshift_prior": redshift_prior}
-        parallel = {"executor": executor, "progress_bar": progress_bar}
-        options = {"pairs": pairs, "seed": seed, "chunk_size": chunk_size, "parallel": parallel}
-        results = self._fit_part(self._table_of(photometry, unit), **known, **options)
+            return self.for_photometry(photometry).fit(
+                photometry,
+                unit=unit,
+                redshift=redshift,
+                redshift_prior=redshift_prior,
+                pairs=pairs,
+                seed=seed,
+                executor=executor,
+                progress_bar=progress_bar,
+                chunk_size=chunk_size,
+            )
+        results = self._fit_part(
+            self._table_of(photometry, unit),
+            redshift=redshift,
+            redshift_prior=redshift_prior,
+            pairs=pairs,
+            seed=seed,
+            chunk_size=chunk_size,
+            parallel={"executor": executor, "progress_bar": progress_bar},
+        )
         warn_of_pulls(results)
         sample = results.reduced_chi2[:: chi2_step(len(results))]
         return with_high_chi2(results, chi2_limit(sample))
@@ -523,34 +572,37 @@ class BayesFitter(Interactive):
 
     def _table_of(self, photometry, unit=None):
         """
-        The catalog by our names, fluxes without a unit in ``unit``, with what there is to warn of.
+        Convert a catalog to our names, fluxes without a unit in ``unit``, and warn of what looks wrong.
 
-        A band of ``filters`` that it lacks is a missing one of all objects.
+        A band of ``filters`` that it lacks is missing for all objects.
         """
         table = as_photometry(photometry, self.filters or self.bands, units=unit)
         if self.nuclei:
             table = with_units(table, unit)
-        lost = [name for name in self.filters or () if name not in table.colnames]
-        if lost and len(lost) < len(self.filters):
-            text = f"the photometry has no {', '.join(lost)}: missing bands of all objects"
+        missing = [name for name in self.filters or () if name not in table.colnames]
+        if missing and len(missing) < len(self.filters):
+            text = f"the photometry has no {', '.join(missing)}: missing bands of all objects"
             warn(text, FitWarning)
             table = table.copy(copy_data=False)
-            for name in lost:
-                table[name] = table[error_column(name)] = np.full(len(table), np.nan) * FNU
+            for name in missing:
+                table[name] = np.full(len(table), np.nan) * FNU
+                table[error_column(name)] = np.full(len(table), np.nan) * FNU
         warn_of_duplicates(read_ids(table), "photometry")
         warn_of_codes([codes_of(table, self._reader.fitted(table))], "photometry")
         self._warn_of_bands(table)
         return table
 
     def _read_bands(self, photometry, bands):
-        """Photometry (`~miricigale.fitting.data.likelihood.FitData`) of bands, with zero points and its own
-        errors.
+        """
+        Read the photometry of bands, with zero points and without errors of models.
+
+        Returned is `~miricigale.fitting.data.likelihood.FitData`.
         """
         zero = dict.fromkeys(bands, 0.0)
         return PhotometryReader(bands, bands, zero, zero, 1, self.zero_points).read(photometry)
 
     def _nucleus_columns(self, photometry):
-        """`NucleusColumns` of a catalog, one band at least."""
+        """Find the `NucleusColumns` of a catalog, at least one band."""
         columns = NucleusColumns.of_table(
             photometry.colnames, self.filters or self._reader.fitted(photometry)
         )
@@ -570,13 +622,26 @@ class BayesFitter(Interactive):
             warn(f"{text}: {', '.join(unused)}", FitWarning)
 
     def _fit_part(
-        self, photometry, *, pairs, seed, parallel, chunk_size=None, repeated=None, **known
+        self,
+        photometry,
+        *,
+        redshift,
+        redshift_prior,
+        pairs,
+        seed,
+        parallel,
+        chunk_size=None,
+        repeated=None,
     ):
         """Do what `fit` does, without warnings; earlier parts of the catalog had the ``repeated`` rows."""
-        size = self.backend.chunk_size if chunk_size is None else chunk_size
-        size = check_count(size, "chunk_size")
-        seed = None if self.engine == "grid" else check_seed(seed)
-        data, known, settings = self._prepare(photometry, **known, repeated=repeated)
+        if chunk_size is None:
+            chunk_size = self.backend.chunk_size
+        chunk_size = check_count(chunk_size, "chunk_size")
+        if self.engine == "grid":
+            seed = None
+        else:
+            seed = check_seed(seed)
+        data, priors, settings = self._prepare(photometry, redshift, redshift_prior, repeated)
         backend = self.backend
         if self.nuclei:
             columns = self._nucleus_columns(photometry)
@@ -585,18 +650,21 @@ class BayesFitter(Interactive):
             flags = data.flags | np.where(left_out, int(FitFlags.NUCLEUS_LEFT_OUT), 0)
             data = data._changed(nuclei=values, flags=flags)
             settings |= backend.settings()
-        task = backend.task(pairs, seed, known)
+        task = backend.task(pairs, seed, priors)
         # the measured errors take no part, and what goes to other processes is kept small
-        sent = data._changed(flux_err=None)
-        rows = list(chunks(len(data), size)) or [slice(0, 0)]
-        pieces = [(sent[some], known[some]) for some in rows]
-        # for threads too, which share this setting with their process
+        task_data = data._changed(flux_err=None)
+        slices = list(chunks(len(data), chunk_size)) or [slice(0, 0)]
+        pieces = [(task_data[rows], priors[rows]) for rows in slices]
+        # numerical libraries use one thread each, in threads too, which share this setting with their process
         with single_threaded():
             results = FitResults.concatenate(parallel_map(task, pieces, desc="fit", **parallel))
         logger.debug("fitted %d objects", len(data))
-        settings |= {} if seed is None else {"seed": seed}
+        if seed is not None:
+            settings["seed"] = seed
         fixed = settings["redshift"] == "fixed"
-        edge = None if fixed else self.backend.edge_weight
+        edge = None
+        if not fixed:
+            edge = self.backend.edge_weight
         return results._changed(
             flags=flags_of_fits(results, data.measured, edge),
             flux_err=data.flux_err,
@@ -608,24 +676,28 @@ class BayesFitter(Interactive):
         )
 
     def _prepare(self, photometry, redshift, redshift_prior, repeated=None):
-        """Photometry with flags, what is known of the redshift of every object, and the settings."""
+        """Read photometry with flags, the prior of the redshift of every object, and the settings."""
         filters = self._reader.fitted(photometry)
-        both = redshift is not None and redshift_prior is not None
-        check_that(not both, "redshift_prior", "left out where 'redshift' is given", "both")
+        is_single = redshift is None or redshift_prior is None
+        check_that(is_single, "redshift_prior", "left out where 'redshift' is given", "both")
         data = self._reader.read(photometry, repeated)
         self.backend.check_data(data)
         flags = np.array(data.flags)
-        known, n_free, kind = self.backend.redshifts(photometry, redshift, redshift_prior, flags)
-        seen = np.sum(data.measured & (data.flux >= 2.0 * data.flux_err), axis=1)
-        few = (seen < min(n_free, 3 - (kind == "fixed"))) & ((flags & int(FitFlags.UNFITTED)) == 0)
-        flags[few] |= int(FitFlags.FEW_FOR_PARAMETERS)
+        priors, n_free, kind = self.backend.redshifts(photometry, redshift, redshift_prior, flags)
+        n_wanted = 3
+        if kind == "fixed":
+            n_wanted = 2
+        n_detected = np.sum(data.measured & (data.flux >= 2.0 * data.flux_err), axis=1)
+        is_fitted = (flags & int(FitFlags.UNFITTED)) == 0
+        too_few = is_fitted & (n_detected < min(n_free, n_wanted))
+        flags[too_few] |= int(FitFlags.FEW_FOR_PARAMETERS)
         settings = self.settings(filters) | {"redshift": kind}
         settings["unused_bands"] = unused_bands(photometry, filters)
         if kind == "fixed":
             # 0 was checked above, where a grid has it
             known_z = known_redshifts(photometry, redshift, zero=True)
             data = data._changed(redshift=np.where(known_z > 0, known_z, np.nan))
-        return data._changed(flags=flags), known, settings
+        return data._changed(flags=flags), priors, settings
 
     def sample(
         self,
@@ -662,39 +734,49 @@ class BayesFitter(Interactive):
             See `fit`; or if the fitter has no grid: the results of a sampler hold draws.
         """
         if self.waits:
-            given = {name: value for name, value in locals().items() if name in _OF_SAMPLE}
-            return self.for_photometry(photometry).sample(n_draws=n_draws, **given)
+            return self.for_photometry(photometry).sample(
+                photometry,
+                n_draws,
+                seed=seed,
+                unit=unit,
+                redshift=redshift,
+                redshift_prior=redshift_prior,
+                executor=executor,
+                progress_bar=progress_bar,
+            )
         if self.engine != "grid":
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
         if self.nuclei:
             msg = "draws of nodes are without nuclei: fitter.replace(nuclei=False).sample(...)"
             raise ValueError(msg)
-        n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
-        data, known, settings = self._prepare(
-            self._table_of(photometry, unit), redshift, redshift_prior
+        n_draws = check_count(n_draws, "n_draws")
+        seed = check_seed(seed)
+        table = self._table_of(photometry, unit)
+        data, priors, settings = self._prepare(table, redshift, redshift_prior)
+        samples = self.backend.sample(
+            data, priors, n_draws, seed, executor=executor, progress_bar=progress_bar
         )
-        parallel = {"executor": executor, "progress_bar": progress_bar}
-        samples = self.backend.sample(data, known, n_draws, seed, **parallel)
         cited = self.backend.provenance()["citations"]
         meta = provenance(citations=cited, fit=settings, seed=seed)
         return samples._changed(model=self.model, meta=meta)
 
     def settings(self, filters=None):
         """Return the settings of the fit, for the meta of results: a dict of plain values."""
-        calibration, known = self.calibration, {}
-        if calibration is not None:
-            known = {"calibration": calibration.name, "zero_point": self.zero_points}
-            known["error_factor"] = self._reader.error_factor
+        optional = {}
+        if self.calibration is not None:
+            optional["calibration"] = self.calibration.name
+            optional["zero_point"] = self.zero_points
+            optional["error_factor"] = self._reader.error_factor
         if self.nuclei:
-            known["nuclei"] = True
-            known["nuclear_stars"] = float(self.backend.given.nuclear_stars)
+            optional["nuclei"] = True
+            optional["nuclear_stars"] = float(self.backend.given.nuclear_stars)
         return {
             "engine": self._engine_name,
             "filters": list(filters or self.filters or self.bands),
             "model_error": dict(self._reader.model_error),
             "error_floor": dict(self._reader.error_floor),
             "n_bands_min": self.n_bands_min,
-            **known,
+            **optional,
             **self.backend.settings(),
         }
