@@ -8,7 +8,7 @@ from astropy.table import QTable, vstack
 
 from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting.catalogs.streaming import row_pieces
-from miricigale.fitting.data.likelihood import PhotometryReader
+from miricigale.fitting.data.likelihood import PhotometryReader, flux_columns
 from miricigale.fitting.data.template_error import TemplateError, pivots
 from miricigale.fitting.posterior.priors import known_redshifts
 from miricigale.fitting.results.pulls import without_warnings
@@ -20,6 +20,7 @@ from miricigale.fitting.survey.band_errors import (
 )
 from miricigale.fitting.survey.survey import (
     SurveyCalibration,
+    bands_in_catalog,
     calibrate,
     on_nodes,
     with_calibration,
@@ -187,7 +188,7 @@ class SourceSample:
         return None
 
     def photometry(self):
-        """Fluxes and errors as in the catalog: `~miricigale.fitting.data.likelihood.FitData`."""
+        """Read fluxes and errors as in the catalog: `~miricigale.fitting.data.likelihood.FitData`."""
         return self._reader.read(self.table)
 
 
@@ -269,7 +270,7 @@ def calibrate_bands(
 
 def sample_of(fitter, columns, seed):
     """Make an empty `SourceSample` for a fitter and a catalog with these columns."""
-    bands = [band for band in fitter.filters or fitter.bands if band in columns]
+    bands = bands_in_catalog(fitter, columns)
     return SourceSample(bands, (fitter.grid.redshift[0], fitter.grid.redshift[-1]), seed)
 
 
@@ -389,7 +390,7 @@ def _name_of(fitter, rows, column, options):
 def _take_rows(fitter, rows, options):
     """Return a function of the number of a piece: its table, with units, and the redshift options of `fit`."""
     redshift_options = {name: options.get(name) for name in ("redshift", "redshift_prior")}
-    fluxes = {column for band in fitter.bands for column in (band, error_column(band))}
+    fluxes = set(flux_columns(fitter.bands))
     return row_pieces(rows, redshift_options, options.get("flux_unit"), fluxes)
 
 

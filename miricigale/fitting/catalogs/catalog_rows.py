@@ -32,7 +32,7 @@ def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None, flux_unit=None
 
 
 def _named_rows(rows, flux_unit):
-    """Rows under our names; with magnitudes by a map that makes fluxes of them."""
+    """Put rows under our names; with magnitudes by a map that makes fluxes of them."""
     first = rows.chunk(0)
     names, magnitudes = band_columns(first, rows.path.name)
     unit = None

@@ -8,10 +8,11 @@ from astropy.stats import mad_std
 from astropy.table import QTable
 
 from miricigale.filters.band_names import known_filter
-from miricigale.fitting.data.likelihood import FitFlags, flux_column
+from miricigale.fitting.data.likelihood import FitFlags, flux_column, flux_columns
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.posterior.posterior import randomized_ranks
 from miricigale.fitting.results.pulls import without_warnings
+from miricigale.fitting.survey.survey import bands_in_catalog
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
@@ -81,21 +82,21 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     seed = check_seed(seed)
     fitter = fitter.for_photometry(photometry)
     filters = results.fitted_filters
-    columns = []
-    for name in filters:
-        columns += [name, error_column(name)]
+    columns = flux_columns(filters)
     require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
     if not np.array_equal(read_ids(photometry), results.ids):
         raise argument_error("photometry", "of the objects of 'results', in order", "others")
     if results.redshift_fixed and options.get("redshift") is None:
         raise argument_error("redshift", "given again: it was fixed in 'results'", "None")
     n_bands = len(results.filters)
+    # every object has its own stream, by its id
     noise = [stream(seed, "mock", str(key)).normal(size=n_bands) for key in results.ids]
     noise = np.reshape(noise, results.flux.shape)
     if model_error:
         error = results.sigma
     else:
         error = results.flux_err
+    # bands without an error in the fit stay as they are, and so do limits
     in_fit = np.isfinite(results.sigma) & results.fitted[:, None] & np.isfinite(error)
     redrawn = in_fit & ~results.limit
     noisy_flux = results.best_flux + noise * error
@@ -103,6 +104,7 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     for name in filters:
         i = results.filters.index(name)
         point = fitter.zero_points.get(name, 1.0)
+        # the catalog is without zero points, which the fit applies again
         measured = noisy_flux[:, i] / point
         mock[name] = np.where(redrawn[:, i], measured, flux_column(photometry, name)) * FNU
     meta = {"seed": seed, "model_error": bool(model_error)}
@@ -162,7 +164,7 @@ class MockResult:
         return self.truth.parameters
 
     def true(self, name):
-        """True values: Quantity, shape (n,); NaN where there is none."""
+        """Return true values: Quantity, shape (n,); NaN where there is none."""
         return self.truth.best[name]
 
     def to_table(self):
@@ -239,6 +241,7 @@ class MockResult:
         true = self.true(name).value[good]
         if name in self.recovered.axes:
             values = self.recovered.axes[name].values
+            # the truth lies on a node, where the distribution steps: its rank is drawn within the step
             node = np.argmin(np.abs(true[:, None] - values), axis=1)
             draw = [stream(self.seed, "rank", name, str(i)).random() for i in self.truth.ids[good]]
             rank = randomized_ranks(self.recovered.pdf[name][good], node, draw)
@@ -323,7 +326,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
         groups = [(name,) for name in bands]
     else:
         groups = [bands]
-    fitted = [f for f in fitter.filters or fitter.bands if f in photometry.colnames]
+    fitted = bands_in_catalog(fitter, photometry.colnames)
     for group in groups:
         if len(set(fitted) - set(group)) < fitter.n_bands_min:
             wanted = f"such that n_bands_min = {fitter.n_bands_min} or more of {fitted} are left"
@@ -335,6 +338,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     for group in groups:
         blank = QTable(photometry, copy=True)
         for name in group:
+            # a band without flux and limit takes no part in the fit
             blank[name] = np.full(len(blank), np.nan) * FNU
             blank[f"{name}_limit"] = np.zeros(len(blank), dtype=bool)
         results |= dict.fromkeys(group, fitter.fit(blank, **options))
@@ -457,6 +461,7 @@ class LeaveOutResult:
         pull = self.pull[good, i]
         flux = self.flux[good, i]
         model = self.predicted[good, i]
+        # ratios need predictions above 0
         offset = _statistic(np.median, flux[model > 0] / model[model > 0]) - 1.0
         return {
             "band": self.bands[i],

@@ -12,7 +12,7 @@ CLASSES = ("quasars", "red_dots", "stars")
 
 def chosen_classes(classes, *, quasars=False, red_dots=False, stars=None):
     """
-    Classes that a caller asks for, by one argument or by one for each.
+    Collect the classes that a caller asks for, by one argument or by one for each.
 
     Parameters
     ----------
@@ -48,7 +48,10 @@ def chosen_classes(classes, *, quasars=False, red_dots=False, stars=None):
         if stars is None:
             names.discard("stars")
             log.info("classes: no stars, for which there are no spectra ('stars', --stars)")
-    names |= {name for name, wanted in (("quasars", quasars), ("red_dots", red_dots)) if wanted}
+    if quasars:
+        names.add("quasars")
+    if red_dots:
+        names.add("red_dots")
     if stars is not None:
         names.add("stars")
     if "stars" in names:

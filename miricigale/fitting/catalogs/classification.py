@@ -208,6 +208,7 @@ def _prior(prior, names, n):
     if prior is None:
         return np.ones((len(names), n))
     check_that(set(prior) == set(names), "prior", f"of the classes {names}", sorted(prior))
+    # one share for all objects, or one for each
     weight = np.array([np.broadcast_to(floats(prior[name]), (n,)) for name in names])
     if not np.all(np.isfinite(weight) & (weight >= 0)) or not np.all(weight.sum(axis=0) > 0):
         raise argument_error("prior", "finite, >= 0 and not all 0", f"{prior}")

@@ -166,7 +166,7 @@ def fit_catalog(
 
 def first_calibration(calibration, axes, model_error):
     """
-    Calibration before a catalog says anything: given, read from a file, or that of the models.
+    Choose the calibration before a catalog is measured: given, read from a file, or that of the models.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def first_calibration(calibration, axes, model_error):
 
 def calibrated(fitter, rows, calibrate, output, options):
     """
-    Fitter with what its catalog says of models and bands; that of `first_calibration` where it is not asked.
+    Calibrate a fitter on its catalog, unless `first_calibration` is to be kept.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def calibrated(fitter, rows, calibrate, output, options):
 
 def calibrates_itself(calibrate, calibration, axes, models, model_error):
     """
-    Column of known redshifts, or whether the errors of bands are measured on the catalog.
+    Decide whether the errors of bands are measured on the catalog, or return the column of known redshifts.
 
     Parameters
     ----------

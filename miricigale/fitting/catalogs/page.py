@@ -121,8 +121,8 @@ def _of_classes(numbers, columns):
     """Return the numbers of all objects but stars, with the redshifts of their classes."""
     out = numbers.copy()
     if not numbers.meta["fixed"]:
-        names = [f"redshift_{level}" for level in ("p16", "p50", "p84")]
-        out["z"] = np.column_stack([columns[name] for name in names])
+        percentiles = ("redshift_p16", "redshift_p50", "redshift_p84")
+        out["z"] = np.column_stack([columns[name] for name in percentiles])
     return out[columns["class"] != "star"]
 
 
@@ -299,6 +299,7 @@ def _physics(page, numbers):
         groups |= {f"fracAGN at least {_AGN_LIMIT:g}": (strong, _SECOND_COLOR)}
     for label, (rows, color) in groups.items():
         ax.plot(drawn["z"][rows, 1], mass[rows], ".", ms=4, color=color, label=label)
+    # a few extreme masses must not set the scale
     low, high = np.percentile(mass, [0.5, 99.5])
     ax.set(xlabel="redshift", ylabel="log stellar mass (Msun)", ylim=(low - 0.5, high + 0.5))
     if with_agn:
@@ -336,6 +337,7 @@ def _choose(numbers):
     if not rows.size:
         return []
     fitted = numbers[rows]
+    # from the best to the worst fit
     order = rows[np.argsort(fitted["chi2"], kind="stable")]
     places = {0.1: "a good fit", 0.5: "median chi2", 0.9: "worst tenth", 1.0: "the worst fit"}
     chosen = {}

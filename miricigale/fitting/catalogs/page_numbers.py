@@ -20,7 +20,7 @@ def thinned(parts, step):
 
 def fit_numbers(results, step=1):
     """
-    Numbers of all objects, or of every ``step``-th, in the order of the catalog.
+    Collect the numbers of all objects, or of every ``step``-th, in the order of the catalog.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def _numbers(part):
 
 def known_redshifts(rows, name, step=1):
     """
-    Known redshifts of a catalog.
+    Read the known redshifts of a catalog.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.filters.photometry_table import unit_of_fluxes
 from miricigale.fitting.catalogs.catalog_rows import give_units, open_catalog
 from miricigale.fitting.data.fitted_bands import bands_with_errors, warn_of_unfitted
-from miricigale.fitting.data.likelihood import HIGH_CHI2, unused_bands
+from miricigale.fitting.data.likelihood import HIGH_CHI2, flux_columns, unused_bands
 from miricigale.fitting.data.nuclei import nucleus_columns
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.results.io import (
@@ -38,7 +38,7 @@ from miricigale.utils.meta import plain_value, undated
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
-from miricigale.utils.tables import ascii_ids, error_column, read_ids, require_columns
+from miricigale.utils.tables import ascii_ids, read_ids, require_columns
 
 logger = logging.getLogger(__name__)
 
@@ -161,8 +161,8 @@ def fit_file(
     else:
         for text in rows.messages():
             warn(f"{rows.path.name}: {text}", CatalogWarning)
-    named = [*fitter.bands, *nucleus_columns(rows.colnames)]
-    fluxes = {c for name in named for c in (name, error_column(name))}
+    named = list(fitter.bands) + list(nucleus_columns(rows.colnames))
+    fluxes = set(flux_columns(named))
     take = row_pieces(rows, options, unit, fluxes)
     kinds = set()
     for i in range(rows.n_chunks):

@@ -30,7 +30,7 @@ def bands_of(photometry):
     ours = our_names(table.colnames, "photometry")
     bands = bands_with_errors([ours.get(name, name) for name in table.colnames], "photometry")
     catalog_names = {name for name, our in ours.items() if our in bands}
-    return bands, unused_bands(table, {*bands, *catalog_names})
+    return bands, unused_bands(table, catalog_names.union(bands))
 
 
 def warn_of_unfitted(unused):

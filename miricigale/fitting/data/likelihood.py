@@ -265,7 +265,7 @@ class PhotometryReader:
     error_factor: dict = field(default_factory=dict)
 
     def fitted(self, table):
-        """Bands of a catalog that are fitted: tuple of str."""
+        """List the bands of a catalog that are fitted: tuple of str."""
         require_columns(table, [], "photometry")
         if self.filters is not None:
             return self.filters
@@ -300,9 +300,7 @@ class PhotometryReader:
             If a flux has no unit of flux density.
         """
         filters = self.fitted(table)
-        columns = []
-        for name in filters:
-            columns += [name, error_column(name)]
+        columns = flux_columns(filters)
         require_columns(table, ["id", *columns], "photometry")
         for name in columns:
             if getattr(table[name], "unit", None) is None:
@@ -344,11 +342,13 @@ class PhotometryReader:
                 np.where(limit[:, column], own_err, total_err), _MIN_RELATIVE_ERROR * abs_flux
             )
             sigma[:, column] = np.where(usable, total_err, np.inf)
+        # flags of whole objects
         n_bands = np.isfinite(sigma).sum(axis=1)
         flags[(n_bands > 0) & (n_bands == limit.sum(axis=1))] |= int(FitFlags.ALL_LIMITS)
         flags[n_bands == 0] |= int(FitFlags.NO_BAND)
         flags[(n_bands > 0) & (n_bands < self.n_bands_min)] |= int(FitFlags.FEW_BANDS)
         ids = read_ids(table)
+        # of several rows with an id the first is fitted
         first_of_id = np.zeros(n, dtype=bool)
         first_of_id[np.unique(ids, return_index=True)[1]] = True
         is_duplicate = ~first_of_id
@@ -358,9 +358,17 @@ class PhotometryReader:
         return FitData(ids, flux, flux_err, sigma, limit, flags)
 
 
+def flux_columns(bands):
+    """List the columns of the fluxes of bands and their errors: list of str."""
+    columns = []
+    for band in bands:
+        columns += [band, error_column(band)]
+    return columns
+
+
 def unused_bands(table, filters):
     """
-    Names of the bands of a catalog that are not fitted (``filters``), in the order of the columns.
+    List the bands of a catalog that are not fitted (``filters``), in the order of the columns.
 
     A column is a band if it has an error ``<name>_err`` and both are in a unit of flux
     density, or if its name is that of a filter.
@@ -401,7 +409,7 @@ def _is_flux(column):
 
 def limits(table, name):
     """
-    Rows whose flux in a band is an upper limit: array of bool, shape (n,).
+    Find the rows whose flux in a band is an upper limit: array of bool, shape (n,).
 
     The column ``<name>_limit``, if it is there, is boolean, or holds 0 and 1 or ``true`` and
     ``false`` as text files do; masked and empty values are no limits. A `ValueError` is raised for a column
@@ -415,7 +423,7 @@ def limits(table, name):
     data_values = np.asarray(getattr(values, "unmasked", np.ma.getdata(values)))
     text = np.char.strip(np.char.lower(data_values.astype(str)))
     is_true = np.isin(text, _TRUE)
-    is_readable = np.isin(text, (*_TRUE, *_FALSE))
+    is_readable = is_true | np.isin(text, _FALSE)
     if getattr(values, "unit", None) is not None:
         is_readable = is_true = np.zeros(len(table), dtype=bool)
     if data_values.shape != (len(table),) or not np.all(is_readable | mask):
@@ -426,14 +434,14 @@ def limits(table, name):
 
 
 def filter_names(argument, filters):
-    """Names of a `~miricigale.filters.FilterSet` or list of names: tuple of str."""
+    """Return the names of a `~miricigale.filters.FilterSet` or list of names: tuple of str."""
     if isinstance(filters, str):
         raise argument_error(argument, "a list of names or a FilterSet", repr(filters))
     return tuple(getattr(filters, "names", filters))
 
 
 def per_band(value, filters, name):
-    """A setting by filter, dict of str to float: given as a number or by name."""
+    """Expand a setting, given as a number or by name, to all filters: dict of str to float."""
     if isinstance(value, dict):
         parts = value
     else:
@@ -450,7 +458,7 @@ def per_band(value, filters, name):
 
 def flux_column(table, name):
     """
-    Fluxes of a column in uJy, NaN where masked: a new array, shape (n,).
+    Read the fluxes of a column in uJy, NaN where masked: a new array, shape (n,).
 
     A `ValueError` is raised for one without real numbers, or with several in a row.
     """
@@ -471,7 +479,7 @@ def flux_column(table, name):
 
 def flags_of_fits(results, measured, edge_weight):
     """
-    Flags of results, with those that the fits show.
+    Add the flags that follow from fits to those of results.
 
     ``measured`` are the bands with a flux, shape (n, nb); ``edge_weight`` is the weight of the first
     or last redshift above which an object is flagged, None where redshifts were fixed.
@@ -483,6 +491,7 @@ def flags_of_fits(results, measured, edge_weight):
     with np.errstate(invalid="ignore"):
         flags[fitted & (results.band_off != "")] |= FitFlags.BAND_OFF
         flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
+        # S/N of the best model in all bands together
         faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
         flags[fitted & faint] |= FitFlags.LOW_SIGNAL
         if edge_weight is not None and pdf.shape[1] > 2:

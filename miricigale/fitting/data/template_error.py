@@ -62,19 +62,19 @@ class TemplateError:
         self.__dict__.update(wave=frozen_array(wave) * WAVE, error=frozen_array(error))
 
     def __call__(self, wave):
-        """Error at rest wavelengths (`~astropy.units.Quantity`): `~numpy.ndarray` of their shape."""
+        """Interpolate the error at rest wavelengths (`~astropy.units.Quantity`): an array of their shape."""
         wave = to_array(wave, WAVE, "wave")
         return np.interp(np.log(wave), np.log(self.wave.to_value(WAVE)), self.error)
 
     @classmethod
     def from_meta(cls, values):
-        """Template error of the plain values (``um`` and ``error``) in the file of a `SurveyCalibration`."""
+        """Make the template error of the values ``um`` and ``error`` in the file of a `SurveyCalibration`."""
         return cls(values["um"] * WAVE, values["error"])
 
     @classmethod
     @deprecated("1.0", alternative="SurveyCalibration.survey().template_error")
     def survey(cls):
-        """Template error of `~miricigale.sed.SEDModel.survey`: that of `SurveyCalibration.survey`."""
+        """Load the template error of `~miricigale.sed.SEDModel.survey`: that of `SurveyCalibration.survey`."""
         # the file is read here too: the calibration knows template errors, not the other way round
         table = read_table(locate("survey.ceers"), wanted="a calibration", form="ascii.ecsv")
         return cls.from_meta(table.meta["template_error"])

@@ -419,7 +419,8 @@ class AdaptiveSampler:
             return None
         weight = np.exp(np.maximum(log - top, -700.0))
         log_mean = top + np.log(weight.mean())
-        return WeightedPlaces(rows, weight, log_mean, *self._wanted(weight, rows))
+        effective, enough, wanted = self._wanted(weight, rows)
+        return WeightedPlaces(rows, weight, log_mean, effective, enough, wanted)
 
     def _add_round(self, mixture, size):
         """Draw places of a mixture and evaluate them; returned are their ends for `_core.add_density`."""
@@ -480,7 +481,8 @@ class AdaptiveSampler:
         table = np.arange(n.size).reshape(-1, len(self.peaks))
         parts = [table[members].ravel() for members in self.members]
         least_each = max(_EFFECTIVE_PART * self.wanted, _MIN_EFFECTIVE)
-        for members in (*table, *table.T, *parts):
+        # each label, each peak, and each range of a component
+        for members in list(table) + list(table.T) + parts:
             total = part[members].sum()
             if total <= _MIN_COUNTED_WEIGHT:
                 continue

@@ -44,6 +44,7 @@ def between_results(fit, data, posteriors, pairs):
         _put_parameters(arrays, i, posterior)
     flags = np.array(data.flags)
     converged = np.array([posterior.converged for posterior in posteriors], bool)
+    # results rest on fewer models than were asked for
     flags[~converged] |= int(FitFlags.NOT_CONVERGED)
     node = np.array([posterior.best_node for posterior in posteriors]).reshape(n, -1)
     log_errors = fit.log_errors(data)
@@ -105,6 +106,7 @@ def _put_parameters(arrays, i, posterior):
         moments, quantiles = draws_summary(posterior.values[name], weight=weight)
         arrays["axis_moments"][i, j] = moments[:2]
         arrays["axis_quantiles"][i, j] = quantiles
+    # every fit has the joint posterior of redshift and AGN fraction
     joint = arrays["pairs"] | {("redshift", "frac_agn"): arrays["pdf_2d"]}
     for (x, y), table in joint.items():
         table[i] = node_shares((node[x], node[y]), table.shape[1:], weight)
@@ -116,6 +118,7 @@ def _derived_summaries(quantities, posteriors):
     moments = np.full((n, len(quantities.names), 3), np.nan)
     quantiles = np.full((n, len(quantities.names), DERIVED_LEVELS.size), np.nan)
     for j, name in enumerate(quantities.names):
+        # a mean of log10 has a meaning for what scales with mass
         with_log = name not in quantities.intensive
         for i, posterior in enumerate(posteriors):
             if name in posterior.derived:
@@ -130,7 +133,7 @@ def _derived_summaries(quantities, posteriors):
 def _best(fit, posteriors):
     """Collect parameters and derived quantities of the best models: dict of str to array."""
     out = {}
-    for name in (*fit.priors.axes, *fit.engine.quantities.names):
+    for name in list(fit.priors.axes) + list(fit.engine.quantities.names):
         values = [posterior.best.get(name, np.nan) for posterior in posteriors]
         out[name] = np.array(values, float)
     return out

@@ -259,6 +259,7 @@ class Continuation(Frozen):
         """`_core.Mixture` of an object, of bands that may be wrong (`BandMixture`)."""
         used, part = stated.bands, bands.part[stated.bands]
         narrow, wide = np.take(stated.weight, used, axis=1), broad[used]
+        # odds of the broad part without a residual: p sigma / ((1 - p) Sigma)
         odds = part / (1.0 - part) / np.sqrt(narrow) / wide
         # of fluxes in units of the errors without that of templates
         level = 0.5 * np.log(narrow * np.square(sigma[used])).sum(axis=1)
@@ -308,6 +309,7 @@ class Continuation(Frozen):
             if nuclei is not None:
                 share = nuclei.of_bands(share)
         mean = weight @ drawn_flux
+        # about the mean, so that narrow posteriors keep their digits
         variance = weight @ np.square(drawn_flux - mean)
         # the best model is that of the highest likelihood, at its own scale
         best = int(np.argmax(models.log_likelihood))
@@ -330,7 +332,7 @@ class Continuation(Frozen):
         )
 
     def _with_nuclei(self, nuclei, flux, values, power):
-        """Fluxes of models, (n, nb), with those of nuclei; ``power``, (n,), is that of their AGN."""
+        """Extend fluxes of models, (n, nb), by those of nuclei; ``power``, (n,), is that of their AGN."""
         agn = np.zeros(flux.shape)
         present = power > 0.0
         if present.any():

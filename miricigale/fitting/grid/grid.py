@@ -107,6 +107,7 @@ class GridEngine(Frozen):
     def n_models(self):
         """Number of different models that are evaluated or bounded."""
         n_zero = int(self._zero_frac)
+        # f = 0 is one model of each galaxy, whatever the AGN template
         n_each = n_zero + self.grid.n_agn * (self.grid.frac_agn.size - n_zero)
         return int(np.count_nonzero(self.usable)) * n_each
 
@@ -140,6 +141,7 @@ class GridEngine(Frozen):
         n_z, n_galaxy, n_bands = self.galaxy.shape
         block = _core.BLOCK
         n_padded = -(-n_galaxy // block) * block
+        # galaxies in blocks that the kernels handle side by side, padded with ones
         padded = np.ones((n_z, n_padded, n_bands))
         padded[:, :n_galaxy] = self.galaxy
         tiles = _core.aligned(n_z, n_padded // block, n_bands, block)
@@ -314,6 +316,7 @@ class GridEngine(Frozen):
                     start = Start(out.draw_index[i], out.zf[i], False)
                     excess = out.chi2[i] / np.isfinite(sigma[i]).sum()
                     if excess > _MAX_EXCESS:
+                        # errors at which the best model on nodes fits
                         larger = np.sqrt(excess)
                         loose = _core.make_target(
                             data[i], larger * sigma[i], log_prior[i], larger * self.template_error
@@ -359,8 +362,8 @@ class GridEngine(Frozen):
         tables, target, _ = self._of_masses(target, workspace[2])
         sums.draws.state[0] = seed
         _core.clear(sums)
-        given = tables, self._scales, self._request, target, limits
-        if not (target.norm[0] > 0.0 and _core.sum_up(*given, *workspace, single=single)):
+        arguments = (tables, self._scales, self._request, target, limits)
+        if not (target.norm[0] > 0.0 and _core.sum_up(*arguments, *workspace, single=single)):
             return None
         return Start(np.array(sums.draws.index), sums.zf / sums.zf.sum(), True)
 
@@ -394,6 +397,7 @@ class GridEngine(Frozen):
         rows = np.flatnonzero(target.log_prior > -1e200)
         galaxy = self.galaxy[rows]
         weight = target.weight[rows]
+        # best scale without AGN: <G, wF> / <G, wG>
         data = np.einsum("zgb,zb->zg", galaxy, weight * target.flux)
         norm = np.einsum("zgb,zgb,zb->zg", galaxy, galaxy, weight)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -499,6 +503,7 @@ class GridEngine(Frozen):
         if not self.scale_error:
             return scale
         error = np.sqrt(np.maximum(variance, _MIN_VARIANCE))
+        # inverse of the cumulative normal distribution, cut at a scale of 0
         low = ndtr(-scale / error)
         return scale + error * ndtri(low + (1.0 - low) * uniform)
 

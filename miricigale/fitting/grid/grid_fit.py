@@ -136,7 +136,7 @@ class GridFit:
 
     def with_nuclei(self, bands):
         """
-        The same for data with nuclei.
+        Return the fit for data with nuclei.
 
         Parameters
         ----------
@@ -152,7 +152,9 @@ class GridFit:
         wanted = "False for models without AGN, whose fluxes those of nuclei are"
         check_that(has_agn, "nuclei", wanted, "True")
         index = tuple(self.filters.index(band) for band in bands)
-        error = 0.0 if self.between is None else self.between.agn_error
+        error = 0.0
+        if self.between is not None:
+            error = self.between.agn_error
         stars = float(self.given.nuclear_stars)
         return replace(self, nuclei=NuclearGrid(self.engine, index, stars, error))
 
@@ -281,11 +283,11 @@ class GridFit:
         return check_pairs(pairs, self.priors.axes, self.constants, derived, wanted)
 
     def task(self, pairs, _seed, _log_prior):
-        """Function that fits a piece of the catalog; nothing is drawn, and the prior comes with it."""
+        """Return a function that fits a piece of the catalog; nothing is drawn, and the prior comes with it."""
         return partial(self.fit_piece, self.check_pairs(pairs))
 
     def fit_piece(self, pairs, piece):
-        """`FitResults` of a piece: its photometry and priors of redshift."""
+        """Fit a piece, its photometry and priors of redshift: `FitResults`."""
         data, log_prior = piece
         if data.nuclei is not None:
             return fit_with_nuclei(self, data, log_prior, pairs)
@@ -294,7 +296,7 @@ class GridFit:
         return self._on_nodes(data, log_prior, pairs)
 
     def _on_nodes(self, data, log_prior, pairs):
-        """Results on nodes alone."""
+        """Fit on nodes alone."""
         joint = joint_names(pairs, self.priors.axes)
         options = {}
         if joint:
@@ -302,13 +304,14 @@ class GridFit:
             options = {"joint": joint, "workspace": workspace}
         # joint sums are large: those of a few objects are reduced before the next are made
         size = self.engine.size
-        each = sum(size[x] * size[y] for x, y in joint)
-        step = max(1, min(_JOINT_SIZE // max(each, 1), len(data)))
+        # numbers in the joint sums of one object
+        joint_size = sum(size[x] * size[y] for x, y in joint)
+        step = max(1, min(_JOINT_SIZE // max(joint_size, 1), len(data)))
         parts = []
         for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
-            some = data[rows]
-            out = self.engine.fit(**some.of_engine(log_prior[rows]), **options)
-            parts.append(self.results_on_nodes(some, out, pairs))
+            photometry = data[rows]
+            out = self.engine.fit(**photometry.of_engine(log_prior[rows]), **options)
+            parts.append(self.results_on_nodes(photometry, out, pairs))
         return FitResults.concatenate(parts)
 
     def _between_nodes(self, data, log_prior, pairs):
@@ -359,7 +362,7 @@ class GridFit:
         return posteriors.get(0)
 
     def _at_redshifts(self, data, log_prior, pairs):
-        """Results on nodes of objects at their own redshifts."""
+        """Fit objects on nodes at their own redshifts."""
         parts = []
         for rows in list(chunks(len(data), 1)) or [slice(0, 0)]:
             if len(data[rows]):
@@ -369,11 +372,13 @@ class GridFit:
         return FitResults.concatenate(parts)
 
     def _at_redshift(self, data, log_prior, pairs):
-        """Results on nodes of an object at its own redshift, which stand at the nearest node."""
+        """Fit an object on nodes at its own redshift; results stand at the nearest node."""
         z = float(data.redshift[0])
         fitted = np.isfinite(log_prior).any()
         node = int(np.argmax(log_prior[0]))
-        engine = self.between.at_redshift(z if fitted else self.grid.redshift[0], node)
+        if not fitted:
+            z = self.grid.redshift[0]
+        engine = self.between.at_redshift(z, node)
         joint = joint_names(pairs, self.priors.axes)
         workspace = engine.workspace(joint=joint)
         photometry = data.of_engine(log_prior[:, node : node + 1])
@@ -381,25 +386,29 @@ class GridFit:
         return self.results_at_redshift(data, out, log_prior, pairs)
 
     def results_at_redshift(self, data, out, log_prior, pairs):
-        """From models at the redshift of one object to results, which stand at the nearest node."""
+        """Convert models at the redshift of one object to results, which stand at the nearest node."""
         z = float(data.redshift[0])
         n_z = log_prior.shape[1]
         node = int(np.argmax(log_prior[0]))
         if np.isfinite(log_prior).any():
             out.index[:, 0] = node
-        here = (np.arange(n_z) == node)[:, None]
+        is_node = (np.arange(n_z) == node)[:, None]
 
         def all_redshifts(table):
-            return np.where(here, table, table * 0.0)
+            # objects that were not fitted stay NaN
+            return np.where(is_node | np.isnan(table), table, 0.0)
 
-        joint = {k: all_redshifts(v) if k[0] == "z" else v for k, v in out.joint.items()}
+        joint = dict(out.joint)
+        for name, table in out.joint.items():
+            if name[0] == "z":
+                joint[name] = all_redshifts(table)
         out = out._replace(zf=all_redshifts(out.zf), joint=joint)
         results = self.results_on_nodes(data, out, pairs)
         best = results.best | {"redshift": 0.0 * results.best["redshift"] + z}
         return results._changed(best=best)
 
     def results_on_nodes(self, data, out, pairs):
-        """From models to parameters and derived quantities."""
+        """Convert models to parameters and derived quantities."""
         flags = np.array(data.flags)
         if self.compat == "cigale":
             vanished = out.chi2 > VANISHING_CHI2
@@ -450,7 +459,7 @@ class GridFit:
         )
 
     def _no_agn_weights(self, n):
-        """NaN for the weights in bins of objects without models between nodes; None where none are asked for."""
+        """Return NaN weights in bins for objects without models between nodes; None if none are asked for."""
         bins = self.given.agn_bins
         if bins is None:
             return None
@@ -460,6 +469,7 @@ class GridFit:
         """Compute ln of the product of the errors that likelihoods are divided by, shape (n,)."""
         # limits are probabilities, which have no unit
         log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
+        # factors sqrt(2 pi) sigma of the normal densities
         return log_sigma + 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
 
     def with_template_error(self, data, node):

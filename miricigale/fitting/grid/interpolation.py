@@ -38,7 +38,7 @@ class _GalaxiesOfGrid:
     shape_names: tuple
 
     def quantities(self, light, values):
-        """As `ModelGalaxies.quantities`."""
+        """Derive quantities as `ModelGalaxies.quantities` does."""
         scaling = part_columns(self.scaling, values).T
         quantities = dict(zip(self.scaling_names, scaling, strict=True))
         shape = log_part_columns(self.shape, values).T
@@ -124,12 +124,13 @@ class InterpolatedModels:
         place_of_amount = -1
         if amount is not None:
             place_of_amount = place[amount]
+        # last columns: what AGN fractions refer to, and the power that dust takes
         columns = np.column_stack([reference, reference])
         flux = np.moveaxis(np.asarray(grid.galaxy), 0, 1)
         table = logarithms(flux, columns, grid.redshift)
         stars = _part_of_grid(table, model, values, grid.redshift, place)
         names = _Names.of_grid(grid)
-        scaling_names = [*names.galaxy, "reference"]
+        scaling_names = list(names.galaxy) + ["reference"]
         scaling = [column_values(column) for column in grid.galaxy_properties.itercols()]
         scaling.append(np.asarray(grid.dust_luminosity, float))
         scaling = np.log(np.maximum(np.array(scaling).T, LEAST))
@@ -220,7 +221,7 @@ class InterpolatedModels:
         return {name: getattr(self.light, name).table.shape[1] for name in names}
 
     def make_work(self):
-        """Scratch arrays of the kernels."""
+        """Make the scratch arrays of the kernels."""
         return _core.make_work(len(self.parameters), self.n_columns)
 
     def vector(self, values, redshift):
@@ -254,6 +255,7 @@ class InterpolatedModels:
         vector = self.vector(values, redshift)
         flux = np.empty((len(redshift), self.n_bands))
         _core.interpolate_columns(self.light.agn, vector, redshift, self.make_work(), flux)
+        # tables hold ln of flux times z^2
         return np.exp(flux) * np.maximum(redshift, 1e-6)[:, None] ** -2.0
 
     def describe(self, values, redshift, power, scale):
@@ -297,6 +299,7 @@ class InterpolatedModels:
         else:
             of_galaxy = galaxy["dust_luminosity"]
             of_agn = power * agn["agn_power"]
+        # share of the AGN in the sum
         total = of_galaxy + of_agn
         return np.divide(of_agn, total, out=np.zeros(len(total)), where=total > 0)
 
@@ -305,7 +308,7 @@ def parameter_names(axes):
     """Order the parameters of models: redshift, AGN fraction, axes of galaxies, axes of AGN."""
     galaxy = [name for name, axis in axes.items() if axis.kind == "galaxy"]
     agn = [name for name, axis in axes.items() if axis.kind == "agn"]
-    return ("redshift", "frac_agn", *galaxy, *agn)
+    return tuple(["redshift", "frac_agn"] + galaxy + agn)
 
 
 def _first_value(axes, grid, name):
@@ -354,6 +357,7 @@ def _part_of_grid(table, model, values, redshift, place):
     powers = {}
     for i, name in enumerate(values):
         along = np.moveaxis(at_middle, i, 0).reshape(len(values[name]), -1, table.shape[2])
+        # a common factor of all bands is taken out
         along = along - np.median(along, axis=-1, keepdims=True)
         powers[name] = straightest_power(values[name], along)
     return make_part(tuple(values), values, powers, table, redshift, place, model)
@@ -361,7 +365,7 @@ def _part_of_grid(table, model, values, redshift, place):
 
 def _saturating_reference(reference, model, values):
     """
-    Axis of the amount of dust, whose 0 is none, and the dust's power over how far the amount saturates.
+    Find the axis of the amount of dust, whose 0 is none, and the dust's power over how far it saturates.
 
     The ratio at no dust is that of the next node. Without such an axis None and the power itself.
     """
@@ -378,6 +382,7 @@ def _saturating_reference(reference, model, values):
         models = np.moveaxis(model, i, 0)
         for j in range(len(nodes) - 1, -1, -1):
             rows = models[j][models[j] >= 0]
+            # power over 1 - exp(-a x), whose limit at x = 0 is that of the next node
             if j:
                 ratio[rows] = reference[rows] / -np.expm1(-_core.SATURATION * nodes[j])
             else:

@@ -50,6 +50,7 @@ class LabelTable:
         label_of_key = {}
         rows = []
         for index in np.ndindex(of_range.shape):
+            # components that the label does not have leave others without effect
             absent = [axes[i].absent_at_zero and index[i] == 0 for i in range(n_axes)]
             inert = without_effect[np.array(absent, bool)].any(axis=0)
             cells = []
@@ -58,6 +59,7 @@ class LabelTable:
                     cells.append((0, axes[i].values.size))
                 else:
                     cells.append(ranges[i][index[i]])
+            # combinations that differ only in axes without effect are one label
             key = tuple(cells)
             if key not in label_of_key:
                 first, count = np.array(cells).T
@@ -65,6 +67,7 @@ class LabelTable:
                     share_below[np.arange(n_axes), first + count]
                     - share_below[np.arange(n_axes), first]
                 )
+                # a label without prior weight does not exist
                 if np.all(share > 0):
                     label_of_key[key] = len(rows)
                 else:
@@ -126,6 +129,7 @@ class LabelTable:
         share_below = self.kernel.below
         first = labels.first[label]
         count = labels.count[label]
+        # a node of an axis without effect may lie outside of the range of the label
         inside = (node >= first) & (node < first + count)
         cell = np.where(inside, node, first)
         start = share_below[all_axes, first]
@@ -155,6 +159,7 @@ def labels_of_ranges(labels):
         Labels of each range of each axis that has several.
     """
     members = []
+    # labels of one axis differ in the cells that they have there
     for first, count in zip(labels.first.T, labels.count.T, strict=True):
         ranges = np.unique(np.stack([first, count], axis=1), axis=0)
         if len(ranges) < 2:
@@ -168,6 +173,7 @@ def _labels(first, count, still, share_below, log_share):
     """Make `_core.Labels` of ranges, of which some axes have no effect."""
     axes = np.zeros(first.shape, np.int64)
     n_active = (~still).sum(axis=1)
+    # active axes come first in each row
     for i, row in enumerate(~still):
         axes[i, : n_active[i]] = np.flatnonzero(row)
     first = first.astype(np.int64)

@@ -71,6 +71,7 @@ class BandMixture:
         out = np.full(np.shape(flux), np.inf)
         for i in range(len(flux)):
             measured = self.order[np.isfinite(sigma[i, self.order])]
+            # largest flux of each band and its two neighbors by wavelength
             size = np.pad(np.abs(flux[i, measured]), 1)
             top = np.maximum(size[1:-1], np.maximum(size[:-2], size[2:]))
             out[i, measured] = np.hypot(_MIN_BROAD_SIGMA * sigma[i, measured], top)
@@ -102,12 +103,14 @@ class BandMixture:
         wide = np.where(measured, broad, 1.0)
         square = np.where(measured, np.square(flux - model), 0.0)
         with np.errstate(divide="ignore"):
+            # ln of (1 - p) N(F; m, sigma) and p N(F; m, Sigma), in units of the density with sigma
             good = np.log1p(-part) - 0.5 * square / np.square(narrow)
             bad = np.log(part) - 0.5 * square / np.square(wide) + np.log(narrow / wide)
             log = np.where(measured, np.logaddexp(good, bad), 0.0)
             wrong = np.where(measured, expit(bad - good), 0.0)
             if limit is not None:
                 has_limit = np.isfinite(limit_sigma)
+                # limits: (1 - p) P + p
                 log_below = log_ndtr(np.where(has_limit, (limit - model) / limit_sigma, 0.0))
                 good = np.log1p(-self.part) + log_below
                 bad = np.log(self.part)
@@ -156,6 +159,7 @@ class Tangents:
         """Choose galaxies of every redshift, spread over all axes."""
         n_z, n_galaxy, n_bands = tables.galaxy.shape
         n_wide = -(-n_galaxy // _core.BLOCK) * _core.BLOCK
+        # golden-ratio steps: any first few galaxies are spread over all axes
         order = np.argsort(np.arange(n_galaxy) * _GOLDEN % 1.0, kind="stable")
         index = np.zeros((n_z, n_wide), np.int64)
         flux = _core.aligned(n_z, n_bands, n_wide, dtype=np.float32)
@@ -193,8 +197,9 @@ class Tangents:
         tables = self.tables
         bands = target.bands
         part = self.bands.part
-        stated = 1.0 / np.sqrt(np.take(target.weight, bands, axis=1))
-        narrow = stated / broad[bands]
+        narrow_sigma = 1.0 / np.sqrt(np.take(target.weight, bands, axis=1))
+        narrow = narrow_sigma / broad[bands]
+        # odds of the broad part without a residual: p sigma / ((1 - p) Sigma)
         odds = part[bands] / (1.0 - part[bands]) * narrow
         n_z = len(log_prior)
         ratio = tables.of_frac[0]
@@ -205,7 +210,7 @@ class Tangents:
         index = np.full((n_z, 2), -1)
         scale = np.zeros((n_z, 2))
         # likelihoods are of fluxes in units of the errors without that of the templates
-        rise = 2.0 * np.log(stated / sigma[bands]).sum(axis=1)
+        rise = 2.0 * np.log(narrow_sigma / sigma[bands]).sum(axis=1)
         best_models = np.ones(odds.shape), np.zeros(n_z), index, scale
         n = self.galaxies[0].shape[1]
         sizes = np.array([min(_N_GALAXIES, n), min(_N_MORE_GALAXIES, n), n])
@@ -218,7 +223,7 @@ class Tangents:
         model[with_agn] += scale[with_agn, 1:] * tables.agn[with_agn, index[with_agn, 1]]
         square = np.square(target.flux - model)[:, bands]
         full = np.full((n_z, len(sigma)), np.inf)
-        full[:, bands] = stated
+        full[:, bands] = narrow_sigma
         log, wrong = self.bands.log_likelihood(model, target.flux, full, broad)
         if limit_sigma is not None:
             no_flux = np.full(sigma.shape, np.inf)
@@ -227,7 +232,9 @@ class Tangents:
             )
             wrong = wrong + wrong_limits
         weight = target.weight.copy()
+        # w = (1 - q) / sigma^2 + q / Sigma^2 with q the share of the broad part
         weight[:, bands] *= 1.0 - wrong[:, bands] * (1.0 - narrow**2)
+        # constant of the tangent, so that it touches at the model
         level = 2.0 * log - rise
         level += np.sum(weight[:, bands] * square, axis=1)
         return _core.weighed(target.flux, weight, level, log_prior, bands), wrong

@@ -169,7 +169,13 @@ class ModelTables:
 
     def _starlight_logs(self, light, rows):
         """Return ln of fluxes, of what AGN fractions may refer to, and of the dust's power over its saturation."""
-        return self._starlight_tables(*self._starlight(light, rows), light.redshift)[0]
+        logs, _ = self._evaluated_starlight(light, rows)
+        return logs
+
+    def _evaluated_starlight(self, light, rows):
+        """Evaluate starlight without a burst: the tables of `_starlight_tables`."""
+        flux, columns, ratio = self._starlight(light, rows)
+        return self._starlight_tables(flux, columns, ratio, light.redshift)
 
     def _starlight_tables(self, flux, columns, ratio, redshift):
         """Compute the logarithms that fluxes follow from, and those of columns, the last the dust's power."""
@@ -299,7 +305,7 @@ class ModelTables:
         part = self._part("starlight")
         axes, powers = part.refined(lines)
         rows = part.rows(axes)
-        logs, _ = self._starlight_tables(*self._starlight(light, rows), light.redshift)
+        logs, _ = self._evaluated_starlight(light, rows)
         stars = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
         return stars, self._star_columns(axes, powers, lines), axes, powers
 
@@ -323,7 +329,7 @@ class ModelTables:
         part = PartAxes(axes, formed, self._refuses, 2 * MAX_MODELS, _COLUMN_TOLERANCE, powers)
         axes, powers = part.refined(light)
         rows = part.rows(axes)
-        _, columns = self._starlight_tables(*self._starlight(light, rows), light.redshift)
+        _, columns = self._evaluated_starlight(light, rows)
         return make_part(tuple(axes), axes, powers, columns[:, None], [0.0], self.place)
 
     def _burst(self, light, axes, powers):

@@ -214,9 +214,21 @@ def _fit_group(labels, parts, group, places, moments):
         np.empty((n_axes, n_axes)),
         np.empty(n),
     )
-    points = (places.score[rows], places.flat[rows], *moments)
-    settings = (group.first, group.label, n, _FIT_ROUNDS, _WIDER)
-    _core.fit_parts(labels, parts, *settings, *points, scratch)
+    mean, cov = moments
+    _core.fit_parts(
+        labels,
+        parts,
+        group.first,
+        group.label,
+        n,
+        _FIT_ROUNDS,
+        _WIDER,
+        places.score[rows],
+        places.flat[rows],
+        mean,
+        cov,
+        scratch,
+    )
     parts.share[group.first : group.wide] *= 1.0 - _WIDE_SHARE
     parts.share[group.wide] = _WIDE_SHARE
 

@@ -60,6 +60,7 @@ def agn_fraction_prior(frac_agn):
         raise argument_error("frac_agn", "ascending values from 0", f"{frac_agn}")
     edges = cell_edges(frac, (0.0, 1.0))[1:-1]
     log = np.linspace(-2.0, 2.0, 4001)
+    # number for each dex of lambda, and the part of it above each lambda
     number = 10.0 ** (-0.5 * log) * np.exp(-(10.0**log))
     steps = 0.5 * (number[1:] + number[:-1])
     above = 1.0 - np.concatenate([[0.0], np.cumsum(steps)]) / np.sum(steps)
@@ -104,6 +105,7 @@ def red_dot_prior(redshift):
     if z.ndim != 1 or z.size < 2 or not (z[0] >= 0 and np.all(np.diff(z) > 0)):
         raise argument_error("redshift", "two or more, ascending from 0 or more", f"{redshift}")
     deviation = (np.log1p(z) - np.log1p(_RED_DOT_REDSHIFT)) / _RED_DOT_WIDTH
+    # density in ln(1 + z) times the widths of the cells
     weights = np.exp(-0.5 * deviation**2) * np.diff(cell_edges(np.log1p(z)))
     return weights / weights.sum()
 
@@ -139,7 +141,7 @@ class MassFunction:
     evolution: float = -1.0
 
     def __call__(self, mass, redshift):
-        """Density at masses (`~astropy.units.Quantity`) and redshifts, which broadcast: `~numpy.ndarray`."""
+        """Evaluate the density at masses (`~astropy.units.Quantity`) and redshifts, which broadcast."""
         x = to_array(mass, MASS, "mass") / 10.0**self.log_mass
         return x ** (self.alpha + 1.0) * np.exp(-x) * (1.0 + np.asarray(redshift)) ** self.evolution
 
@@ -176,6 +178,7 @@ class MassPrior:
         else:
             cells = np.ones(1)
         volume = COSMOLOGY.differential_comoving_volume(redshift).value * cells
+        # ln of the number in each cell, for each dex of mass
         table = np.log(np.maximum(density, 1e-300)) + np.log(volume)[:, None]
         return cls(mass_function, np.ascontiguousarray(table), np.log10(np.maximum(stars, 1e-290)))
 
@@ -219,4 +222,5 @@ def _log_normal_sfr(relation, scatter, redshift, stars, rate, formed, rows):
     expected = expected_sfr(relation, formed * stars * MASS, redshift[rows])
     with np.errstate(divide="ignore"):
         log_ratio = np.log10(formed * rate / expected)
+    # log-normal about the relation, scatter in dex
     return -0.5 * np.square(log_ratio / scatter)

@@ -85,6 +85,7 @@ def cell_shares(values, pdf, low, high, bounds=(-np.inf, np.inf)):
     Nodes (k,), their weights (m, k), limits (m,): shape (m,). Rows of NaN give NaN.
     """
     edges = cell_edges(values, bounds)
+    # cumulative distribution at the edges, linear between them
     upto = np.pad(np.cumsum(pdf, axis=1), ((0, 0), (1, 0)))
     ends = [
         np.interp(at, edges, row) for row, at in zip(upto, np.stack([low, high], 1), strict=True)
@@ -119,6 +120,7 @@ def bin_edges(values, *, log):
     if not (log and low > 0):
         return np.linspace(low, high, _N_BINS + 1)
     edges = np.geomspace(low, high, _N_BINS + 1)
+    # rounding must not leave the extreme values outside
     edges[[0, -1]] = low, high
     return edges
 
@@ -280,11 +282,11 @@ class FitRows(ObjectRows):
         return replace(self, model=model)
 
     def to_pandas(self):
-        """The table as a `pandas.DataFrame`, without units."""
+        """Return the table as a `pandas.DataFrame`, without units."""
         return self.to_table().to_pandas()
 
     def _named(self, name):
-        """Our name of a parameter or derived quantity."""
+        """Return our name of a parameter or derived quantity."""
         return other_name(name, self.parameters)
 
     def interval(self, name, level=0.68):
@@ -307,7 +309,7 @@ class FitRows(ObjectRows):
         return self.percentile(name, [0.5 * (1.0 - level), 0.5 * (1.0 + level)])
 
     def flag_names(self):
-        """Names of the flags of each object: list of lists of str."""
+        """List the names of the flags of each object: list of lists of str."""
         return [FitFlags.names(value) for value in np.atleast_1d(self.flags)]
 
     def __add__(self, other):

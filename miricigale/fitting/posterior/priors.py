@@ -85,7 +85,7 @@ class GridAxis:
 
     def cells(self, bounds=(-np.inf, np.inf)):
         """
-        Lowest and highest values of the cells between which the posterior has weight: two arrays, shape (n,).
+        Return lowest and highest values of the cells where the posterior has weight: two arrays, shape (n,).
 
         Those of a label, and of a component that is absent, are the value itself; the first cell of what is
         present begins at 0. The outermost are those of `~miricigale.fitting.posterior.posterior.cell_edges` with
@@ -188,6 +188,7 @@ def _add_axis(axes, name, column, kind, priors, bounds, rows=None, nodes=None):
     inside = (min(low, values[0]), max(high, values[-1]))
     axis = _axis(name, values, unit, kind, priors, inside)
     share = (column[None, :] == values[:, None]).astype(float)
+    # weight of the value of each model, over that of equal weights
     factor = axis.weights @ share * values.size
     if rows is not None:
         share[:, rows] = axis.weights[:, None]
@@ -347,6 +348,7 @@ def magnitude_prior(magnitude, redshift=None):
     peak = np.maximum(
         _PEAK + _SLOPE * np.where(np.isfinite(faintness), faintness, 0.0), 0.1 * _PEAK
     )
+    # Benitez 2000, eq. 24, with the same power in both factors
     density = z**_POWER * np.exp(-((z / peak[:, None]) ** _POWER))
     return z, density / np.trapezoid(density, z, axis=1)[:, None]
 
@@ -410,6 +412,7 @@ def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
         edges = np.array([nodes[0], nodes[-1]])
     else:
         edges = np.clip(cell_edges(grid_redshift, (0.0, np.inf)), nodes[0], nodes[-1])
+    # integral of each object's density over the cells of the grid
     weights = np.maximum(np.diff(integrals_to(edges, nodes, density, total), axis=1), 0.0)
     integral = total[:, -1:]
     is_usable = np.isfinite(integral[:, 0]) & (integral[:, 0] > 0)

@@ -32,12 +32,12 @@ FORMED_TEXT = (
 
 
 def column_values(column):
-    """Values of a column as an array of float, without its unit."""
+    """Return the values of a column as an array of float, without its unit."""
     return np.asarray(getattr(column, "value", column), dtype=float)
 
 
 def unit_of(column):
-    """Unit of a column; dimensionless if it has none."""
+    """Return the unit of a column; dimensionless if it has none."""
     return getattr(column, "unit", None) or u.dimensionless_unscaled
 
 
@@ -154,7 +154,7 @@ class ShapeQuantities:
 
     def summarize(self, weights, levels):
         """
-        Moments, shape (n, n_quantities, 3), and quantiles, from posterior weights of galaxies (n, nG).
+        Compute moments, (n, n_quantities, 3), and quantiles from posterior weights of galaxies (n, nG).
 
         The moments are mean, standard deviation, and NaN (a mean of log10 has no meaning here); the
         quantiles, at ``levels``, those of the distribution over the different values, linear within each

@@ -161,7 +161,7 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
     if "frac_agn" in (x, y) and "frac_agn" not in results.axes:
         raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
     weights = results._one("plot_pdf2d").joint_pdf(x, y)
-    kwargs.setdefault("labels", tuple(labeled(name, results.unit(name)) for name in (x, y)))
+    kwargs.setdefault("labels", (labeled(x, results.unit(x)), labeled(y, results.unit(y))))
     # edges around the nodes: there an absent component has a cell that can be seen
     x_edges = cell_edges(results.axes[x].values, results.axes[x].bounds)
     y_edges = cell_edges(results.axes[y].values, results.axes[y].bounds)

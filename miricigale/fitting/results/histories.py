@@ -14,7 +14,7 @@ _STEPS = 400
 
 
 def rates_at(component, values, lookback):
-    """Rates (Msun/yr for one solar mass formed) at lookback times (Gyr); 0 before the first stars."""
+    """Look up rates (Msun/yr for one solar mass formed) at lookback times (Gyr); 0 before the first stars."""
     history = component.history(values)
     # steps of 1 Myr, the oldest first
     step = history.size - 1 - np.floor(lookback * 1e3).astype(int)
@@ -23,7 +23,7 @@ def rates_at(component, values, lookback):
 
 def sfh_band(samples, key, levels=LEVELS):
     """
-    Percentiles of the star-formation history of one object.
+    Compute percentiles of the star-formation history of one object.
 
     Parameters
     ----------

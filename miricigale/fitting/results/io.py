@@ -104,8 +104,10 @@ def write_samples(samples, path, *, overwrite=False):
         "n_draws": samples.n_draws,
     }
     table = Table(dict(samples._per_object()))
-    shares = {f"SHARE{i}": axis.share for i, axis in enumerate(samples.axes.values())}
-    shares = {name: np.asarray(x, dtype=float) for name, x in shares.items() if x is not None}
+    shares = {}
+    for i, axis in enumerate(samples.axes.values()):
+        if axis.share is not None:
+            shares[f"SHARE{i}"] = np.asarray(axis.share, dtype=float)
     parts = {"text": text, "arrays": shares, "tables": {"SAMPLES": table}}
     write_parts(path, _SAMPLES, shown=samples.to_table(), **parts, overwrite=overwrite)
 
@@ -121,8 +123,10 @@ def read_samples(path, grid, *, model=None):
         columns = {name: native(table[name]) for name in ("ids", "flags", "index", "scale")}
         columns["index"] = columns["index"].reshape(*shape, 4)
         columns["scale"] = columns["scale"].reshape(shape)
-        names = {name: f"SHARE{i}" for i, name in enumerate(text["axes"])}
-        shares = {name: parts.array(key) for name, key in names.items() if key in parts}
+        shares = {}
+        for i, name in enumerate(text["axes"]):
+            if f"SHARE{i}" in parts:
+                shares[name] = parts.array(f"SHARE{i}")
         axes = _axes_from_plain(text["axes"], shares)
         grid_sha256 = text["grid"]["sha256"]
         grid_text = text["grid"]["text"]
@@ -343,7 +347,7 @@ class FitResultsFiles:
         return self._read(path, [row])[0]
 
     def row(self, key):
-        """The file of an id and the row in it."""
+        """Find the file of an id and the row in it."""
         if isinstance(key, np.generic):
             key = key.item()
         for path in self.paths:
@@ -354,7 +358,7 @@ class FitResultsFiles:
         raise KeyError(msg)
 
     def _rows(self, rows):
-        """Results of rows by number, in their order."""
+        """Read the results of rows by number, in their order."""
         n_rows = [record["rows"] for record in self._records]
         ends = np.cumsum([0, *n_rows])
         of_part = np.searchsorted(ends, rows, side="right") - 1
@@ -368,7 +372,7 @@ class FitResultsFiles:
 
     def to_table(self, columns=None):
         """
-        Results as one table; see `FitResults.to_table`.
+        Return the results as one table; see `FitResults.to_table`.
 
         Parameters
         ----------

@@ -229,7 +229,7 @@ class FitResults(FitRows):
     @property
     def band_off(self):
         """The band that is off (`FitFlags` ``BAND_OFF``), empty without: array of str, shape (n,)."""
-        names = np.array([*self.filters, ""])
+        names = np.array(list(self.filters) + [""])
         worst = names[worst_bands(self._several())]
         if self.isscalar:
             return worst[0]
@@ -238,10 +238,10 @@ class FitResults(FitRows):
     @property
     def parameters(self):
         """Names of all that has a posterior: parameters, then derived quantities."""
-        return (*self.axes, *self.quantities)
+        return tuple(self.axes) + tuple(self.quantities)
 
     def unit(self, name):
-        """Unit of a parameter or derived quantity."""
+        """Return the unit of a parameter or derived quantity."""
         name = self._named(name)
         if name in self.axes:
             return u.Unit(self.axes[name].unit)
@@ -266,12 +266,12 @@ class FitResults(FitRows):
     # ------------------------------------------------------------------ posteriors
 
     def mean(self, name):
-        """Posterior means of a parameter or derived quantity: Quantity, shape (n,)."""
+        """Return the posterior means of a parameter or derived quantity: Quantity, shape (n,)."""
         mean, _ = self._moments(name)
         return mean * self.unit(name)
 
     def std(self, name):
-        """Posterior standard deviations: Quantity, shape (n,)."""
+        """Return the posterior standard deviations: Quantity, shape (n,)."""
         _, std = self._moments(name)
         return std * self.unit(name)
 
@@ -295,11 +295,11 @@ class FitResults(FitRows):
         return stored[..., list(self.axes).index(name), :]
 
     def median(self, name):
-        """Posterior medians of a parameter: `~astropy.units.Quantity`, shape (n,)."""
+        """Return the posterior medians of a parameter: `~astropy.units.Quantity`, shape (n,)."""
         return self.percentile(name, [0.5])[..., 0]
 
     def summary(self):
-        """Id, names of flags, chi2, and the 16th, 50th and 84th percentiles, as a table."""
+        """Tabulate id, names of flags, chi2, and the 16th, 50th and 84th percentiles."""
         table = self.to_table()
         columns = [name for name in table.colnames if re.search(r"^(id|chi2_best)$|_p\d\d$", name)]
         table = table[columns]
@@ -307,7 +307,7 @@ class FitResults(FitRows):
         return table
 
     def _column(self, name):
-        """Posterior medians of a parameter, or a column of the table."""
+        """Return the posterior medians of a parameter, or a column of the table."""
         if self._named(name) in self.parameters:
             return self.median(name)
         return super()._column(name)
@@ -396,7 +396,7 @@ class FitResults(FitRows):
 
     def cdf(self, name):
         """
-        Cumulative distribution of a parameter or derived quantity, linear between its points.
+        Return the cumulative distribution of a parameter or derived quantity, linear between its points.
 
         Returns
         -------
@@ -428,6 +428,7 @@ class FitResults(FitRows):
         if "redshift" in self.axes and not self.redshift_fixed:
             z = rows.median("redshift").value
             axis = self.axes["redshift"]
+            # abs(z50 - z) / (1 + z) < 0.15, solved for z
             low = (z - OUTLIER) / (1.0 + OUTLIER)
             high = (z + OUTLIER) / (1.0 - OUTLIER)
             out = cell_shares(axis.values, rows.pdf["redshift"], low, high, axis.bounds)

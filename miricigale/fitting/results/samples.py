@@ -131,11 +131,11 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def __repr__(self):
         objects = f"{len(self)} objects"
-        each = " each"
+        ending = " each"
         if self.isscalar:
             objects = repr(np.asarray(self.ids).item())
-            each = ""
-        return f"<Samples of {objects}, {self.n_draws} draws{each}>"
+            ending = ""
+        return f"<Samples of {objects}, {self.n_draws} draws{ending}>"
 
     @property
     def n_draws(self):
@@ -168,10 +168,10 @@ model : `~miricigale.sed.SEDModel`, optional
         """
         fractions = self._fractions
         derived = (name for name in self._quantities.names if name not in fractions)
-        return (*self.axes, *derived, *fractions)
+        return tuple(self.axes) + tuple(derived) + tuple(fractions)
 
     def unit(self, name):
-        """Unit of a parameter or derived quantity."""
+        """Return the unit of a parameter or derived quantity."""
         name = self._named(name)
         if name in self.axes:
             return u.Unit(self.axes[name].unit)
@@ -182,7 +182,7 @@ model : `~miricigale.sed.SEDModel`, optional
         return quantities.units[quantities.names.index(name)]
 
     def description(self, name):
-        """One line on a parameter or derived quantity."""
+        """Return one line on a parameter or derived quantity."""
         quantities = self._quantities
         texts = dict(zip(quantities.names, quantities.descriptions, strict=True))
         texts |= {name: parts[0] for name, parts in FRACTIONS.items()}
@@ -192,7 +192,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def values(self, name):
         """
-        Values of a parameter or derived quantity in every draw.
+        Return the values of a parameter or derived quantity in every draw.
 
         Returns
         -------
@@ -207,12 +207,14 @@ model : `~miricigale.sed.SEDModel`, optional
         return out.reshape(self.scale.shape) * unit
 
     def _values(self, name):
-        """Values without their unit, shape (n, n_draws); of any model for objects without draws."""
+        """Look up values without their unit, shape (n, n_draws); of any model for objects without draws."""
         z, g, k, f = np.moveaxis(self.index, -1, 0)
         grid = self.grid
         axis = self.axes.get(name)
         if name in self._fractions:
-            agn, galaxy = (self._values(part) for part in FRACTIONS[name][1:])
+            _, agn_name, galaxy_name = FRACTIONS[name]
+            agn = self._values(agn_name)
+            galaxy = self._values(galaxy_name)
             total = agn + galaxy
             return np.divide(agn, total, out=np.zeros_like(total), where=total != 0)
         if axis is None:
@@ -225,8 +227,9 @@ model : `~miricigale.sed.SEDModel`, optional
         return self._of_axis(axis, model)
 
     def _of_axis(self, axis, model):
-        """Values of a parameter; where a model stands for several, drawn as its prior has it."""
+        """Look up the values of a parameter; where a model stands for several, draw from their prior."""
         share = axis.share
+        # the value of each model, or the first of several that it stands for
         out = axis.values[np.argmax(share, axis=0)][model]
         has_several = np.count_nonzero(share > 0, axis=0) > 1
         is_shared = has_several[model] & (model >= 0)
@@ -234,13 +237,14 @@ model : `~miricigale.sed.SEDModel`, optional
         for i in np.flatnonzero(is_shared.any(axis=1)):
             rng = stream(int(self.seed), "samples", axis.name, str(self.ids[i]))
             draw = rng.random(model.shape[1])[is_shared[i]]
+            # cumulative prior over the values that the model stands for
             cdf = total[:, model[i][is_shared[i]]]
             out[i, is_shared[i]] = axis.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
         return np.where(model >= 0, out, np.nan)
 
     def to_table(self, names=None):
         """
-        All draws as a long table.
+        Return all draws as a long table.
 
         Parameters
         ----------
@@ -268,16 +272,16 @@ model : `~miricigale.sed.SEDModel`, optional
         return described_table(columns, dict(self.meta))
 
     def mean(self, name):
-        """Means of the draws: Quantity, shape (n,)."""
+        """Return the means of the draws: Quantity, shape (n,)."""
         return self.values(name).mean(axis=-1)
 
     def std(self, name):
-        """Standard deviations of the draws: Quantity, shape (n,)."""
+        """Return the standard deviations of the draws: Quantity, shape (n,)."""
         return self.values(name).std(axis=-1)
 
     def percentile(self, name, levels):
         """
-        Percentiles of the draws.
+        Compute percentiles of the draws.
 
         Parameters
         ----------
@@ -298,7 +302,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def pdf(self, name, key):
         """
-        Distribution of a parameter or derived quantity of one object.
+        Return the distribution of a parameter or derived quantity of one object.
 
         Parameters
         ----------
@@ -318,7 +322,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def pdf_2d(self, a, b, key):
         """
-        Joint distribution of two parameters or derived quantities of one object.
+        Return the joint distribution of two parameters or derived quantities of one object.
 
         Parameters
         ----------
@@ -335,13 +339,15 @@ model : `~miricigale.sed.SEDModel`, optional
             Part of the draws in each; the draws without a value (parameters of an AGN that is
             not there) are in none.
         """
-        (x, x_edges), (y, y_edges) = (self._binned(name, key) for name in (a, b))
+        x, x_edges = self._binned(a, key)
+        y, y_edges = self._binned(b, key)
+        # all draws have the same weight
         part = np.full(self.n_draws, 1.0 / self.n_draws)
         weights = np.histogram2d(x, y, (x_edges, y_edges), weights=part)[0]
         return x_edges * self.unit(a), y_edges * self.unit(b), weights
 
     def _binned(self, name, key):
-        """Values in the draws of an object, and edges of the cells."""
+        """Return the values in the draws of an object, and edges of the cells."""
         name = self._named(name)
         values = self.loc[key]._fitted_one().values(name).value
         quantities = self._quantities
@@ -355,7 +361,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def fluxes(self, filters=None):
         """
-        Model fluxes of every draw.
+        Compute the model fluxes of every draw in uJy.
 
         Parameters
         ----------
@@ -392,7 +398,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def predict(self, filters=None, *, levels=LEVELS):
         """
-        Posterior of the fluxes in any bands.
+        Tabulate the posterior of the fluxes in any bands.
 
         Parameters
         ----------
@@ -424,7 +430,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def spectra(self, key, *, rest=True):
         """
-        Spectra of the draws of one object; different galaxies and AGN models are evaluated once.
+        Compute the spectra of the draws of one object; different galaxies and AGN models are evaluated once.
 
         Parameters
         ----------
@@ -453,7 +459,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def sed_band(self, key, levels=LEVELS, *, rest=True):
         """
-        Percentiles of the spectrum of one object.
+        Compute percentiles of the spectrum of one object.
 
         Parameters
         ----------
@@ -497,7 +503,8 @@ model : `~miricigale.sed.SEDModel`, optional
         from miricigale.plotting.posteriors import plot_pdf_2d
 
         a_edges, b_edges, weights = self.pdf_2d(a, b, key)
-        kwargs.setdefault("labels", tuple(labeled(name, self.unit(name)) for name in (a, b)))
+        labels = (labeled(a, self.unit(a)), labeled(b, self.unit(b)))
+        kwargs.setdefault("labels", labels)
         return plot_pdf_2d(a_edges.value, b_edges.value, weights, ax=ax, **kwargs)
 
     def plot_corner(self, key, names=None, *, truths=None, figure=None):
@@ -550,7 +557,7 @@ model : `~miricigale.sed.SEDModel`, optional
         return plot_corner(labels, marginals, joints, truths=values, figure=figure)
 
     def _panel(self, name):
-        """Values of a single object, edges of their cells, and whether both are logarithms, for a corner plot."""
+        """Return values of a single object, edges of their cells, and whether both are logarithms."""
         values = self.values(name).value
         if name in self.axes:
             axis = self.axes[name]
@@ -562,6 +569,7 @@ model : `~miricigale.sed.SEDModel`, optional
         if log:
             values = np.log10(values)
             good = np.log10(good)
+        # the outermost draws would squeeze the panel
         low, high = np.quantile(good, [0.5 * CUT, 1.0 - 0.5 * CUT])
         # equal values get a narrow bin
         high = max(high, low + 1e-6 * max(abs(low), 1e-30))

@@ -150,7 +150,7 @@ class Lockstep:
         return out
 
     def evaluate(self, point):
-        """ln(likelihood) of one point, and the number of the call."""
+        """Return ln(likelihood) of one point, and the number of the call."""
         number = getattr(self._own, "number", None)
         if number is None:
             value, call = self._log_like(np.asarray(point)[None])

@@ -59,9 +59,11 @@ class SamplerFit:
         check_that(isinstance(model, FluxModel), "model", "an SEDModel", type(model).__name__)
         check_that(isinstance(priors, dict), "priors", "a dict of parameters", repr(priors))
         predict = settings.predict
-        names = (*getattr(filters, "names", filters), *getattr(predict, "names", predict))
+        names = tuple(getattr(filters, "names", filters)) + tuple(
+            getattr(predict, "names", predict)
+        )
         if isinstance(model, SEDModel):
-            bands = FilterSet([*filters, *predict])
+            bands = FilterSet(list(filters) + list(predict))
         else:
             bands = names
         fit = cls(
@@ -138,10 +140,11 @@ class SamplerFit:
         cited = ()
         if isinstance(self.sampler, str):
             cited = CITATIONS.get(self.sampler, ())
-        return {"citations": (*meta.pop("citations", ()), *cited), "model": meta}
+        citations = tuple(meta.pop("citations", ())) + tuple(cited)
+        return {"citations": citations, "model": meta}
 
     def check_data(self, data):
-        """All data will do."""
+        """Accept all data."""
 
     def redshifts(self, photometry, redshift, redshift_prior, flags):
         """
@@ -184,7 +187,7 @@ class SamplerFit:
     # ------------------------------------------------------------------------- fit
 
     def task(self, pairs, seed, spaces):
-        """Function that fits a piece of the catalog; every object has its own random stream."""
+        """Return a function that fits a piece of the catalog; every object has its own random stream."""
         axes = self._axes(spaces)
         parameters = self.model.parameters
         constant = [name for name in parameters if name not in axes and name != "mass"]
@@ -193,7 +196,7 @@ class SamplerFit:
         return partial(self._fit_piece, axes, pairs, seed)
 
     def _axes(self, spaces):
-        """Cells of all parameters that are free for some object, and of redshift."""
+        """Make the cells of all parameters that are free for some object, and of redshift."""
         model = self.model
         n_cells = self.request.n_cells
         agn = None
@@ -217,7 +220,7 @@ class SamplerFit:
         return axes
 
     def _fit_piece(self, axes, pairs, seed, piece):
-        """`FitResults` of a piece: its photometry, parameters and priors."""
+        """Fit a piece, its photometry and priors: `FitResults`."""
         data, spaces = piece
         flags = np.array(data.flags)
         n = len(data)
@@ -282,7 +285,7 @@ class SamplerFit:
 
     def models(self, values, mass=None):
         """
-        Fluxes in uJy (m, n_bands), NaN where a model is not possible, and derived quantities by name.
+        Evaluate fluxes in uJy (m, n_bands), NaN where a model is not possible, and derived quantities by name.
 
         ``values`` has all parameters but mass by name, each of shape (m,); ``mass`` is in solar masses
         formed, 1 by default.
@@ -328,6 +331,7 @@ class SamplerFit:
             derived = self._scaled(calls.of("derived", call), values, scale, space.fixed)
             of_best |= self._scaled(calls.of("derived", best), of_best, best_scale, space.fixed)
         rng = stream(seed, "draws", key)
+        # model fluxes are those of one solar mass
         flux = calls.of("flux", call) * scale[:, None]
         return {
             "chi2": calls.of("chi2", best)[0],
@@ -373,15 +377,17 @@ class SamplerFit:
             return sums.reshape(size[x], size[y])
 
         columns = [values[name] for name in axes] + list(derived.values())
+        # parameters first, then derived quantities
         moments, quantiles = zip(*(_summary(array, weight) for array in columns), strict=True)
         n = len(axes)
+        # posterior mean and standard deviation of the model fluxes
         mean = weight @ flux
         drawn = rng.permutation(systematic_draws(weight, self.request.n_draws, rng))
         return {
             "pdf": {n: np.bincount(cells[n], weight, minlength=size[n]) for n in axes},
             "pdf_2d": joint("redshift", "frac_agn"),
             "pairs": {(x, y): joint(x, y) for x, y in pairs},
-            "axis_moments": [pair[:2] for pair in moments[:n]],
+            "axis_moments": np.array(moments[:n])[:, :2],
             "axis_quantiles": quantiles[:n],
             "moments": moments[n:],
             "quantiles": quantiles[n:],
@@ -393,6 +399,7 @@ class SamplerFit:
 
 def _cell(axis, values):
     """Find the cell of an axis in which each value lies; the outermost take values beyond."""
+    # inner edges alone: the outermost cells are open
     edges = cell_edges(axis.values, axis.bounds)
     return np.searchsorted(edges[1:-1], values, side="right")
 

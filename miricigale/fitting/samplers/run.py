@@ -18,10 +18,10 @@ class FluxModel(Protocol):
     meta: dict
 
     def fluxes(self, table, filters):
-        """Fluxes and derived quantities for a table of parameters."""
+        """Return fluxes and derived quantities for a table of parameters."""
 
     def derived_columns(self):
-        """Derived quantities by name."""
+        """Return derived quantities by name."""
 
 
 class Calls:
@@ -33,6 +33,7 @@ class Calls:
         self._space = space
         self._parts = []
         self.n = 0
+        # constant of the likelihood: the product of the normal densities' factors
         sigma = data.sigma[data.measured]
         self._norm = np.log(sigma).sum() + 0.5 * sigma.size * np.log(2.0 * np.pi)
 
@@ -60,7 +61,7 @@ class Calls:
         return -0.5 * chi2 - self._norm, number
 
     def of(self, name, calls):
-        """Arrays of some of the calls; a dict of them where there are several by name."""
+        """Return arrays of some of the calls; a dict of them where there are several by name."""
         parts = [part[name] for part in self._parts]
         if isinstance(parts[0], dict):
             return {key: np.concatenate([part[key] for part in parts])[calls] for key in parts[0]}
@@ -68,7 +69,7 @@ class Calls:
 
 
 def positive_normal(mean, std, rng):
-    """Draws from normal distributions, those below 0 drawn again."""
+    """Draw from normal distributions; draws below 0 are repeated."""
     out = mean + std * rng.standard_normal(mean.size)
     for _ in range(1000):
         negative = np.flatnonzero(out < 0)
@@ -79,18 +80,20 @@ def positive_normal(mean, std, rng):
 
 
 def systematic_draws(weight, n, rng):
-    """Rows in proportion to weights, with as few repetitions as possible (systematic resampling): shape (n,)."""
+    """Choose rows in proportion to weights, with few repetitions (systematic resampling): shape (n,)."""
     total = np.cumsum(weight)
+    # n even steps along the cumulative weight, with one random offset
     place = (np.arange(n) + rng.random()) / n * total[-1]
     return np.minimum(np.searchsorted(total, place), weight.size - 1)
 
 
 def _hazard(x):
     """
-    First and second derivative of -ln(cumulative normal distribution) at -x.
+    Compute first and second derivative of -ln(cumulative normal distribution) at -x.
 
     With h = density / cumulative at x these are h and h (h + x).
     """
+    # density over cumulative, by the scaled complementary error function: no overflow far out
     hazard = np.sqrt(2.0 / np.pi) / erfcx(-x / np.sqrt(2.0))
     with np.errstate(divide="ignore"):
         second = np.where(x < _FAR, 1.0 - 1.0 / np.square(x), hazard * (hazard + x))
@@ -99,7 +102,7 @@ def _hazard(x):
 
 def chi2_at(scale, model, flux, sigma, limit):
     """
-    Chi2 of m models, shape (m, n_bands) for a scale of 1, at given scales: shape (m,).
+    Compute chi2 of m models, shape (m, n_bands) for a scale of 1, at given scales: shape (m,).
 
     Sum of ((F - s m) / sigma)^2 and, of limits, of -2 ln(1/2 (1 + erf((F - s m) / (sqrt2 sigma))))
     (Sawicki 2012, PASP 124, 1208, eq. A10; Boquien et al. 2019, section 4.3).
@@ -110,7 +113,7 @@ def chi2_at(scale, model, flux, sigma, limit):
 
 def best_scale(model, flux, sigma, limit):
     """
-    Scales at which chi2 is least, not below 0, and their variances; arguments as of `chi2_at`.
+    Find the scales at which chi2 is smallest, not below 0, and their variances; arguments as of `chi2_at`.
 
     Without limits the minimum is closed-form. With limits chi2 is convex in the scale, its
     derivative convex too, and the scale of the measured bands alone (one at least) lies above the
@@ -120,6 +123,7 @@ def best_scale(model, flux, sigma, limit):
     unit = model / sigma
     measured = unit[:, ~limit]
     bound = unit[:, limit]
+    # p = <m, F> and q = <m, m> over the detections, in units of the errors: scale p / q
     ratio = (flux / sigma)[~limit]
     p = measured @ ratio
     q = np.sum(measured * measured, axis=1)
@@ -131,8 +135,10 @@ def best_scale(model, flux, sigma, limit):
         for _ in range(_STEPS):
             x = ceiling - scale[:, None] * bound
             first, second = _hazard(x)
+            # half of the first and second derivative of chi2
             slope = q * scale - p + np.sum(bound * first, axis=1)
             curvature = q + np.sum(bound**2 * second, axis=1)
+            # Newton's step, which comes down from above the minimum
             new = np.clip(scale - slope / curvature, 0.0, scale)
             done = np.all(~(scale - new > 1e-12 * scale))
             scale = new

@@ -25,11 +25,11 @@ class Flat:
     high: float
 
     def transform(self, unit):
-        """Values at which the cumulative prior is ``unit``."""
+        """Return the values at which the cumulative prior is ``unit``."""
         return self.low + unit * (self.high - self.low)
 
     def cdf(self, value):
-        """Cumulative prior."""
+        """Return the cumulative prior."""
         return np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0)
 
     @property
@@ -38,11 +38,11 @@ class Flat:
         return (self.low, self.high)
 
     def nodes(self, n):
-        """Middles of n cells."""
+        """Return the middles of n cells."""
         return self.transform((np.arange(n) + 0.5) / n)
 
     def cells(self, n):
-        """Nodes of n cells (or the prior's own values), their weights, and the limits of the outermost."""
+        """Return nodes of n cells (or the prior's own values), their weights, and the limits of the outermost."""
         nodes = self.nodes(n)
         bounds = self.bounds
         total = self.cdf(cell_edges(nodes, bounds)[1:-1])
@@ -56,11 +56,12 @@ class Log(Flat):
     """Flat in the logarithm from ``low`` to ``high``."""
 
     def transform(self, unit):
-        """Values at which the cumulative prior is ``unit``."""
+        """Return the values at which the cumulative prior is ``unit``."""
+        # even steps in the logarithm
         return self.low * (self.high / self.low) ** np.asarray(unit)
 
     def cdf(self, value):
-        """Cumulative prior."""
+        """Return the cumulative prior."""
         value = np.clip(value, self.low, self.high)
         return np.log(value / self.low) / np.log(self.high / self.low)
 
@@ -76,7 +77,7 @@ class Choice:
     weights: np.ndarray
 
     def transform(self, unit):
-        """Values at which the cumulative prior reaches ``unit``."""
+        """Return the values at which the cumulative prior reaches ``unit``."""
         place = np.searchsorted(np.cumsum(self.weights), unit, side="right")
         return self.values[np.minimum(place, self.values.size - 1)]
 
@@ -86,7 +87,7 @@ class Choice:
         return (self.values[0], self.values[-1])
 
     def cells(self, n):
-        """The values, whatever n, their weights and limits: as of `Flat`."""
+        """Return the values, whatever n, their weights and limits, as `Flat` does."""
         return self.values, self.weights, (-np.inf, np.inf)
 
     def __str__(self):
@@ -104,17 +105,17 @@ class Continuous(Flat):
         return self.law.cdf(self.low), self.law.cdf(self.high)
 
     def transform(self, unit):
-        """Values at which the cumulative prior is ``unit``."""
+        """Return the values at which the cumulative prior is ``unit``."""
         first, last = self._ends
         return np.clip(self.law.ppf(first + unit * (last - first)), self.low, self.high)
 
     def cdf(self, value):
-        """Cumulative prior."""
+        """Return the cumulative prior."""
         first, last = self._ends
         return np.clip((self.law.cdf(value) - first) / (last - first), 0.0, 1.0)
 
     def nodes(self, n):
-        """Middles of n cells: even, or even in the logarithm if they span more than a factor 30."""
+        """Return the middles of n cells: even, or even in the logarithm if they span more than a factor 30."""
         low, high = self.transform(np.array([_TAIL, 1.0 - _TAIL]))
         if 0 < 30 * low < high:
             return Log(low, high).nodes(n)
@@ -142,7 +143,7 @@ class Table:
         return (self.value[0], self.value[-1])
 
     def nodes(self, n):
-        """Middles of n equal cells."""
+        """Return the middles of n equal cells."""
         return Flat(*self.bounds).nodes(n)
 
     cells = Flat.cells
@@ -166,7 +167,8 @@ class Table:
         return None
 
     def transform(self, unit):
-        """Values at which the cumulative prior is ``unit``."""
+        """Return the values at which the cumulative prior is ``unit``."""
+        # cell in which the cumulative density reaches the target
         target = np.asarray(unit) * self.area
         i = np.clip(np.searchsorted(self._total, target, side="right") - 1, 0, self.value.size - 2)
         first = self.density[i]
@@ -182,14 +184,14 @@ class Table:
         return self.value[i] + np.clip(step, 0.0, width)
 
     def cdf(self, value):
-        """Cumulative prior."""
+        """Return the cumulative prior."""
         value = np.clip(value, self.value[0], self.value[-1])
         return integrals_to(value, self.value, self.density, self._total) / self.area
 
 
 def make_prior(name, prior, parameter):
     """
-    Prior of one parameter, or its fixed value.
+    Make the prior of one parameter, or return its fixed value.
 
     ``prior`` is given as for `~miricigale.fitting.BayesFitter`, its numbers may be quantities;
     ``parameter`` is the declaration (`~miricigale.sed.Parameter`). A `ValueError` is raised for something else,
@@ -197,9 +199,12 @@ def make_prior(name, prior, parameter):
     """
     argument = f"priors[{name!r}]"
     if isinstance(prior, str) and prior in ("flat", "log"):
-        return _interval(argument, *parameter.bounds, prior)
+        low, high = parameter.bounds
+        return _interval(argument, low, high, prior)
     if hasattr(prior, "ppf") and hasattr(prior, "cdf"):
-        law = Continuous(*parameter.bounds, prior)
+        low, high = parameter.bounds
+        law = Continuous(low, high, prior)
+        # weight of the distribution within the bounds of the parameter
         first, last = law._ends
         text = f"with weight from {law.low} to {law.high}"
         check_that(last - first > 0, argument, text, str(law))
@@ -208,7 +213,8 @@ def make_prior(name, prior, parameter):
         return _choice(argument, prior, np.ones(len(prior)), parameter)
     pair = isinstance(prior, tuple) and len(prior) == 2
     if pair and np.ndim(prior[0]) == np.ndim(prior[1]) == 1:
-        return _choice(argument, *prior, parameter)
+        values, weights = prior
+        return _choice(argument, values, weights, parameter)
     try:
         if pair or (isinstance(prior, tuple) and len(prior) == 3 and prior[2] in ("log", "flat")):
             low, high, kind = (*prior, "flat")[:3]
@@ -237,6 +243,7 @@ def _choice(argument, values, weights, parameter):
     check_that(weights.shape == (len(values),), argument, text, f"shape {weights.shape}")
     if not (np.all(np.isfinite(weights) & (weights >= 0)) and weights.sum() > 0):
         raise argument_error(argument, "weights that are finite, >= 0 and not all 0", f"{weights}")
+    # values ascend, as nodes of an axis do
     order = np.argsort(values)
     values = np.array(values)[order]
     weights = weights[order]
@@ -285,7 +292,7 @@ class Space:
         return len(self.free)
 
     def at_redshifts(self, limits, photometry, redshift, flags):
-        """Copies with the redshift of every object, within ``limits``; what cannot be used is flagged."""
+        """Make copies with the redshift of every object, within ``limits``; unusable ones are flagged."""
         values = known_redshifts(photometry, redshift)
         missing = np.isnan(values)
         low, high = limits
@@ -297,24 +304,25 @@ class Space:
 
     def with_densities(self, limits, redshift_prior, flags):
         """
-        Copies with the prior of redshift of every object (`read_density`), cut to ``limits``.
+        Make copies with the prior of redshift of every object (`read_density`), cut to ``limits``.
 
         A prior that leaves nothing is flagged.
         """
         nodes, density = read_density(redshift_prior, len(flags))
+        low, high = limits
         out = []
         for row, heights in enumerate(np.broadcast_to(density, (len(flags), nodes.size))):
             prior = None
             if np.isfinite(heights).all():
-                prior = Table(nodes, np.array(heights)).cut(*limits)
+                prior = Table(nodes, np.array(heights)).cut(low, high)
             if prior is None:
                 flags[row] |= int(FitFlags.NO_MODEL)
-                prior = Flat(*limits)
+                prior = Flat(low, high)
             out.append(self.with_prior("redshift", prior))
         return out
 
     def values(self, points):
-        """Parameters, fixed ones included, by name at points of the unit cube, shape (m, n_dim)."""
+        """Convert points of the unit cube, shape (m, n_dim), to parameters by name, fixed ones included."""
         out = {name: np.full(len(points), value) for name, value in self.fixed.items()}
         for i, (name, prior) in enumerate(self.free.items()):
             out[name] = prior.transform(points[:, i])
@@ -338,11 +346,11 @@ def redshift_axis(spaces, limits, n):
     if all(prior is priors[0] for prior in priors):
         return priors[0].cells(n)
     tables = [prior for prior in priors if isinstance(prior, Table)]
+    lowest, highest = limits
     if tables:
         lowest = min(table.bounds[0] for table in tables)
         highest = max(table.bounds[1] for table in tables)
-        limits = (lowest, highest)
-    nodes, _, bounds = Flat(*limits).cells(n)
+    nodes, _, bounds = Flat(lowest, highest).cells(n)
     edges = cell_edges(nodes, bounds)
     # without tables the priors are flat within the limits, and so is their mean
     cdf = np.mean([table.cdf(edges) for table in tables] or [edges], axis=0)

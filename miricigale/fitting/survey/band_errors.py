@@ -197,7 +197,7 @@ def left_out_predictions(results):
 
 def _others_chi2(results, fitted, mean, std):
     """
-    Reduced chi2 without each band, shape (n, nb): a flux that is wrong says nothing against the fit of the others.
+    Compute reduced chi2 without each band, (n, nb): a wrong flux says nothing against the fit of the others.
 
     Without a flux chi2 falls by the square of its pull about what the others predict (Cook & Weisberg 1982).
     """
@@ -209,7 +209,7 @@ def _others_chi2(results, fitted, mean, std):
 
 
 def _largest_chi2(results):
-    """Reduced chi2 above which a fit predicts nothing: 4, or 4 times that of half of the catalog."""
+    """Compute the reduced chi2 above which a fit predicts nothing: 4, or 4 times the median of the catalog."""
     chi2 = np.asarray(results.reduced_chi2, dtype=float)
     chi2 = chi2[results.fitted & np.isfinite(chi2)]
     median = 0.0
@@ -286,12 +286,13 @@ def select_fluxes(
         good = np.isfinite(flux) & (flux_err > 0) & np.isfinite(flux_err)
         good &= (predicted > MIN_SIGNAL * flux_err) & np.isfinite(predicted_std)
         good &= (rest_wave > SHORTEST_REST) & (rest_wave < longest)
-    columns = [values[good] for values in (flux, flux_err, predicted, predicted_std)]
     if template_error is None:
         model_error = np.zeros(np.count_nonzero(good))
     else:
         model_error = template_error(rest_wave[good] * WAVE)
-    return PredictedFluxes(*columns, model_error)
+    return PredictedFluxes(
+        flux[good], flux_err[good], predicted[good], predicted_std[good], model_error
+    )
 
 
 def estimate_band_errors(fluxes, prior):
@@ -320,6 +321,7 @@ def estimate_band_errors(fluxes, prior):
     scatter = np.array([prior.factor_scatter, prior.part_scatter, 1.0, 1.0])
     if has_zero_point:
         scatter[3] = prior.zero_point_scatter
+    # ln factor, ln part, logit of the wrong share, and ln zero point if it is free
     n_free = 3
     if has_zero_point:
         n_free = 4
@@ -373,7 +375,8 @@ def estimate_band_errors(fluxes, prior):
 
 
 def _curvature(function, x):
-    """Matrix of second derivatives at ``x``, by central differences."""
+    """Compute the matrix of second derivatives at ``x``, by central differences."""
+    # f(x + a + b) - f(x + a - b) - f(x - a + b) + f(x - a - b), over 4 h^2
     steps = _STEP * np.eye(x.size)
     out = np.empty((x.size, x.size))
     for i, a in enumerate(steps):
@@ -385,7 +388,7 @@ def _curvature(function, x):
 
 
 def prior_errors(band):
-    """Errors of a band of which nothing is measured: `BandErrors` of its prior."""
+    """Return the errors of a band of which nothing is measured: `BandErrors` of its prior."""
     prior = prior_of_band(band)
     return BandErrors(
         n=0,
@@ -419,6 +422,7 @@ def measure_bands(results, data, bands, template_error):
     errors : dict of str to `BandErrors`
         By band.
     """
+    # each band is compared with what the others predict, at the redshift of the fit
     predicted, predicted_std = left_out_predictions(results)
     redshift = results.mean("redshift").value
     measured = data.measured

@@ -8,7 +8,7 @@ from astropy.table import QTable
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from miricigale.fitting.data.likelihood import per_band
+from miricigale.fitting.data.likelihood import flux_columns, per_band
 from miricigale.fitting.data.template_error import TemplateError, pivots
 from miricigale.fitting.survey.band_errors import (
     LONGEST_REST,
@@ -20,7 +20,7 @@ from miricigale.fitting.survey.band_errors import (
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
-from miricigale.utils.tables import described_columns, error_column, require_columns
+from miricigale.utils.tables import described_columns, require_columns
 from miricigale.utils.units import FNU, WAVE, to_array
 
 _COLUMNS = declared("miricigale.fitting", "columns.toml")["zero_points"]
@@ -71,6 +71,7 @@ def _excess(flux, error, model, scatter):
     scatter = np.maximum(scatter, 1e-9 * flux)
 
     def excess(part):
+        # half-width that half of normal residuals lie within
         within = _MEDIAN * np.hypot(error, part * flux)
         return 0.5 - np.mean(
             ndtr((within - residual) / scatter) - ndtr((-within - residual) / scatter)
@@ -203,16 +204,22 @@ def measure_template_error(results, *, model_error=0.0, edges=None):
     edges = to_array(edges, WAVE, "edges", ndim=1)
     band_error = per_band(model_error, results.filters, "model_error")
     flux, error, _, good = _residuals(results)
+    # errors of bands are part of those that models leave unexplained
     error = np.hypot(error, np.array([band_error[name] for name in results.filters]) * flux)
     rest_wave = _rest_wavelengths(results)
-    columns = (flux, error, results.model_flux, results.model_flux_std)
     wave = []
     bin_errors = []
     for low, high in itertools.pairwise(edges):
         in_bin = good & (rest_wave >= low) & (rest_wave < high)
         if np.count_nonzero(in_bin) >= _N_BIN:
             wave.append(np.sqrt(low * high))
-            bin_errors.append(_excess(*(column[in_bin] for column in columns)))
+            excess = _excess(
+                flux[in_bin],
+                error[in_bin],
+                results.model_flux[in_bin],
+                results.model_flux_std[in_bin],
+            )
+            bin_errors.append(excess)
     check_that(wave, "results", f"with {_N_BIN} fluxes of S/N above 5 in a bin", "fewer")
     return TemplateError(wave * WAVE, bin_errors)
 
@@ -352,6 +359,7 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
             scatter[i] = median_err / free_part
         else:
             scatter[i] = np.inf
+    # masses take up a factor common to all bands
     factor[has_factor] /= factor[bands.index(reference)]
     columns = {
         "band": np.array(bands),
@@ -364,6 +372,7 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
 
 def _free_part(results, column, rows):
     """Return the median part of the residuals of a band that models, which follow its fluxes, do not take up."""
+    # leverage s^2 / sigma^2: the part of a residual that the model follows
     taken_up = np.square(results.model_flux_std[rows, column] / results.sigma[rows, column])
     return 1.0 - np.median(taken_up)
 
@@ -403,13 +412,11 @@ def apply_zero_points(photometry, zero_points):
     names = map(str, zero_points["band"])
     values = map(float, zero_points["factor"])
     factors = dict(zip(names, values, strict=True))
-    columns = []
-    for name in factors:
-        columns += [name, error_column(name)]
+    columns = flux_columns(factors)
     require_columns(photometry, columns, "photometry", units=dict.fromkeys(columns, FNU))
     out = QTable(photometry, copy=True)
     for name, factor in factors.items():
-        for column in (name, error_column(name)):
+        for column in flux_columns([name]):
             out[column] = out[column] * factor
     before = out.meta.get("zero_points", {})
     out.meta["zero_points"] = before | {b: f * before.get(b, 1.0) for b, f in factors.items()}

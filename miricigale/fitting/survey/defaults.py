@@ -225,8 +225,11 @@ def errors_and_priors(fitter):
 
 def _span(values):
     """Format smallest and largest of some numbers in per cent; one number if they are the same."""
-    ends = [f"{100.0 * end:.0f}" for end in (min(values), max(values))]
-    return " to ".join(dict.fromkeys(ends))
+    low = f"{100.0 * min(values):.0f}"
+    high = f"{100.0 * max(values):.0f}"
+    if low == high:
+        return low
+    return f"{low} to {high}"
 
 
 def _priors(fitter):

@@ -202,10 +202,10 @@ class SurveyCalibration:
         error = self.template_error
         meta = {"kind": _NAME, "name": self.name}
         meta["template_error"] = {"um": error.wave.value.tolist(), "error": error.error.tolist()}
-        meta["priors"] = {
-            name: {"values": np.asarray(v).tolist(), "weights": np.asarray(w).tolist()}
-            for name, (v, w) in self.priors.items()
-        }
+        meta["priors"] = {}
+        for name, (values, weights) in self.priors.items():
+            prior = {"values": np.asarray(values).tolist(), "weights": np.asarray(weights).tolist()}
+            meta["priors"][name] = prior
         if self.mass_function is not None:
             meta["mass_function"] = dataclasses.asdict(self.mass_function)
         meta["errors"] = {name: np.asarray(e).tolist() for name, e in self.errors.items()}
@@ -360,7 +360,7 @@ def calibrate(
         if has_fractions:
             priors = {"frac_agn": agn_fraction_prior(axis.values)}
     if reference is not None:
-        check_names([reference], "band that is fitted", _fitted(fitter, table))
+        check_names([reference], "band that is fitted", bands_in_catalog(fitter, table.colnames))
     options = {"executor": executor}
     half_tables = [table[rows[0::2]], table[rows[1::2]]]
     half_redshifts = [z[rows[0::2]], z[rows[1::2]]]
@@ -384,14 +384,15 @@ def calibrate(
     return dataclasses.replace(_mean(calibrations), scores=described_rows(scores, _SCORES))
 
 
-def _fitted(fitter, table):
-    """Bands of a catalog that are fitted: list of str."""
-    return [b for b in fitter.filters or fitter.bands if b in table.colnames]
+def bands_in_catalog(fitter, columns):
+    """List the bands of a fitter among the columns of a catalog: list of str."""
+    return [band for band in fitter.filters or fitter.bands if band in columns]
 
 
 def _score(fits, true):
     """Score redshifts: sources, bias, sigma_MAD, outliers, and part within the 68 % interval, by column."""
     percentiles = [fit.percentile("redshift", (0.16, 0.5, 0.84)).value for fit in fits]
+    # 16th, 50th and 84th percentile of each source
     low, z, high = np.concatenate(percentiles).T
     good = np.isfinite(z)
     metrics = photoz_metrics(true[good], z[good])
@@ -415,7 +416,7 @@ def _measure(fitter, table, z, name, reference, priors, options):
     """Measure the `SurveyCalibration` of sources at their redshifts, in turns of expectation maximization."""
     options = {"redshift": z, **options}
     fitter = on_nodes(fitter)
-    bands = _fitted(fitter, table)
+    bands = bands_in_catalog(fitter, table.colnames)
     long = list(itertools.chain.from_iterable(long_instruments(bands)))
     predicting = [band for band in bands if band not in long]
     data = fitter.replace(calibration=None)._read_bands(table, bands)
@@ -462,6 +463,7 @@ def _longer(before, after, power):
     longer = {}
     for name, weights in after.items():
         old = before.get(name, np.full(weights.size, 1.0 / weights.size))
+        # old (new / old)^power
         step = np.divide(weights, old, out=np.zeros(weights.size), where=old > 0) ** power * old
         longer[name] = step / step.sum()
     return longer
@@ -481,8 +483,12 @@ def _mean(calibrations):
     bands["n"] = a.bands["n"] + b.bands["n"]
     a_error = a.template_error.error
     b_error = b.template_error(wave)
-    priors = {n: (v, 0.5 * (w + b.priors[n][1])) for n, (v, w) in a.priors.items()}
-    errors = {n: 0.5 * np.abs(w - b.priors[n][1]) for n, (_, w) in a.priors.items()}
+    priors = {}
+    errors = {}
+    for name, (values, a_weights) in a.priors.items():
+        _, b_weights = b.priors[name]
+        priors[name] = (values, 0.5 * (a_weights + b_weights))
+        errors[name] = 0.5 * np.abs(a_weights - b_weights)
     errors["template_error"] = 0.5 * np.abs(a_error - b_error)
     mean = TemplateError(wave, np.sqrt(0.5 * (a_error**2 + b_error**2)))
     return SurveyCalibration(a.name, bands, mean, priors, a.mass_function, errors=errors)
