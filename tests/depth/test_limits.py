@@ -300,3 +300,12 @@ def test_several_filters_have_a_limit_each():
     names = ["F770W", "F1500W"]
     alone = [sensitivity(name, 1000 * u.s).value for name in names]
     assert_allclose(sensitivity(names, 1000 * u.s).value, alone)
+
+
+@pytest.mark.parametrize("name", ["miri.f770w", "miri.f2100w"])
+def test_four_equal_exposures_halve_the_noise(name):
+    """Each holds as many integrations as one alone, of which long bands take several; the source has no noise."""
+    time = 2500 * u.s
+    one = sensitivity(name, time, n_sigma=0.01)
+    four = sensitivity(name, 4 * time, n_sigma=0.01, n_dithers=4)
+    assert_quantity_allclose(four, one / 2, rtol=2e-3)
