@@ -197,7 +197,7 @@ class SampleNumbers:
         return described_rows(rows, _texts("totals"))
 
     def _total_corrected(self, fraction):
-        """Draws of the number of AGN from a fraction on, by the selected ones."""
+        """Draws of the number of AGN from a fraction on by the selected ones, uncorrected without a share."""
         kind = "above" if fraction == self.floor else "limit"
         total = np.zeros(self.draws.n_draws)
         for i in range(len(self.bins.redshift) - 1):

@@ -75,14 +75,8 @@ prior
 # Numbers by luminosity. ``completeness`` is the share of the injected AGN that are selected (``frac_agn_p50`` of
 # 0.4 or more), ``above`` the share with a fraction of 0.1 or more, which are those that ``n`` counts.
 
-names = [
-    "log_luminosity_low",
-    "n",
-    "n_shipped",
-    "n_selected",
-    "completeness",
-    "above",
-]
+names = ["log_luminosity_low", "n", "n_shipped", "n_selected"]
+names += ["completeness", "above"]
 shown = result.numbers[names]
 shown.round(2)
 shown
@@ -100,10 +94,8 @@ bars = [
 ]
 true = np.log10(fluxes["accretion_power"][has_agn].to_value("erg/s"))
 counts, _ = np.histogram(true, [*low, high[-1]])
-volume = survey.bins.redshift
-shell = model.cosmology.comoving_volume(
-    volume[1]
-) - model.cosmology.comoving_volume(volume[0])
+inner, outer = model.cosmology.comoving_volume(survey.bins.redshift)
+shell = outer - inner
 cubic_mpc = (shell * (5 * u.arcmin**2) / (4 * np.pi * u.sr)).to_value("Mpc3")
 
 fig, ax = plt.subplots(figsize=(6, 4), layout="constrained")
