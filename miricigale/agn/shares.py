@@ -201,7 +201,7 @@ def _galaxy_counts(table, component, uniform):
 
 def _member_counts(table, members, uniform):
     """Members of another class in the bins, which are drawn from their own posteriors."""
-    own = table[members].reshape(len(members), -1)
+    own = table[members].reshape(len(members), np.prod(table.shape[1:]))
     flat = _draw_places(own, uniform[members])
     return np.bincount(flat, minlength=own.shape[1]).reshape(table.shape[1:])
 

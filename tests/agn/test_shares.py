@@ -91,6 +91,14 @@ def test_classes_share_the_objects_by_their_evidence():
     assert draws.probability["quasar"][:12].min() > 0.999
 
 
+def test_a_class_may_have_no_members():
+    table = np.zeros((5, 1, 2, 1))
+    table[:, 0, 0, 0] = 1.0
+    others = {"quasar": (np.full(5, -400.0), table)}
+    draws = draw_shares(table, [0.5, 0.5], others=others, n_draws=5, seed=1)
+    assert np.all(draws.counts["quasar"] == 0)
+
+
 def test_the_same_seed_draws_the_same():
     table = two_normals(50, 0.3, np.random.default_rng(9), (0.5, 0.5))
     same = [draw_shares(table, (0.5, 0.5), n_draws=5, seed=4).shares for _ in range(2)]
