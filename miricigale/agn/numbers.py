@@ -139,17 +139,21 @@ class SampleNumbers:
         """
         Draws of the number of AGN of a bin by the selected ones and the injected ones of a kind.
 
-        NaN where AGN are selected and no such injected one is.
+        NaN where AGN are selected, and no such injected one is.
         """
         pure = self.pure[i, k]
-        n_injected = int(self.injected[kind][i, k])
-        n_right = int(self.injected["right"][i, k])
-        n_draws = self.draws.n_draws
-        if not n_right:
-            return np.full(n_draws, np.nan if pure > 0 or kind == "all" else 0.0)
         rng = stream(self.seed, "agn", "corrected", i, k)
-        share = rng.beta(n_right + _JEFFREYS, n_injected - n_right + _JEFFREYS, n_draws)
-        return rng.standard_gamma(pure, n_draws) / share if pure > 0 else np.zeros(n_draws)
+        share = self._selected_share(rng, self.injected["right"][i, k], self.injected[kind][i, k])
+        if pure > 0:
+            return rng.standard_gamma(pure, self.draws.n_draws) / share
+        return 0.0 * share
+
+    def _selected_share(self, rng, n_right, n_injected):
+        """Draws of the share of injected AGN that is selected; NaN where none is."""
+        if not n_right:
+            return np.full(self.draws.n_draws, np.nan)
+        n_lost = n_injected - n_right
+        return rng.beta(n_right + _JEFFREYS, n_lost + _JEFFREYS, self.draws.n_draws)
 
     def _density(self, number, n_shipped, injected, i, k):
         """Luminosity function of all AGN of a bin, also those below the floor, which injected ones tell."""
@@ -197,13 +201,27 @@ class SampleNumbers:
         return described_rows(rows, _texts("totals"))
 
     def _total_corrected(self, fraction):
-        """Draws of the number of AGN from a fraction on by the selected ones, uncorrected without a share."""
+        """
+        Draws of the number of AGN from a fraction on, by the selected ones.
+
+        Bins of which no injected AGN is selected have the share of all bins.
+        """
         kind = "above" if fraction == self.floor else "limit"
+        n_z = len(self.bins.redshift) - 1
+        rng = stream(self.seed, "agn", "corrected", kind)
+        every = (int(self.injected[name][:n_z].sum()) for name in ("right", kind))
+        of_all = self._selected_share(rng, *every)
         total = np.zeros(self.draws.n_draws)
-        for i in range(len(self.bins.redshift) - 1):
+        rest = 0.0
+        for i in range(n_z):
             for k in range(self.bins.shape[2]):
                 number = self._corrected(i, k, kind)
-                total += np.where(np.isfinite(number), number, self.pure[i, k])
+                if np.all(np.isfinite(number)):
+                    total += number
+                else:
+                    rest += self.pure[i, k]
+        if rest > 0:
+            total += rng.standard_gamma(rest, total.size) / of_all
         return total
 
 

@@ -16,7 +16,7 @@ from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.fitting import AGNBins
 from miricigale.fitting.catalogs.catalog_calibration import measured_calibration
 from miricigale.fitting.catalogs.classes import fit_classes
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import FitWarning, argument_error, warn
 from miricigale.utils.files import replacing
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
@@ -278,7 +278,10 @@ class AGNSurvey:
         out = QTable({"host": hosts.ids, "redshift": hosts.best["redshift"].value})
         out["log_luminosity"] = truth["log_luminosity"]
         out["frac_agn"] = fraction
-        # a galaxy without a model of its own gets none
+        n_lost = int(np.count_nonzero(~usable))
+        if n_lost:
+            text = "injected AGN are left out: the best models of their galaxies have no dust, or are too old"
+            warn(f"{n_lost} of {len(hosts)} {text}", FitWarning)
         return table[usable], out[usable]
 
     # ---------------------------------------------------------------------- result
