@@ -66,7 +66,7 @@ def _save_text(save, name, text):
 
 
 def rounded(values, digits=4):
-    """Plain numbers of so many significant digits, None for NaN; text, integers and flags as they are."""
+    """Return plain numbers of so many significant digits, None for NaN; text, integers and flags as they are."""
     values = np.asarray(values)
     if values.ndim:
         return [rounded(value, digits) for value in values]
@@ -81,7 +81,7 @@ def rounded(values, digits=4):
 
 
 def _json(values):
-    """JSON that may stand in a script of a page."""
+    """Return JSON that may stand in a script of a page."""
     text = json.dumps(values, separators=(",", ":"), allow_nan=False)
     # no tag and no comment of HTML can begin in it
     return text.replace("<", "\\u003c")

@@ -83,8 +83,12 @@ class Page:
 
     def items(self, pairs):
         """Add headline numbers: (label, value) pairs of text; a value may be `Missing`."""
-        named = [(k + f" ({v.reason})" if isinstance(v, Missing) else k, v) for k, v in pairs]
-        self._add("items", named)
+        entries = []
+        for label, value in pairs:
+            if isinstance(value, Missing):
+                label = label + f" ({value.reason})"
+            entries.append((label, value))
+        self._add("items", entries)
 
     def table(self, rows, *, header, caption="", empty="", text=1):
         """
@@ -116,19 +120,11 @@ class Page:
         if not rows:
             check_that(empty, "rows", "at least one, or 'empty' for the sentence", "none")
             return self.text(empty)
-        reasons = {cell.reason: cell for row in rows for cell in row if isinstance(cell, Missing)}
-        # a single reason is not numbered
-        marks = {}
-        for k, (reason, cell) in enumerate(reasons.items(), start=1):
-            if len(reasons) > 1:
-                marks[reason] = Markup("{}<sup>{}</sup>").format(cell, k)
-            else:
-                marks[reason] = cell
-        shown = [[marks[c.reason] if isinstance(c, Missing) else c for c in row] for row in rows]
-        if isinstance(text, int):
-            words = range(text)
-        else:
-            words = text
+        marks = _marks_of_missing(rows)
+        shown = []
+        for row in rows:
+            shown.append([marks[c.reason] if isinstance(c, Missing) else c for c in row])
+        words = range(text) if isinstance(text, int) else text
         return self._add("table", shown, header, set(words), caption, marks)
 
     def figure(self, figure, caption=""):
@@ -147,9 +143,14 @@ class Page:
         self._add("figure", *image_of(figure, self.dpi), caption)
 
     def to_html(self):
-        """The page as text."""
-        values = {name: getattr(self, name) for name in ("title", "subtitle", "notices")}
-        return render("page.html", sections=self._sections, **values)
+        """Return the page as text."""
+        return render(
+            "page.html",
+            sections=self._sections,
+            title=self.title,
+            subtitle=self.subtitle,
+            notices=self.notices,
+        )
 
     def write(self, path, *, overwrite=False):
         """
@@ -176,3 +177,18 @@ class Page:
         with replacing(path, overwrite=overwrite) as partial:
             partial.write_text(self.to_html(), encoding="utf-8")
         return path
+
+
+def _marks_of_missing(rows):
+    """Return the marks of missing cells by their reasons; a single reason is not numbered."""
+    cells = {}
+    for row in rows:
+        for cell in row:
+            if isinstance(cell, Missing):
+                cells[cell.reason] = cell
+    if len(cells) == 1:
+        return cells
+    marks = {}
+    for k, (reason, cell) in enumerate(cells.items(), start=1):
+        marks[reason] = Markup("{}<sup>{}</sup>").format(cell, k)
+    return marks

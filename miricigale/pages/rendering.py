@@ -8,7 +8,7 @@ import jinja2
 from miricigale.utils.caching import cached
 
 #: Points, line nodes and glyphs above which a figure is smaller as pixels than as vectors.
-_MOST_MARKS = 1500
+_MAX_MARKS = 1500
 
 
 @cached
@@ -57,13 +57,14 @@ def image_of(figure, dpi):
     if figure.get_layout_engine() is None:
         figure.set_layout_engine("constrained")
     # dates and the version of matplotlib are omitted, and ids do not depend on chance
-    kind = "png"
-    options = {"format": "png", "metadata": {"Software": None}, "dpi": 2 * dpi}
-    # faster than the default level, and smaller for pixels that are repeated
-    options["pil_kwargs"] = {"compress_level": 2}
-    if _count_marks(figure) <= _MOST_MARKS:
+    if _count_marks(figure) <= _MAX_MARKS:
         kind = "svg+xml"
         options = {"format": "svg", "metadata": {"Date": None, "Creator": None}}
+    else:
+        kind = "png"
+        options = {"format": "png", "metadata": {"Software": None}, "dpi": 2 * dpi}
+        # faster than the default level, and smaller for pixels that are repeated
+        options["pil_kwargs"] = {"compress_level": 2}
     buffer = io.BytesIO()
     # laid out here: savefig draws all of a figure once more for its layout
     figure.set_dpi(options.get("dpi", figure.dpi))

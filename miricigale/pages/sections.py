@@ -63,13 +63,11 @@ class SectionWriter:
     def section(self, name, text="text", /, **facts):
         """Begin a section, with the paragraph ``text`` where it has that."""
         self._section = name
-        if text in self.texts[name]:
-            paragraph = self.sentence(text, **facts)
-        else:
-            paragraph = ""
-        title, closed = (self.texts[name].get(key, "") for key in ("title", "closed"))
-        title = sentence(title, self.facts | facts)
-        self.report.section(title, paragraph, closed=sentence(closed, self.facts | facts))
+        texts = self.texts[name]
+        paragraph = self.sentence(text, **facts) if text in texts else ""
+        title = sentence(texts.get("title", ""), self.facts | facts)
+        closed = sentence(texts.get("closed", ""), self.facts | facts)
+        self.report.section(title, paragraph, closed=closed)
 
     def folding(self, name, /, **facts):
         """Return a context whose figures and tables are folded, if the section folds what is called so."""
@@ -84,11 +82,11 @@ class SectionWriter:
 
     def items(self, values, /, **facts):
         """Add headline numbers: label, and how it is taken from values by name; unknown ones are left out."""
-        self.report.items(
-            (sentence(label, self.facts | facts), cell_of(values, column))
-            for label, *column in self.texts[self._section]["items"]
-            if column[0] in values
-        )
+        pairs = []
+        for label, *column in self.texts[self._section]["items"]:
+            if column[0] in values:
+                pairs.append((sentence(label, self.facts | facts), cell_of(values, column)))
+        self.report.items(pairs)
 
     def figure(self, name, figure, /, **facts):
         """Add a figure with its caption, unless there is none."""
@@ -101,15 +99,19 @@ class SectionWriter:
         table = self.texts[self._section][name]
         rows = list(rows)
         facts = self.facts | facts
-        if rows:
-            keys = list(rows[0])
-        else:
-            keys = ()
+        keys = list(rows[0]) if rows else ()
         columns = {}
         for header, *column in table.get("columns", [(key, key) for key in keys]):
             if column[0] in keys:
                 columns[sentence(header, facts)] = column
-        cells = [[cell_of(row, column) for column in columns.values()] for row in rows]
-        texts = {key: sentence(table.get(key, ""), facts) for key in ("caption", "empty")}
+        cells = []
+        for row in rows:
+            cells.append([cell_of(row, column) for column in columns.values()])
         with self.folding(name, **facts):
-            self.report.table(cells, header=tuple(columns), text=table.get("text", 1), **texts)
+            self.report.table(
+                cells,
+                header=tuple(columns),
+                text=table.get("text", 1),
+                caption=sentence(table.get("caption", ""), facts),
+                empty=sentence(table.get("empty", ""), facts),
+            )

@@ -80,15 +80,12 @@ def number(value, spec, reason, *, error=None):
         return Missing(reason)
     if "{" in spec:
         return spec.format(value)
-    spec, share, unit = spec.partition(" %")
-    if share:
-        scale = 100
-    else:
-        scale = 1
+    spec, percent, unit = spec.partition(" %")
+    scale = 100 if percent else 1
     text = f"{scale * value:{spec}}"
     if error is not None and np.isfinite(error):
         text += f" ± {scale * error:{spec.lstrip('+')}}"
-    return text + share + unit
+    return text + percent + unit
 
 
 def cell_of(entry, column):
@@ -111,5 +108,8 @@ def cell_of(entry, column):
     key, *form = column
     if not form:
         return entry[key]
-    spec, reason, *error = form
-    return number(entry[key], spec, reason, error=entry[error[0]] if error else None)
+    spec, reason, *error_key = form
+    error = None
+    if error_key:
+        error = entry[error_key[0]]
+    return number(entry[key], spec, reason, error=error)
