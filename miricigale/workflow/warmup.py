@@ -157,8 +157,8 @@ def compile_missing(n_threads):
     """
     names = [name for name in JOBS if not is_compiled(name)]
     for name in names:
-        _, what, seconds = JOBS[name]
-        log.info("compiling %s, once for each installation, up to %d s", what, seconds)
+        _, title, seconds = JOBS[name]
+        log.info("compiling %s, once for each installation, up to %d s", title, seconds)
     with threads(n_threads) as executor:
         return all(parallel_map(compile_apart, names, executor=executor))
 

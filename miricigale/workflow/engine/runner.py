@@ -140,14 +140,6 @@ class StudyRunner:
         for key, (stage, _) in self._parts.items():
             if stage.name == pattern or fnmatch.fnmatchcase(key, pattern):
                 keys.add(key)
-
-    def _matching(self, pattern, argument):
-        """Keys of units by stage or pattern."""
-        keys = {
-            key
-            for key in self._parts
-            if key.partition(":")[0] == pattern or fnmatch.fnmatchcase(key, pattern)
-        }
         if not keys:
             msg = (
                 f"'{argument}' is {pattern!r}, which is no stage and matches no unit of this configuration; "
@@ -246,10 +238,10 @@ class StudyRunner:
             n_left = sum(states[key] != "current" for key in self.keys)
             if n_left:
                 needed = max(0, self._products_bytes() - store.standing_bytes())
-                free = check_disk(self.folder, needed)
+                n_free = check_disk(self.folder, needed)
                 self._tell(
                     f"{self.config.run.name}: {n_left} of {len(self.keys)} steps to do, which take "
-                    f"about {needed / 1e9:.2f} GB in {self.folder}/ ({free / 1e9:.1f} GB are free)"
+                    f"about {needed / 1e9:.2f} GB in {self.folder}/ ({n_free / 1e9:.1f} GB are free)"
                 )
             self._write_config(store)
             for key, state in states.items():

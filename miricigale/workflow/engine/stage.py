@@ -206,7 +206,8 @@ class ConfigView:
     """
 
     def __init__(self, config, stage):
-        self._config, self._stage = config, stage
+        self._config = config
+        self._stage = stage
 
     def __getattr__(self, section):
         if section in self._stage.sections:

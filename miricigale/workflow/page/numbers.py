@@ -237,24 +237,6 @@ def _detected(config, tables, n_bands):
     return rows
 
 
-def _detected(config, tables, least):
-    """Shares of the galaxies of the field detected in enough bands, by limit of the prior's magnitude."""
-    prior = ab_magnitude(tables.truth[config.highres.filter])
-    proposal = above_proposal(tables.truth, config.exposures.filters)
-    rows = []
-    for limit, paper in PAPER_DETECTED:
-        if limit > config.catalog.mag_limit:
-            continue
-        chosen = tables.field & (prior < limit)
-        n, found = int(chosen.sum()), chosen & (tables.matched["n_detected"] >= least)
-        fraction, low, high = fraction_interval(int(np.count_nonzero(found)), n)
-        known = proposal is not None and n > 0
-        to_proposal = float(np.mean(proposal[chosen] >= least)) if known else np.nan
-        row = {"limit": limit, "n": n, "fraction": fraction, "low": low, "high": high}
-        rows.append(row | {"to_proposal": to_proposal, "paper": paper})
-    return rows
-
-
 def _band_numbers(config, tables, name):
     """Measure recovery, limits and conditions of one band."""
     matched = tables.matched

@@ -56,13 +56,13 @@ def spectra_figure(study, key, model):
     plot_filters(curves, ax=lower, lw=1.4)
     legend(lower, loc="upper left", ncols=2, fontsize=7)
     redshift = float(values["redshift"])
-    for rest in PAH_FEATURES.value:
-        place = rest * (1 + redshift)
+    for wavelength in PAH_FEATURES.value:
+        place = wavelength * (1 + redshift)
         if wave.min() < place < wave.max():
             for axis in (ax, lower):
                 axis.axvline(place, color=TRUE, lw=0.7, ls=":")
             at_top = {"transform": ax.get_xaxis_transform(), "ha": "right", "va": "top"}
-            ax.text(place, 0.98, f"{rest:g}", rotation=90, fontsize=7, color=TRUE, **at_top)
+            ax.text(place, 0.98, f"{wavelength:g}", rotation=90, fontsize=7, color=TRUE, **at_top)
     ax.set_title(f"z = {redshift:g}", fontsize="medium")
     ax.set_xlabel("")
     lower.set_xlabel("observed wavelength (µm)")

@@ -65,7 +65,7 @@ def _patches(key, options, pixel_scale):
     for name, exposure in exposures.items():
         corners = wcs.all_world2pix(exposure.wcs.calc_footprint(), 0)
         outlines[name] = Path(corners)
-    least = np.array([outline.vertices.min(axis=0) for outline in outlines.values()])
+    smallest = np.array([outline.vertices.min(axis=0) for outline in outlines.values()])
     largest = np.array([outline.vertices.max(axis=0) for outline in outlines.values()])
     names = np.array(list(exposures))
     patches = {}
@@ -78,7 +78,7 @@ def _patches(key, options, pixel_scale):
         overlapping = []
         bands = set()
         # only outlines whose own boxes overlap are compared
-        for name in names[np.all((least < high) & (largest > low), axis=1)].tolist():
+        for name in names[np.all((smallest < high) & (largest > low), axis=1)].tolist():
             if outlines[name].intersects_bbox(box, filled=True):
                 overlapping.append(name)
             if outlines[name].intersects_bbox(core, filled=True):

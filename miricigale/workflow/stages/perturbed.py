@@ -78,8 +78,9 @@ def perturbation_costs(truths, tables, bands, *, seed):
     def add(base, label, name, value, change=None):
         row = {"truth": base, "perturbation": label, "quantity": name}
         row |= {"n": value.n, "value": value.value, "value_err": value.error}
-        row["change"] = np.nan if change is None else change.value
-        row["change_err"] = np.nan if change is None else change.error
+        row |= {"change": np.nan, "change_err": np.nan}
+        if change is not None:
+            row |= {"change": change.value, "change_err": change.error}
         rows.append(row)
 
     perturbed = [truth for truth in truths.values() if truth.perturbations]
