@@ -100,7 +100,7 @@ class SampleNumbers:
             for k in range(1, self.bins.shape[2]):
                 rows.append(self._row(i, k))
         table = described_rows(rows, _texts("numbers"))
-        for name in [one for one in table.colnames if one.startswith("density")]:
+        for name in ("density", "density_low", "density_high", "density_shipped"):
             table[name].unit = 1 / u.Mpc**3 / u.dex
         return table
 
@@ -192,9 +192,9 @@ class SampleNumbers:
         for fraction in sorted({self.floor, self.limit}):
             part = np.s_[:n_z, self._first(fraction) :, :]
             counts = self.draws.counts.values()
-            number = sum(one[(slice(None), *part)].sum(axis=(1, 2, 3)) for one in counts)
+            number = sum(number[(slice(None), *part)].sum(axis=(1, 2, 3)) for number in counts)
             row = {"frac_agn": fraction} | _summary(number, "n")
-            row["n_shipped"] = float(sum(one[part].sum() for one in self.shipped.values()))
+            row["n_shipped"] = float(sum(weights[part].sum() for weights in self.shipped.values()))
             row["n_selected"] = int(self.selected[:n_z].sum())
             row |= _summary(self._total_corrected(fraction), "n_corrected")
             rows.append(row)

@@ -101,7 +101,10 @@ def _luminosity_function(numbers):
     """Densities by luminosity, a panel for each bin of redshift."""
     parts = _by_redshift(numbers)
     figure, axes = new_figure(1, len(parts), size=(WIDTH / 2.2, 3.4), sharey=True)
+    lowest = np.min(numbers["log_luminosity_low"])
+    highest = np.max(numbers["log_luminosity_low"])
     for ax, rows in zip(axes[0], parts, strict=True):
+        ax.set_xlim(lowest, max(highest, lowest + 1.0))
         rows = rows[np.isfinite(rows["log_luminosity_high"])]
         middle = 0.5 * (rows["log_luminosity_low"] + rows["log_luminosity_high"])
         ax.set(xlabel="log L (erg/s)", title=_title(rows) if len(rows) else "", yscale="log")

@@ -366,8 +366,8 @@ class AGNSurvey:
 
 def _agn_probability(probability, first):
     """Probability of an AGN fraction from a bin on, of all classes that have them."""
-    with_bins = [one for one in probability.values() if one.ndim > 1]
-    total = sum(one[:, :, first:].sum(axis=(1, 2, 3)) for one in with_bins)
+    with_bins = [weights for weights in probability.values() if weights.ndim > 1]
+    total = sum(weights[:, :, first:].sum(axis=(1, 2, 3)) for weights in with_bins)
     if "quasar" in probability and probability["quasar"].ndim == 1:
         total = total + probability["quasar"]
     return total
@@ -414,7 +414,7 @@ class _Sample:
     def of_fits(cls, fits, bins, limit):
         """Of fits of the same catalog by class."""
         columns = {name: _columns(results, bins) for name, results in fits.items()}
-        evidence = np.array([one["log_evidence"] for one in columns.values()])
+        evidence = np.array([values["log_evidence"] for values in columns.values()])
         names = np.array(list(columns))
         main = names[np.argmax(np.where(np.isnan(evidence), -np.inf, evidence), axis=0)]
         galaxy = columns["galaxy"]
