@@ -81,6 +81,13 @@ _MIN_MOVED = 48
 _MIN_MOVED_WEIGHT = 1e-3
 #: Weight of the models that are left out of results.
 _LEFT_OUT = 1e-4
+#: Largest number of models that results are of.
+_MAX_MODELS = 1536
+#: Part of the effective number that is wanted, of what all places that may follow would give at most, below which
+#: no more are tried.
+_HOPELESS = 0.5
+#: Number of places after which that is judged.
+_HOPELESS_TRIAL = 4096
 #: Distance that uniform numbers keep from 0 and 1.
 _END = 1e-9
 
@@ -363,6 +370,10 @@ class AdaptiveSampler:
             may_follow = self.max_places - self.n > _TRIAL_GROWTH * n
             if sample.enough or (many_more and n >= n_trial and may_follow):
                 break
+            effective_in_all = sample.effective * (self.max_places - first) / n
+            is_hopeless = effective_in_all < _HOPELESS * self.wanted
+            if n >= min(n_trial, _HOPELESS_TRIAL) and is_hopeless and not may_follow:
+                break
             group = self._groups(self.label[rows], self.peak[rows])
             n_each = np.bincount(group, minlength=self.n_groups)
             missing = np.maximum(sample.wanted - n_each, 0.02 * sample.wanted)
@@ -532,10 +543,16 @@ class AdaptiveSampler:
         upto = np.cumsum(weight[order])
         indices = np.sort(order[upto > _LEFT_OUT * upto[-1]])
         rows = sample.rows.start + indices
+        # neighbors in redshift, label by label
+        indices = indices[np.lexsort((self.place[rows, 0], self.label[rows]))]
+        rows = sample.rows.start + indices
+        is_best = rows == rows[np.argmax(self.evaluated[rows, 4])]
+        indices, weight = thinned(indices, weight[indices], is_best, _MAX_MODELS)
+        rows = sample.rows.start + indices
         return self._placed(
             self.place[rows],
             self.evaluated[rows],
-            weight[indices] / weight[indices].sum(),
+            weight / weight.sum(),
             self.points[1][rows],
             sample,
             converged=sample.enough,
@@ -605,6 +622,45 @@ class AdaptiveSampler:
         return self._placed(
             place, evaluated, np.concatenate(weight), uniform, sample, converged=False
         )
+
+
+def thinned(index, weight, always, most):
+    """
+    Keep some of many weights, with the sums that they had.
+
+    Weights above a level are kept. Of the others so many are taken, evenly in their order and in proportion to
+    them, that those left have this level for a weight (Fearnhead & Clifford 2003, J. R. Stat. Soc. B 65, 887).
+
+    Parameters
+    ----------
+    index : `~numpy.ndarray` of int, shape (n,)
+        What the weights are of; neighbors should be alike.
+    weight : `~numpy.ndarray`, shape (n,)
+        Weights above 0.
+    always : `~numpy.ndarray` of bool, shape (n,)
+        Those that are kept with their own weight in any case.
+    most : int
+        Number to keep of the others.
+
+    Returns
+    -------
+    index, weight : `~numpy.ndarray`
+        Those kept; all if there are not more than ``most``.
+    """
+    if len(weight) <= most:
+        return index, weight
+    descending = np.sort(weight)[::-1]
+    # the level if the k largest are kept
+    below = np.cumsum(descending[::-1])[::-1]
+    level = below[:most] / (most - np.arange(most))
+    n_kept = int(np.argmax(descending[:most] <= level))
+    level = level[n_kept]
+    large = (weight > level) | always
+    upto = np.cumsum(np.where(large, 0.0, weight)) / level
+    steps = np.floor(upto + 0.5)
+    taken = np.diff(steps, prepend=0.0) > 0
+    chosen = large | taken
+    return index[chosen], np.where(large, weight, level)[chosen]
 
 
 def places_to_values(space, axis, place):

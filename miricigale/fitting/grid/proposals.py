@@ -191,9 +191,12 @@ def _groups(labels, n_peaks, places, n_local):
 def _moments_of_peaks(places):
     """Compute mean and covariance of the places of each peak, by peak; of axes without effect too."""
     n_axes = places.score.shape[1]
-    _, global_cov = _mean_and_cov(places.score, places.flat)
+    global_mean, global_cov = _mean_and_cov(places.score, places.flat)
     moments = {}
-    for peak in np.unique(places.peak[places.flat > 0]):
+    peaks = np.unique(places.peak[places.flat > 0])
+    if peaks.size == 1:
+        return {peaks[0]: (global_mean, global_cov)}
+    for peak in peaks:
         rows = np.flatnonzero((places.peak == peak) & (places.flat > 0))
         flat = places.flat[rows]
         mean, cov = _mean_and_cov(places.score[rows], flat)
