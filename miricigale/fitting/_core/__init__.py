@@ -42,6 +42,15 @@ from miricigale.fitting._core.masses import weigh_masses
 from miricigale.fitting._core.mixture import find_models
 from miricigale.fitting._core.nuclei import Nuclei
 from miricigale.fitting._core.population import NEVER, Masses, Mixture, Object, Space
+from miricigale.fitting._core.scan import (
+    TOGETHER,
+    ScannedGalaxies,
+    ScannedObjects,
+    draw_agn,
+    draw_nodes,
+    make_scan_work,
+    scan_nodes,
+)
 from miricigale.fitting._core.structs import BLOCK, Request, Tables
 from miricigale.fitting._core.workspace import (
     JOINT,

@@ -14,6 +14,8 @@ _LN2_HIGH = 0.693359375
 _LN2_LOW = -2.121944400546905e-4
 _LOG10_2 = 0.30102999566398120
 _LOG10_E = 0.43429448190325183
+_MANTISSA32 = np.int32(0x007FFFFF)
+_HALF_ONE32 = np.int32(0x3F000000)
 _MANTISSA = np.int64(0x000FFFFFFFFFFFFF)
 _HALF_ONE = np.int64(0x3FE0000000000000)
 _ROOT_HALF = 0.70710678118654752
@@ -54,7 +56,7 @@ _EXPONENTIAL = polynomial(
      5.0000001201e-1, 1.0, 1.0),
 )  # fmt: skip
 # atanh(t) / t in t^2
-_ATANH = polynomial((1 / 11, 1 / 9, 1 / 7, 1 / 5, 1 / 3, 1.0))
+_ATANH = polynomial((1 / 11, 1 / 9, 1 / 7, 1 / 5, 1 / 3, 1.0), (1 / 7, 1 / 5, 1 / 3, 1.0))
 
 
 def _power_of_two(m):
@@ -86,3 +88,18 @@ def log10(x):
     m = as_type((bits & _MANTISSA) | _HALF_ONE, np.float64) / _ROOT_HALF
     t = (m - 1.0) / (m + 1.0)
     return (e - 0.5) * _LOG10_2 + 2.0 * _LOG10_E * t * _ATANH(t * t)
+
+
+@njit(**PART)
+def log10_single(x):
+    """Logarithm of positive normal numbers in single precision, to 1e-6."""
+    half = np.float32(0.5)
+    one = np.float32(1.0)
+    bits = as_type(x, np.int32)
+    e = np.float32(np.int32(bits >> np.int32(23)) - np.int32(126))
+    m = as_type(np.int32((bits & _MANTISSA32) | _HALF_ONE32), np.float32) * np.float32(
+        1.0 / _ROOT_HALF
+    )
+    t = (m - one) / (m + one)
+    log = (e - half) * np.float32(_LOG10_2)
+    return log + np.float32(2.0 * _LOG10_E) * t * _ATANH(t * t)

@@ -11,6 +11,7 @@ from miricigale.fitting.grid.adaptive import AdaptiveSampler, places_to_values, 
 from miricigale.fitting.grid.grid import GridEngine
 from miricigale.fitting.grid.interpolation import InterpolatedModels, grid_models
 from miricigale.fitting.grid.labels import LabelTable, log_weights
+from miricigale.fitting.grid.node_scan import NodeScan
 from miricigale.fitting.posterior.priors import GridAxis
 from miricigale.utils.units import Frozen
 
@@ -166,6 +167,13 @@ class Continuation(Frozen):
         return replace(engine, **new)
 
     @cached_property
+    def scan(self):
+        """`NodeScan` of the grid; None with a prior of rates, which takes sums over the nodes."""
+        if self.engine.mass_prior is not None:
+            return None
+        return NodeScan(self.engine, N_START)
+
+    @cached_property
     def _log_usable(self):
         """2 ln(prior) of the galaxies, shape (nz, nG)."""
         prior = self.engine.priors.galaxy
@@ -180,7 +188,7 @@ class Continuation(Frozen):
             return _core.Masses(np.zeros((n_z, 2)), np.zeros(n_galaxies), 0.0)
         return _core.Masses(density.table, density.log_stars, density.per_dex)
 
-    def place(self, n_effective, posteriors, node, redshift, known, nuclei=None):
+    def place(self, n_effective, known, node, redshift, nuclei=None):
         """
         Put models between the nodes, with the weights of the posterior of an object.
 
@@ -188,16 +196,19 @@ class Continuation(Frozen):
         ----------
         n_effective : int
             Effective number of models.
-        posteriors : dict
-            Gets, at the row of the object, a `BetweenPosterior`, or None if no model is possible.
+        known : `~miricigale.fitting.grid.grid.ObjectOnNodes`
+            What is known of the object.
         node : int or None
             Node that stands for the redshift; None if that is free.
         redshift : float
             Redshift of the object; 0 if it is free.
-        known : `~miricigale.fitting.grid.grid.ObjectOnNodes`
-            What is known of the object.
         nuclei : `~miricigale.fitting.grid.nuclei.ObjectNuclei`, optional
             Its nuclei, with which the data in ``known`` are extended.
+
+        Returns
+        -------
+        posterior : `BetweenPosterior` or None
+            None if no model is possible.
         """
         start = known.start
         bands = self.engine.mixture
@@ -237,7 +248,9 @@ class Continuation(Frozen):
         label, score = labels.of_nodes(self._cells_of(start.index))
         peak = np.searchsorted(borders, self.engine.grid.redshift[start.index[:, 0]])
         models = sampler.run(label, score, peak)
-        posteriors[known.row] = models and self._describe(models, one, known, nuclei)
+        if models is None:
+            return None
+        return self._describe(models, one, known, nuclei)
 
     def _cells_of(self, drawn):
         """Find the nodes of the axes of draws from the posterior on nodes: (n, n_axes)."""

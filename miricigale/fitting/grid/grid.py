@@ -132,7 +132,7 @@ class GridEngine(Frozen):
         return max(self.rtol, _MIN_MIXTURE_RTOL)
 
     @cached_property
-    def _tables(self):
+    def tables(self):
         """
         The model grid and its priors, as the kernels take them.
 
@@ -220,8 +220,9 @@ class GridEngine(Frozen):
         return _core.make_scales(galaxy, agn)
 
     @cached_property
-    def _tangents(self):
-        return Tangents.of_tables(self.mixture, self._tables)
+    def tangents(self):
+        """`~miricigale.fitting.grid.mixture.Tangents` of its models, where bands may be wrong."""
+        return Tangents.of_tables(self.mixture, self.tables)
 
     def workspace(self, n_draws=0, joint=()):
         """Make the accumulators and work space of one worker (some tens of MB)."""
@@ -298,7 +299,7 @@ class GridEngine(Frozen):
             limits = _core.make_limits(limit[i], inverse[i], getattr(self.mixture, "part", None))
             if broad is not None:
                 more = broad[i], limit[i], limit_sigma[i] if limits is not None else None
-                target, wrong = self._tangents.touch(stated, log_prior[i], sigma[i], *more)
+                target, wrong = self.tangents.touch(stated, log_prior[i], sigma[i], *more)
             of_all = target
             tables, target, log_norm = self._of_masses(target, workspace[2])
             given = tables, self._scales, self._request, target, limits
@@ -373,7 +374,7 @@ class GridEngine(Frozen):
 
         The third is ln of the factor that keeps the sum of a mass function's priors.
         """
-        tables = self._tables
+        tables = self.tables
         log_norm = 0.0
         if self.density is not None:
             change = np.empty(target.log_prior.size)

@@ -317,21 +317,15 @@ class GridFit:
     def _between_nodes(self, data, log_prior, pairs):
         """Results between nodes, and on nodes of objects that no model between them is possible for."""
         posteriors = {}
-        sampled = partial(self.between.place, self.given.interpolate)
-        at_redshift = data.redshift is not None and self.grid.redshift.size > 1
-        if at_redshift:
-            for i in np.flatnonzero(np.isfinite(log_prior).any(axis=1)):
-                row = slice(i, i + 1)
-                posterior = self._posterior_at_redshift(sampled, data[row], log_prior[row])
-                if posterior is not None:
-                    posteriors[i] = posterior
-        else:
-            self.engine.fit(
-                **data.of_engine(log_prior),
-                n_draws=N_START,
-                each=partial(sampled, posteriors, None, 0.0),
-                workspace=self.engine.workspace(N_START),
-            )
+        fitted = np.isfinite(log_prior).any(axis=1)
+        scanned = fitted & ~data.limit.any(axis=1)
+        if self.between.scan is None:
+            scanned[:] = False
+        if scanned.any():
+            self._scan(posteriors, data, log_prior, np.flatnonzero(scanned))
+        others = np.flatnonzero(fitted & ~scanned)
+        if others.size:
+            self._sum_up(posteriors, data, log_prior, others)
         posteriors = {i: posterior for i, posterior in posteriors.items() if posterior is not None}
         parts = []
         rows = np.array(sorted(posteriors), int)
@@ -341,25 +335,65 @@ class GridFit:
         others = np.setdiff1d(np.arange(len(data)), rows)
         if others.size or not parts:
             on_nodes = self._on_nodes
-            if at_redshift:
+            if self._at_own_redshift(data):
                 on_nodes = self._at_redshifts
             results = on_nodes(data[others], log_prior[others], pairs)
             parts.append(with_axis_summaries(results))
         order = np.argsort(np.concatenate([rows, others]), kind="stable")
         return FitResults.concatenate(parts)[order]
 
-    def _posterior_at_redshift(self, sampled, data, log_prior):
+    def _at_own_redshift(self, data):
+        """Whether objects are fitted at redshifts of their own, which are not those of nodes."""
+        return data.redshift is not None and self.grid.redshift.size > 1
+
+    def _scan(self, posteriors, data, log_prior, rows):
+        """Put `BetweenPosterior` of some objects, without limits, into a dict by row; None if there is none."""
+        nodes = None
+        at_redshift = self._at_own_redshift(data)
+        if at_redshift:
+            nodes = np.argmax(log_prior[rows], axis=1)
+
+        def place(known):
+            i = rows[known.row]
+            node = None
+            z = 0.0
+            if at_redshift:
+                node = int(nodes[known.row])
+                z = float(data.redshift[i])
+            posteriors[i] = self.between.place(self.given.interpolate, known, node, z)
+
+        some = data[rows]
+        photometry = some.of_engine(log_prior[rows])
+        self.between.scan.fit(**photometry, each=place, nodes=nodes)
+
+    def _sum_up(self, posteriors, data, log_prior, rows):
+        """Do what `_scan` does, by way of the sums over all nodes, for objects with limits and priors of rates."""
+        if not self._at_own_redshift(data):
+
+            def place(known):
+                posterior = self.between.place(self.given.interpolate, known, None, 0.0)
+                posteriors[rows[known.row]] = posterior
+
+            photometry = data[rows].of_engine(log_prior[rows])
+            self.engine.fit(**photometry, n_draws=N_START, each=place)
+            return
+        for i in rows:
+            row = slice(i, i + 1)
+            posteriors[i] = self._posterior_at_redshift(data[row], log_prior[row])
+
+    def _posterior_at_redshift(self, data, log_prior):
         """`BetweenPosterior` of an object at its own redshift; None if no model is possible."""
         z = float(data.redshift[0])
         node = int(np.argmax(log_prior[0]))
         engine = self.between.at_redshift(z, node)
-        posteriors = {}
-        engine.fit(
-            **data.of_engine(log_prior[:, node : node + 1]),
-            n_draws=N_START,
-            each=partial(sampled, posteriors, node, z),
-        )
-        return posteriors.get(0)
+        posteriors = []
+
+        def place(known):
+            posteriors.append(self.between.place(self.given.interpolate, known, node, z))
+
+        photometry = data.of_engine(log_prior[:, node : node + 1])
+        engine.fit(**photometry, n_draws=N_START, each=place)
+        return posteriors[0] if posteriors else None
 
     def _at_redshifts(self, data, log_prior, pairs):
         """Fit objects on nodes at their own redshifts."""

@@ -15,7 +15,7 @@ differ from object to object.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -372,16 +372,17 @@ def _fit_object(fit, data, log_prior, pairs, workspaces):
 
     results = None
     if fit.between is not None:
-        posteriors = {}
-        place = partial(fit.between.place, fit.given.interpolate, posteriors, node, z)
-        engine.fit(
-            **photometry,
-            n_draws=N_START,
-            each=partial(place, nuclei=nuclei),
-            workspace=memory("draws", n_draws=N_START),
-        )
-        if posteriors.get(0) is not None:
-            results = between_results(fit, plain, [posteriors[0]], pairs)
+        posteriors = []
+
+        def place(known):
+            posterior = fit.between.place(fit.given.interpolate, known, node, z, nuclei)
+            if posterior is not None:
+                posteriors.append(posterior)
+
+        workspace = memory("draws", n_draws=N_START)
+        engine.fit(**photometry, n_draws=N_START, each=place, workspace=workspace)
+        if posteriors:
+            results = between_results(fit, plain, posteriors, pairs)
     if results is None:
         joint = joint_names(pairs, fit.priors.axes)
         out = engine.fit(**photometry, joint=joint, workspace=memory("joint", joint=joint))
