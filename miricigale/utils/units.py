@@ -167,7 +167,7 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)
     except u.UnitConversionError:
         if unit == u.dimensionless_unscaled:
-            wanted = "a number without a unit"
+            wanted = "convertible to a number without a unit"
         else:
             wanted = f"convertible to {unit}"
         raise units_error(name, wanted, getattr(value, "unit", None)) from None

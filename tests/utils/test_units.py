@@ -75,5 +75,5 @@ def test_mjy_may_be_two_units():
 
 def test_complex_numbers_and_units_of_numbers_without_one_are_refused():
     refuses("'redshift' must be real numbers, got complex", to_array, [1j], u.one, "redshift")
-    message = "'redshift' must be a number without a unit, got km / s"
+    message = "'redshift' must be convertible to a number without a unit, got km / s"
     refuses(message, to_array, [1] * u.km / u.s, u.one, "redshift", error=u.UnitsError)
