@@ -50,20 +50,26 @@ def reducer_of(args):
 
 
 def _references(args):
-    """What the options say of references."""
+    """Return references of the options: files, a cache of CRDS, or what ``--references`` names."""
     from miricigale.reduction import ReferenceCache, ReferenceFiles
 
-    given = {k: _number(v) for k, v in chosen(args, _FILES).items() if v is not None}
-    ways = [bool(given), args.crds is not None, args.references is not None]
-    if sum(ways) > 1 or (args.context and args.crds is None):
+    files = {}
+    for name, value in chosen(args, _FILES).items():
+        if value is not None:
+            files[name] = _number(value)
+    n_ways = bool(files) + (args.crds is not None) + (args.references is not None)
+    if n_ways > 1 or (args.context and args.crds is None):
         msg = "wanted are files of references, --crds (with --context) or --references, only one of these"
         raise ValueError(msg)
     if args.crds is not None:
         return ReferenceCache(args.crds, args.context, incomplete=args.incomplete)
-    return ReferenceFiles(**given, incomplete=args.incomplete) if given else args.references
+    if files:
+        return ReferenceFiles(**files, incomplete=args.incomplete)
+    return args.references
 
 
 def _number(text):
+    """Return a text as a number where it is one."""
     try:
         return float(text)
     except ValueError:

@@ -18,45 +18,51 @@ def inject(args):
     from miricigale.injection import Injection
     from miricigale.injection.ramps import is_ramp
 
-    ramps = []
-    while len(ramps) < len(args.images) and is_ramp(args.images[len(ramps)].partition("[")[0]):
-        ramps.append(args.images[len(ramps)])
-    others = args.images[len(ramps) :] if ramps else args.images[1:]
-    if len(others) > 1:
-        msg = f"wanted are an image, or ramps, and at most one prior, got {len(others)} priors"
+    images = args.images
+    n_ramps = 0
+    while n_ramps < len(images) and is_ramp(images[n_ramps].partition("[")[0]):
+        n_ramps += 1
+    ramps = images[:n_ramps]
+    priors = images[max(n_ramps, 1) :]
+    if len(priors) > 1:
+        msg = f"wanted are an image, or ramps, and at most one prior, got {len(priors)} priors"
         raise ValueError(msg)
-    highres = None
     options = chosen(args, _PHOTOMETRY)
-    if others:
-        (highres,) = images_of(args, others, "highres_")
-        options |= chosen(args, "segmentation catalog psf_stars") | {"kernel": args.kernel}
+    if priors:
+        (highres,) = images_of(args, priors, "highres_")
+        options |= chosen(args, "segmentation catalog psf_stars kernel")
     else:
-        names = [name for name in vars(args) if name.startswith("highres_")]
-        _refuse(args, (*names, *_OF_PRIOR), "given with a prior")
+        highres = None
+        of_prior = [name for name in vars(args) if name.startswith("highres_")]
+        _refuse(args, (*of_prior, *_OF_PRIOR), "given with a prior")
     injection = Injection(
-        args.sources,
-        **chosen(args, "n_trials n_sources stars threshold preset seed"),
+        args.sources, **chosen(args, "n_trials n_sources stars threshold preset seed")
     )
-    options |= chosen(args, "redo") | {"folder": args.output, "n_threads": args.threads}
+    options["redo"] = args.redo
+    options["folder"] = args.output
+    options["n_threads"] = args.threads
     options["progress_bar"] = not args.no_progress
     with workers(None, args.threads) as executor:
         options["executor"] = executor
         if ramps:
-            of_image = [name.removeprefix("highres_") for name in vars(args)]
-            of_image = {name for name in of_image if f"highres_{name}" in vars(args)}
-            _refuse(args, sorted(of_image), "left out for ramps, whose mosaic states it")
-            options |= chosen(args, "pixel_scale align") | {"reducer": reducer_of(args)}
+            # an option of image and prior has both names
+            of_image = sorted(name for name in vars(args) if f"highres_{name}" in vars(args))
+            _refuse(args, of_image, "left out for ramps, whose mosaic states it")
+            options |= chosen(args, "pixel_scale align")
+            options["reducer"] = reducer_of(args)
             result = injection.run_exposures(ramps, highres, **options)
         else:
             _refuse_reduction(args)
-            (image,) = images_of(args, args.images[:1])
+            (image,) = images_of(args, images[:1])
             result = injection.run(image, highres, **options)
+    if len(result.sources) == 0:
+        print(f"0 sources; photometry: photometry.fits in {args.output}/")
+        return 0
     for question in ("detection", "forced"):
-        curve = result.curve(question) if len(result.sources) else None
+        curve = result.curve(question)
         if curve is not None and math.isfinite(curve.limit):
             print(f"50 % limit, {question}: {curve.limit:.2f} ± {curve.limit_err:.2f} AB")
-    made = "page: index.html" if len(result.sources) else "photometry: photometry.fits"
-    print(f"{len(result.sources)} sources; {made} in {args.output}/")
+    print(f"{len(result.sources)} sources; page: index.html in {args.output}/")
     return 0
 
 

@@ -29,14 +29,14 @@ class Parser(argparse.ArgumentParser):
     every_flag = ()
 
 
-def _nearest(name, known):
+def _nearest(name, names):
     """Say which name may be meant; empty if none is near."""
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def quantity_in(unit):
-    """Type of an option that is a number in a unit."""
+    """Return the type of an option that is a number in a unit."""
 
     def number(text):
         import astropy.units as u
@@ -47,7 +47,7 @@ def quantity_in(unit):
 
 
 def pair(text):
-    """Two names with a colon between them."""
+    """Return two names that stand with a colon between them."""
     names = tuple(text.split(":"))
     if len(names) != 2 or not all(names):
         msg = f"{text!r} is no pair NAME:NAME"
@@ -67,7 +67,7 @@ TYPES = {
 
 
 def chosen(args, names):
-    """Options by the names of the arguments that they become."""
+    """Return options by the names of the arguments that they become."""
     return {name: getattr(args, name) for name in names.split()}
 
 
@@ -78,7 +78,7 @@ def filled(args, function):
 
 
 def declarations():
-    """What ``commands.toml`` declares: of each command by name, and of ``shared`` options."""
+    """Return what ``commands.toml`` declares: of each command by name, and of ``shared`` options."""
     return tomllib.loads((resources.files("miricigale.cli") / "commands.toml").read_text("utf-8"))
 
 
@@ -102,55 +102,69 @@ def workers(scheduler, n_threads, memory=None):
 
 
 def make_parser(argv):
-    """The parser of the program; help texts are complete where they are asked for."""
-    known = {}
+    """Return the parser of the program; help texts are complete where they are asked for."""
+    words = {}
     if not argv or {"-h", "--help"} & set(argv):
         from miricigale.filters.surveys import SURVEYS
         from miricigale.workflow.config import preset_names
 
-        known = {"{presets}": ", ".join(preset_names()), "{surveys}": ", ".join(SURVEYS)}
+        words = {"{presets}": ", ".join(preset_names()), "{surveys}": ", ".join(SURVEYS)}
     declared = declarations()
     shared = declared.pop("shared")
-    talk = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
-    how = talk.add_mutually_exclusive_group()
-    how.add_argument("-v", "--verbose", action="store_true", help="say what is done")
-    how.add_argument("-q", "--quiet", action="store_true", help="errors and warnings only")
-    about = "Plan and analyze JWST/MIRI deep imaging."
-    parser = Parser(prog="miricigale", description=about, parents=[talk])
+    verbosity = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    group = verbosity.add_mutually_exclusive_group()
+    group.add_argument("-v", "--verbose", action="store_true", help="say what is done")
+    group.add_argument("-q", "--quiet", action="store_true", help="errors and warnings only")
+    description = "Plan and analyze JWST/MIRI deep imaging."
+    parser = Parser(prog="miricigale", description=description, parents=[verbosity])
     parser.add_argument("--version", action="store_true", help="print the version and stop")
+    # parsers of commands by the name of their group, empty for that of the program
     parsers = {"": parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)}
     for name, command in declared.items():
-        group, _, last = name.rpartition(" ")
-        text = _filled(command["help"], known)
-        made = parsers[group].add_parser(
-            last,
+        group, _, word = name.rpartition(" ")
+        text = _replaced(command["help"], words)
+        command_parser = parsers[group].add_parser(
+            word,
             help=text,
             description=command.get("description", f"{text[0].upper()}{text[1:]}."),
             epilog="examples:\n  " + "\n  ".join(command["examples"]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
-            parents=[talk],
+            parents=[verbosity],
         )
         if "call" not in command:
-            parsers[name] = made.add_subparsers(dest="action", metavar="ACTION", required=True)
+            parsers[name] = command_parser.add_subparsers(
+                dest="action", metavar="ACTION", required=True
+            )
             continue
-        stopped = command.get("stopped", "miricigale: stopped")
-        made.set_defaults(call=command["call"], stopped=stopped)
         options = command.get("options", {})
-        for other, flags in command.get("as_in", {}).items():
-            options |= {one: declared[other]["options"][one] for one in flags}
-        options |= {shared[one]["flags"]: shared[one] for one in command.get("shared", ())}
-        groups, section, title = {}, made, None
-        for flags, option in _of_both(options):
-            # an option of image and prior has its heading twice
-            if option.get("heading", title) != title:
-                title = option["heading"]
-                section = made.add_argument_group(title)
-            is_positional = not flags.startswith("-")
-            _add(made if is_positional else section, groups, flags, option, known)
-        names = _option_names(made)
-        made.set_defaults(option_names=names)
-        parser.every_flag = (*parser.every_flag, *names.values())
+        for source, flags in command.get("as_in", {}).items():
+            for flag in flags:
+                options[flag] = declared[source]["options"][flag]
+        for key in command.get("shared", ()):
+            options[shared[key]["flags"]] = shared[key]
+        _add_options(command_parser, options, words)
+        names = _option_names(command_parser)
+        command_parser.set_defaults(
+            call=command["call"],
+            stopped=command.get("stopped", "miricigale: stopped"),
+            option_names=names,
+        )
+        parser.every_flag += tuple(names.values())
     return parser
+
+
+def _add_options(parser, options, words):
+    """Add the options of a command, under their headings."""
+    groups = {}
+    section = parser
+    title = None
+    for flags, option in _of_both(options):
+        # an option of image and prior has its heading twice
+        if option.get("heading", title) != title:
+            title = option["heading"]
+            section = parser.add_argument_group(title)
+        target = section if flags.startswith("-") else parser
+        _add(target, groups, flags, option, words)
 
 
 def _option_names(parser):
@@ -193,57 +207,67 @@ def in_options(message, names):
 
 
 def _of_both(options):
-    """Options with those of the image and of the prior apart."""
+    """Yield options, those of image and prior once for each."""
     for flags, option in options.items():
-        both = (("", "image"), ("highres-", "prior")) if "{prefix}" in flags else (("", ""),)
-        for prefix, what in both:
-            words = {"{prefix}": prefix, "{what}": what}
-            texts = {k: _filled(v, words) for k, v in option.items() if isinstance(v, str)}
-            yield _filled(flags, words), option | texts
+        variants = [{"{prefix}": "", "{what}": ""}]
+        if "{prefix}" in flags:
+            variants = [
+                {"{prefix}": "", "{what}": "image"},
+                {"{prefix}": "highres-", "{what}": "prior"},
+            ]
+        for words in variants:
+            replaced = dict(option)
+            for key, value in option.items():
+                if isinstance(value, str):
+                    replaced[key] = _replaced(value, words)
+            yield _replaced(flags, words), replaced
 
 
 #: Keys of options that argparse does not know.
-_OWN_KEYS = ("flags", "group", "key", "heading")
+_EXTRA_KEYS = ("flags", "group", "key", "heading")
 
 
-def _add(parser, groups, flags, option, known):
+def _add(parser, groups, flags, option, words):
     """Add an option to a parser, or to its group of options of which one may be given."""
-    own = {key: value for key, value in option.items() if key not in _OWN_KEYS}
-    own["help"] = _filled(own["help"], known)
-    if "type" in own:
+    arguments = {key: value for key, value in option.items() if key not in _EXTRA_KEYS}
+    arguments["help"] = _replaced(arguments["help"], words)
+    if "type" in arguments:
         # argparse applies it to a default that is text
-        own["type"] = TYPES[own["type"]]
-    if own.get("action") == "boolean":
-        own["action"] = argparse.BooleanOptionalAction
-    if isinstance(own.get("metavar"), list):
-        own["metavar"] = tuple(own["metavar"])
+        arguments["type"] = TYPES[arguments["type"]]
+    if arguments.get("action") == "boolean":
+        arguments["action"] = argparse.BooleanOptionalAction
+    if isinstance(arguments.get("metavar"), list):
+        arguments["metavar"] = tuple(arguments["metavar"])
     if (group := option.get("group")) is not None:
         if group not in groups:
             groups[group] = parser.add_mutually_exclusive_group()
         parser = groups[group]
-    parser.add_argument(*flags.split(), **own)
+    parser.add_argument(*flags.split(), **arguments)
 
 
-def _filled(text, words):
+def _replaced(text, words):
     for name, value in words.items():
         text = text.replace(name, value)
     return text
 
 
 def read_input(folder):
-    """Write what standard input holds, a table, beside the folder of its results: its path."""
+    """Write the table that standard input holds to a file next to the folder of its results; return its path."""
     from miricigale.utils.files import replacing
     from miricigale.utils.options import check_that
 
     data = sys.stdin.buffer.read()
-    kinds = {b"SIMPLE": "fits", b"# %ECSV": "ecsv", b"PAR1": "parquet", b"<?xml": "xml"}
-    ending = next((kind for begin, kind in kinds.items() if data.startswith(begin)), "csv")
+    endings = {b"SIMPLE": "fits", b"# %ECSV": "ecsv", b"PAR1": "parquet", b"<?xml": "xml"}
+    ending = "csv"
+    for begin, name in endings.items():
+        if data.startswith(begin):
+            ending = name
     path = folder.with_name(f"{folder.name}-input.{ending}")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists():
         # the same input again resumes; another is not put in its place
-        same = path.is_file() and path.read_bytes() == data
-        check_that(same, "output", "another folder", f"{folder}: {path} holds another input")
+        is_same = path.is_file() and path.read_bytes() == data
+        check_that(is_same, "output", "another folder", f"{folder}: {path} holds another input")
     else:
         with replacing(path) as partial:
             partial.write_bytes(data)

@@ -1,5 +1,6 @@
 """Commands of single products: show, psf, cite."""
 
+import collections
 import re
 import warnings
 from pathlib import Path
@@ -12,16 +13,18 @@ _PRODUCTS = (".fits", ".fit", ".gz", ".ecsv", ".parquet", ".asdf")
 
 
 def _readers():
-    """Functions that read a product, the most particular first."""
+    """Yield functions that read a product, the most particular first."""
     from miricigale.fitting import FitResults
     from miricigale.photometry import ErrorModel, ForcedPhotometryResult, read_mosaic
     from miricigale.psf import InstrumentPSF, MatchingKernel, read_psf
     from miricigale.reduction import open_exposure
     from miricigale.utils.table_files import read_table
 
-    classes = (FitResults, ForcedPhotometryResult, MatchingKernel, InstrumentPSF, ErrorModel)
-    yield from (cls.read for cls in classes)
-    yield from (open_exposure, read_mosaic, read_psf)
+    for cls in (FitResults, ForcedPhotometryResult, MatchingKernel, InstrumentPSF, ErrorModel):
+        yield cls.read
+    yield open_exposure
+    yield read_mosaic
+    yield read_psf
     yield lambda path: read_table(path, wanted="a table")
 
 
@@ -50,7 +53,7 @@ def open_product(path):
     from miricigale.utils.options import check_data
 
     # of a reader for a file of another kind
-    other = (OSError, ValueError, KeyError, TypeError, IORegistryError)
+    unsuitable = (OSError, ValueError, KeyError, TypeError, IORegistryError)
     path = Path(path)
     check_data(path.is_file(), "no file", path)
     if path.suffix.lower() == ".ini":
@@ -64,7 +67,7 @@ def open_product(path):
         for read in _readers():
             try:
                 return read(path)
-            except other as err:
+            except unsuitable as err:
                 # the last reader is that of tables
                 reason = str(err).partition("cannot be read as a table: ")[2]
     problem = "is no product, image or table that can be read"
@@ -111,12 +114,12 @@ def psf(args):
     from miricigale.photometry.commands.kernel_files import image_psf
     from miricigale.psf import MODEL_FILTERS
 
-    made = image_psf(MosaicFile(args.image, filter=args.filter, pa_aper=args.pa_aper))
+    model = image_psf(MosaicFile(args.image, filter=args.filter, pa_aper=args.pa_aper))
     wanted = f"an image of a filter with a model ({', '.join(MODEL_FILTERS)}) and its PA_APER"
-    check_that(made is not None, "IMAGE", wanted, args.image)
+    check_that(model is not None, "IMAGE", wanted, args.image)
     check_output(args.output, "output", overwrite=args.overwrite, inputs=[args.image])
-    made.write(args.output, overwrite=args.overwrite)
-    print(f"{args.output}: FWHM {made.fwhm:.4f}, pixel {made.pixel_scale:.4f}")
+    model.write(args.output, overwrite=args.overwrite)
+    print(f"{args.output}: FWHM {model.fwhm:.4f}, pixel {model.pixel_scale:.4f}")
     return 0
 
 
@@ -145,7 +148,7 @@ def cite(args):
 
 def citations_of(path):
     """
-    What products name to be cited, each once, in the order of the files.
+    Return what products name to be cited, each once, in the order of the files.
 
     Parameters
     ----------
@@ -173,7 +176,7 @@ def citations_of(path):
 
 def bibtex(citations):
     """
-    Entries for BibTeX.
+    Return entries for BibTeX.
 
     Parameters
     ----------
@@ -197,7 +200,7 @@ def bibtex(citations):
     }
     """
     entries = []
-    taken = set()
+    n_keys = collections.Counter()
     for text in citations:
         match = re.match(r"(?P<author>[^,;(]+?),? \(?(?P<year>(?:19|20)\d\d)\b", text)
         word = re.match(r"\W*(\w+)", text)[1].lower()
@@ -205,13 +208,9 @@ def bibtex(citations):
         if match:
             authors = match["author"].replace("et al.", "and others").replace(" & ", " and ")
             lines = [f"  author = {{{authors}}}", f"  year = {{{match['year']}}}"]
-        stem = word + (match["year"] if match else "")
-        key = stem
-        number = 1
-        while key in taken:
-            number += 1
-            key = f"{stem}_{number}"
-        taken.add(key)
+            word += match["year"]
+        n_keys[word] += 1
+        key = word if n_keys[word] == 1 else f"{word}_{n_keys[word]}"
         note = re.sub(r"([&%#_$])", r"\\\1", text)
         lines.append(f"  note = {{{note}}}")
         entries.append(f"@misc{{{key},\n" + ",\n".join(lines) + "\n}")

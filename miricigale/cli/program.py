@@ -34,20 +34,10 @@ def main(argv=None):
 
         argcomplete.autocomplete(parser)
     args = parser.parse_args(argv)
-    verbose, quiet = (getattr(args, name, False) for name in ("verbose", "quiet"))
+    verbose = getattr(args, "verbose", False)
+    quiet = getattr(args, "quiet", False)
     args.no_progress = quiet or getattr(args, "no_progress", False)
-    handler = logging.StreamHandler()
-    handler.addFilter(lambda record: _is_logged(record, verbose))
-    level = logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING
-    logging.basicConfig(level=level, format="%(message)s", handlers=[handler])
-    if not quiet:
-        # what is compiled, and what is fitted, is said at any verbosity
-        for name in (
-            "utils.compilation",
-            "fitting.catalogs.from_files",
-            "fitting.catalogs.class_names",
-        ):
-            logging.getLogger(f"miricigale.{name}").setLevel(logging.INFO)
+    _log_to_screen(verbose, quiet)
     if args.version:
         from miricigale import __version__
 
@@ -70,14 +60,41 @@ def main(argv=None):
         expected = (ValueError, KeyError, OSError, ImportError, MemoryError, UnitsError)
         if verbose or not isinstance(err, expected):
             raise
-        message = err.args[0] if isinstance(err, KeyError) and err.args else err
-        # the message of a KeyError may be the key alone
-        bare = isinstance(err, KeyError) and " " not in str(message)
-        kind = f"{type(err).__name__} " if bare else ""
-        where = "".join(f" ({note})" for note in getattr(err, "__notes__", ()))
-        text = in_options(" ".join(str(message).split()), args.option_names)
-        print(f"miricigale: {kind}{text}{where}", file=sys.stderr)
+        text = in_options(_sentence(err), args.option_names)
+        notes = "".join(f" ({note})" for note in getattr(err, "__notes__", ()))
+        print(f"miricigale: {text}{notes}", file=sys.stderr)
         return 2
+
+
+def _sentence(err):
+    """Return the message of an error in one line."""
+    if not isinstance(err, KeyError):
+        return " ".join(str(err).split())
+    message = str(err.args[0]) if err.args else ""
+    if " " in message:
+        return " ".join(message.split())
+    # the message of a KeyError may be the key alone
+    return f"{type(err).__name__} {message}"
+
+
+def _log_to_screen(verbose, quiet):
+    """Show log records: warnings, with ``verbose`` notes too, with ``quiet`` errors alone."""
+    handler = logging.StreamHandler()
+    handler.addFilter(lambda record: _is_logged(record, verbose))
+    level = logging.WARNING
+    if verbose:
+        level = logging.INFO
+    elif quiet:
+        level = logging.ERROR
+    logging.basicConfig(level=level, format="%(message)s", handlers=[handler])
+    if not quiet:
+        # what is compiled, and what is fitted, is said at any verbosity
+        for name in (
+            "utils.compilation",
+            "fitting.catalogs.from_files",
+            "fitting.catalogs.class_names",
+        ):
+            logging.getLogger(f"miricigale.{name}").setLevel(logging.INFO)
 
 
 def command():
@@ -87,8 +104,8 @@ def command():
     status = main()
     sys.stdout.flush()
     sys.stderr.flush()
-    others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
-    if status > _STOPPED and not all(thread.daemon for thread in others):
+    threads = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+    if status > _STOPPED and not all(thread.daemon for thread in threads):
         # threads in compiled code ignore interrupts, and the interpreter would wait for them
         os._exit(status)
     sys.exit(status)

@@ -8,24 +8,29 @@ from miricigale.cli.options import chosen, declarations, workers
 
 
 def _settings(args, values):
-    """Values by section and key, with those of ``--set``."""
+    """Return values by section and key, with those of ``--set``."""
     from miricigale.workflow.options import read_setting
 
-    given = {}
-    for key, value in values.items():
-        section, _, key = key.partition(".")
-        given.setdefault(section, {})[key] = value
+    sections = {}
+    for name, value in values.items():
+        section, _, key = name.partition(".")
+        sections.setdefault(section, {})[key] = value
     for section, key, value in map(read_setting, args.settings):
-        given.setdefault(section, {})[key] = value
-    return given
+        sections.setdefault(section, {})[key] = value
+    return sections
 
 
 def run(args):
     """Run a study."""
     from miricigale.workflow import load_config, run_study
 
-    options = chosen(args, "threads seed") | {"keep_level1b": args.keep_level1b or None}
-    values = {f"run.{name}": value for name, value in options.items() if value is not None}
+    values = {}
+    if args.threads is not None:
+        values["run.threads"] = args.threads
+    if args.seed is not None:
+        values["run.seed"] = args.seed
+    if args.keep_level1b:
+        values["run.keep_level1b"] = True
     config = load_config(args.config, quick=args.quick, overrides=_settings(args, values))
     if args.print_config:
         print(config.to_toml(), end="")
@@ -34,11 +39,16 @@ def run(args):
     if args.plan:
         return _show_cost(config, folder, **chosen(args, "until again"))
     begin = time.monotonic()
-    options = chosen(args, "redo until again") | {"progress_bar": not args.no_progress}
     with workers(args.scheduler, config.run.threads, config.run.memory) as executor:
-        report = run_study(config, folder, executor=executor, **options)
-    made = f"report: {report}" if args.until is None else f"products: {folder}"
-    print(f"done in {(time.monotonic() - begin) / 60:.1f} min; {made}")
+        report = run_study(
+            config,
+            folder,
+            executor=executor,
+            **chosen(args, "redo until again"),
+            progress_bar=not args.no_progress,
+        )
+    products = f"report: {report}" if args.until is None else f"products: {folder}"
+    print(f"done in {(time.monotonic() - begin) / 60:.1f} min; {products}")
     return 0
 
 
@@ -56,20 +66,26 @@ def _show_cost(config, folder, until, again):
         cost = cost[[name in stages for name in cost["stage"]]]
         print(f"stages that {until!r} needs, with all of their units:")
     cost.pprint_all()
-    hours, disk = cost["cpu"].sum().to_value("h"), cost["disk"].sum().to_value("GB")
+    hours = cost["cpu"].sum().to_value("h")
+    disk = cost["disk"].sum().to_value("GB")
     print(f"all: {cost['units'].sum()} units, {hours:.1f} hours of a core, {disk:.1f} GB")
     return 0
 
 
 def plan(args):
     """Tabulate exposures, or compare plans."""
-    options = declarations()["plan"]["options"]
-    keys = {flag.lstrip("-"): option["key"] for flag, option in options.items() if "key" in option}
-    keys |= {"seed": "plan.seed", "threads": "plan.threads"}
-    given = {key: getattr(args, name) for name, key in keys.items()}
-    values = {key: one for key, one in given.items() if one is not None and one is not False}
-    others = [args.config, args.bands, args.position, args.output, *args.settings]
-    if not values and not args.print_config and all(one is None for one in others):
+    values = {}
+    if args.seed is not None:
+        values["plan.seed"] = args.seed
+    if args.threads is not None:
+        values["plan.threads"] = args.threads
+    for flag, option in declarations()["plan"]["options"].items():
+        value = getattr(args, flag.lstrip("-"), None)
+        if "key" in option and value is not None and value is not False:
+            values[option["key"]] = value
+    has_files = args.config is not None or args.output is not None
+    has_options = args.bands is not None or args.position is not None or args.settings
+    if not (values or has_files or has_options or args.print_config):
         from miricigale.planning import plan_table
 
         plan_table(quick=args.quick).pprint_all()
@@ -93,7 +109,7 @@ def plan(args):
     if args.bands is not None:
         values |= _bands_of(args, values)
     if args.position is not None:
-        values |= dict(zip(("background.ra", "background.dec"), args.position, strict=True))
+        values["background.ra"], values["background.dec"] = args.position
     config = load_plan(args.config, overrides=_settings(args, values))
     if args.print_config:
         print(config.to_toml(), end="")
@@ -112,8 +128,8 @@ def plan(args):
             overwrite=args.overwrite,
             progress_bar=not args.no_progress,
         )
-    wanted = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter", "completeness", "purity"]
-    table = comparison[[*wanted, "n_agn", "merit"]]
+    names = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter", "completeness", "purity"]
+    table = comparison[[*names, "n_agn", "merit"]]
     for name in table.colnames[1:]:
         table[name].info.format = ".3g"
     table.pprint_all()
@@ -123,18 +139,20 @@ def plan(args):
 
 
 def _bands_of(args, values):
-    """Keys of the bands that were asked for: those that nothing else gives as in the CEERS exposures."""
+    """Return keys of the bands that were asked for: those that nothing else gives as in the CEERS exposures."""
     from miricigale.instrument.published_tables import imager_filter
     from miricigale.planning.config import ExposureSection
 
     names = [imager_filter(name) for name in args.bands]
-    found = {"exposures.bands": names}
+    keys = {"exposures.bands": names}
     if args.config is None and not {"exposures.time", "exposures.depth"} & set(values):
-        found["exposures.time"] = ExposureSection(bands=tuple(names)).by_band("time")
+        times = ExposureSection(bands=tuple(names)).by_band("time")
+        keys["exposures.time"] = times
         if "exposures.hours" not in values:
-            text = ", ".join(f"{t:g} s" for t in found["exposures.time"])
+            text = ", ".join(f"{time:g} s" for time in times)
             print(f"exposed as in CEERS: {text}", file=sys.stderr)
-    return found | {"exposures.dithers": values.get("exposures.dithers", [4])}
+    keys["exposures.dithers"] = values.get("exposures.dithers", [4])
+    return keys
 
 
 def compile_all(args):
