@@ -28,16 +28,16 @@ def with_nuclei(nuclei, flux):
         out[1, b] = flux[1, b]
     for j in range(n):
         b = nuclei.bands[j]
-        rest = flux[0, b]
+        remainder = flux[0, b]
         nucleus = 0.0
         if power > 0.0:
             for k in range(n):
                 light = flux[1, nuclei.bands[k]]
-                rest -= nuclei.mix[j, k] * light
+                remainder -= nuclei.mix[j, k] * light
                 nucleus += nuclei.root[j, k] * light
-        out[0, n_bands + j] = rest
+        out[0, n_bands + j] = remainder
         # of the error of AGN light the rest has the AGN's share of the total
-        out[1, n_bands + j] = rest * flux[1, b] / flux[0, b] if power > 0.0 else 0.0
+        out[1, n_bands + j] = remainder * flux[1, b] / flux[0, b] if power > 0.0 else 0.0
         out[0, n_bands + n + j] = nucleus
         # and the nuclei have theirs in their errors
         out[1, n_bands + n + j] = 0.0

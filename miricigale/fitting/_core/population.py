@@ -11,7 +11,8 @@ from miricigale.fitting._core.structs import NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
 #: ln of what has no probability, and below which there is none.
-NEVER, _NONE = -1e300, -1e200
+NEVER = -1e300
+_NONE = -1e200
 
 #: Where places are: a unit interval for each axis (redshift, AGN fraction, those of galaxies, those of AGN), in
 #: which all cells are equally wide: their number, int64 (n_axes,), lowest and highest values, (n_axes, n_largest),
@@ -29,8 +30,10 @@ Masses = namedtuple("Masses", "table log_stars per_dex")
 #: one, (n_used,); odds of the latter without a residual, (nz, n_used); ln of the likelihood where none is wrong
 #: and there are no residuals, (nz,); scratch, (nb,).
 Mixture = namedtuple("Mixture", "narrow broad odds level weight")
-#: Most steps to the scale with bands that may be wrong, and the square of the last one over the scale's error.
-_STEPS, _CLOSE = 10, 1e-4
+#: Largest number of steps to the scale with bands that may be wrong.
+_STEPS = 10
+#: Square of the last step over the variance of the scale.
+_CLOSE = 1e-4
 
 
 @njit(**PART)
@@ -40,7 +43,8 @@ def _best_scale(flux, weight, target, limits):
 
     R is chi2 of no model less that of this one, and chi2 of the fluxes is less that of no model.
     """
-    p, q = 0.0, 0.0
+    p = 0.0
+    q = 0.0
     for b in target.bands:
         wm = weight[b] * flux[b]
         p += wm * target.flux[b]
@@ -70,18 +74,18 @@ def _widen(flux, agn, z, target, agn_error, weight):
 
     Returned is what 2 ln(likelihood) of no light changes by.
     """
-    more = 0.0
+    log_change = 0.0
     for b in target.bands:
         w = target.weight[z, b]
         part = _widened(w, b, flux, agn, target, agn_error)
         weight[b] = w * part
         if part < 1.0:
-            more += math.log(part) + (1.0 - part) * w * target.flux[b] ** 2
-    return more
+            log_change += math.log(part) + (1.0 - part) * w * target.flux[b] ** 2
+    return log_change
 
 
 @njit(**PART)
-def _likelihood(one, limits, mixture, z, fluxes):
+def _likelihood(observed, limits, mixture, z, fluxes):
     """
     Best scale of a model, ln of the likelihood there but for a constant, and the variance of the scale.
 
@@ -90,27 +94,36 @@ def _likelihood(one, limits, mixture, z, fluxes):
     model and of its AGN, and memory for weights; ``limits`` and ``mixture``, those of the object, are
     arguments so that kernels without them are compiled.
     """
-    flux, agn, scratch = fluxes[0], fluxes[1], fluxes[2]
-    target, agn_error = one.target, one.agn_error
-    more = _widen(flux, agn, z, target, agn_error, scratch)
+    flux = fluxes[0]
+    agn = fluxes[1]
+    scratch = fluxes[2]
+    target = observed.target
+    agn_error = observed.agn_error
+    log_change = _widen(flux, agn, z, target, agn_error, scratch)
     s, r, variance, chi2 = _best_scale(flux, scratch, target, limits)
-    log = 0.5 * (r + target.level[z] + more)
+    log = 0.5 * (r + target.level[z] + log_change)
     if mixture is not None:
-        weight, product = mixture.weight, 1.0
+        weight = mixture.weight
+        product = 1.0
         for _ in range(_STEPS):
-            log, product = mixture.level[z], 1.0
+            log = mixture.level[z]
+            product = 1.0
             if limits is not None:
                 log += 0.5 * (r - limits.dark + chi2)
             for j, b in enumerate(target.bands):
                 d = target.flux[b] - s * flux[b]
-                narrow, broad, odds = mixture.narrow[z, j], mixture.broad[j], mixture.odds[z, j]
+                narrow = mixture.narrow[z, j]
+                broad = mixture.broad[j]
+                odds = mixture.odds[z, j]
                 part = _widened(narrow, b, flux, agn, target, agn_error)
                 if part < 1.0:
-                    narrow, odds = narrow * part, odds / math.sqrt(part)
+                    narrow = narrow * part
+                    odds = odds / math.sqrt(part)
                     log += 0.5 * math.log(part)
-                some = odds > 0.0
-                good = exponential(max(0.5 * (broad - narrow) * d * d, -600.0)) if some else 1.0
-                log -= 0.5 * (broad if some else narrow) * d * d
+                may_be_wrong = odds > 0.0
+                exponent = max(0.5 * (broad - narrow) * d * d, -600.0)
+                good = exponential(exponent) if may_be_wrong else 1.0
+                log -= 0.5 * (broad if may_be_wrong else narrow) * d * d
                 product *= good + odds
                 weight[b] = (good * narrow + odds * broad) / (good + odds)
             before = s
@@ -122,12 +135,13 @@ def _likelihood(one, limits, mixture, z, fluxes):
 
 
 @njit(**PART)
-def _prior(one, z, g):
+def _prior(observed, z, g):
     """Ln(prior) of a galaxy at a redshift, and where that stands."""
-    z = 0 if one.redshift > 0.0 else z
-    if g < 0 or one.target.log_prior[z] < _NONE or one.log_usable[z, g] < _NONE:
+    z = 0 if observed.redshift > 0.0 else z
+    if g < 0 or observed.target.log_prior[z] < _NONE or observed.log_usable[z, g] < _NONE:
         return NEVER, z
-    return 0.5 * (one.target.log_prior[z] - one.target.level[z] + one.log_usable[z, g]), z
+    target = observed.target
+    return 0.5 * (target.log_prior[z] - target.level[z] + observed.log_usable[z, g]), z
 
 
 @njit(**PART)
@@ -179,21 +193,21 @@ def _model(space, x, redshift, work):
 
 
 @njit(**PART)
-def _likelihood_of_data(one, nuclei, z, work):
+def _likelihood_of_data(observed, nuclei, z, work):
     """As `_likelihood` of all data; ``nuclei``, those of the object, are an argument as there."""
     if nuclei is None:
-        return _likelihood(one, one.limits, one.mixture, z, work.flux)
+        return _likelihood(observed, observed.limits, observed.mixture, z, work.flux)
     with_nuclei(nuclei, work.flux)
-    return _likelihood(one, one.limits, one.mixture, z, nuclei.flux)
+    return _likelihood(observed, observed.limits, observed.mixture, z, nuclei.flux)
 
 
 @njit(**PART)
-def _evaluate(space, one, x, work):
+def _evaluate(space, observed, x, work):
     """Ln of the prior and of the likelihood of a place, its scale and the variance of that."""
-    z, g, prior = _model(space, x, one.redshift, work)
-    log, z = _prior(one, z, g)
+    z, g, prior = _model(space, x, observed.redshift, work)
+    log, z = _prior(observed, z, g)
     if log < _NONE:
         return NEVER, 0.0, 0.0, 0.0
-    s, like, variance = _likelihood_of_data(one, one.nuclei, z, work)
-    log += _mass_prior(one.masses, z, g, s)
+    s, like, variance = _likelihood_of_data(observed, observed.nuclei, z, work)
+    log += _mass_prior(observed.masses, z, g, s)
     return prior + log, like, s, variance

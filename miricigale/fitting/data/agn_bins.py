@@ -49,8 +49,8 @@ class AGNBins:
     quantity: str = "accretion_power"
 
     def __post_init__(self):
-        least = {"redshift": 2, "log_luminosity": 1, "frac_agn": 2}
-        for name, n_least in least.items():
+        min_edges = {"redshift": 2, "log_luminosity": 1, "frac_agn": 2}
+        for name, n_least in min_edges.items():
             edges = floats(getattr(self, name))
             wanted = f"{n_least} or more ascending edges"
             if edges.ndim != 1 or edges.size < n_least or not np.all(np.diff(edges) > 0):
@@ -68,7 +68,7 @@ class AGNBins:
 
     def place(self, redshift, frac_agn, luminosity):
         """
-        Bins of models.
+        Find the bins of models.
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class AGNBins:
         return z_bin, frac_bin, l_bin
 
     def __call__(self, posterior):
-        """Weights of a `~miricigale.fitting.grid.continuation.BetweenPosterior` in the bins, of `shape`."""
+        """Sum the weights of a `~miricigale.fitting.grid.continuation.BetweenPosterior` in bins, of `shape`."""
         # models without AGN have no such quantity
         none = np.zeros(posterior.weight.size)
         luminosity = posterior.derived.get(self.quantity, none)
@@ -104,7 +104,7 @@ class AGNBins:
 
     def prior(self, axis):
         """
-        Prior of the bins of the AGN fraction.
+        Compute the prior of the bins of the AGN fraction.
 
         Parameters
         ----------

@@ -58,35 +58,38 @@ class NucleusColumns:
             If two columns are of the same band.
         """
         bands = tuple(bands)
-        found = {}
+        column_of_band = {}
         for column, band in nucleus_columns(colnames).items():
             if band not in bands:
                 continue
             wanted = f"a table with one flux of nuclei in {band!r}"
             check_that(
-                band not in found, "photometry", wanted, f"{found.get(band)!r} and {column!r}"
+                band not in column_of_band,
+                "photometry",
+                wanted,
+                f"{column_of_band.get(band)!r} and {column!r}",
             )
-            found[band] = column
-        ordered = [band for band in bands if band in found]
-        return cls(tuple(ordered), tuple(found[band] for band in ordered))
+            column_of_band[band] = column
+        ordered = [band for band in bands if band in column_of_band]
+        return cls(tuple(ordered), tuple(column_of_band[band] for band in ordered))
 
 
 def nucleus_columns(colnames):
-    """Columns that hold fluxes of nuclei and have errors: dict of band, by our names, by column."""
-    found = {}
+    """Find the columns that hold fluxes of nuclei and have errors: dict of band, by our names, by column."""
+    band_of_column = {}
     for column in colnames:
         for suffix in NUCLEUS_SUFFIXES:
             if not column.endswith(suffix) or error_column(column) not in colnames:
                 continue
             name = column.removesuffix(suffix)
             band = find_filter(name) or name
-            found[column] = band
-    return found
+            band_of_column[column] = band
+    return band_of_column
 
 
 def with_units(table, unit):
     """
-    Catalog whose fluxes of nuclei without a unit have that of the fluxes of bands.
+    Give fluxes of nuclei without a unit that of the fluxes of bands.
 
     Parameters
     ----------
@@ -100,19 +103,22 @@ def with_units(table, unit):
     table : `~astropy.table.QTable`
         Itself, or a copy.
     """
-    known = {}
+    unit_of_column = {}
     for column, band in nucleus_columns(table.colnames).items():
-        of_band = unit.get(band, unit.get("flux")) if isinstance(unit, Mapping) else unit
+        if isinstance(unit, Mapping):
+            of_band = unit.get(band, unit.get("flux"))
+        else:
+            of_band = unit
         if of_band is None:
             continue
         parsed = unit_of_fluxes(of_band)
         for name in (column, error_column(column)):
             if getattr(table[name], "unit", None) is None and parsed != u.ABmag:
-                known[name] = parsed
-    if not known:
+                unit_of_column[name] = parsed
+    if not unit_of_column:
         return table
     out = table.copy(copy_data=False)
-    for name, parsed in known.items():
+    for name, parsed in unit_of_column.items():
         out[name] = out[name] * parsed
     return out
 
@@ -168,8 +174,10 @@ def read_nuclei(table, columns, data, reader):
         usable = np.isfinite(flux) & np.isfinite(error) & (error > 0) & data.used[:, i]
         usable &= limited | (np.abs(correlation) < 1.0)
         left_out |= present & ~usable
+        # errors of models are a part of the flux; limits have none
         sigma = np.hypot(error, reader.model_error[band] * np.abs(flux))
         sigma = np.where(limited, error, sigma)
+        # cov = rho sigma_point sigma_total
         covariance = correlation * error * data.flux_err[:, i]
         paired = usable & ~limited & data.measured[:, i]
         values[:, j, FLUX] = np.where(usable, flux, 0.0)
@@ -180,17 +188,21 @@ def read_nuclei(table, columns, data, reader):
 
 
 def _fluxes(table, name):
-    """Fluxes or errors of a column in uJy, NaN where masked."""
+    """Read fluxes or errors of a column in uJy, NaN where masked."""
     unit = getattr(table[name], "unit", None)
-    parsed = None if unit is None else flux_unit(unit) or unit
+    parsed = None
+    if unit is not None:
+        parsed = flux_unit(unit) or unit
     if parsed is None or not parsed.is_equivalent(FNU):
-        stated = "no unit" if unit is None else repr(str(unit))
-        raise units_error("photometry", f"convertible to {FNU}", stated, column=name)
+        got = "no unit"
+        if unit is not None:
+            got = repr(str(unit))
+        raise units_error("photometry", f"convertible to {FNU}", got, column=name)
     return flux_column(table, name)
 
 
 def _numbers(table, name):
-    """Numbers of a column without unit, NaN where masked."""
+    """Read numbers of a column without unit, NaN where masked."""
     column = table[name]
     mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), (len(table),))
     try:

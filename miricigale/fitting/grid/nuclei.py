@@ -52,23 +52,23 @@ class NuclearMixture(BandMixture):
 
     @classmethod
     def of_mixture(cls, mixture, bands):
-        """Nuclei are wrong as often as the fluxes of their bands; None without a mixture."""
+        """Extend a mixture: nuclei are wrong as often as the fluxes of their bands; None without a mixture."""
         if mixture is None:
             return None
         part = np.concatenate([mixture.part, mixture.part[bands], mixture.part[bands]])
         return cls(part, mixture.order, bands)
 
     def broad(self, flux, sigma):
-        """Widths of the broad parts; see `BandMixture.broad`."""
+        """Compute the widths of the broad parts; see `BandMixture.broad`."""
         n_bands = len(self.order)
         end = n_bands + len(self.bands)
         out = np.full(np.shape(flux), np.inf)
         total = np.array(flux[:, :n_bands])
         error = np.array(sigma[:, :n_bands])
-        rest = sigma[:, n_bands:end]
-        paired = np.isfinite(rest)
+        remainder_sigma = sigma[:, n_bands:end]
+        paired = np.isfinite(remainder_sigma)
         total[:, self.bands] = np.where(paired, flux[:, n_bands:end], total[:, self.bands])
-        error[:, self.bands] = np.where(paired, rest, error[:, self.bands])
+        error[:, self.bands] = np.where(paired, remainder_sigma, error[:, self.bands])
         width = super().broad(total, error)
         out[:, :n_bands] = np.where(np.isfinite(sigma[:, :n_bands]), width, np.inf)
         out[:, n_bands:end] = np.where(paired, width[:, self.bands], np.inf)
@@ -133,7 +133,9 @@ class ObjectNuclei:
             Error of the AGN's light as a part of it.
         """
         n = len(bands)
-        flux, sigma, limit = data.flux, data.sigma, data.limit
+        flux = data.flux
+        sigma = data.sigma
+        limit = data.limit
         point = values[:, FLUX]
         limited = values[:, LIMIT] > 0
         usable = np.isfinite(values[:, SIGMA])
@@ -142,23 +144,26 @@ class ObjectNuclei:
         mix = np.zeros((n, n))
         root = np.diag(np.where(usable & limited, 1.0, 0.0))
         covariance = values[index, COVARIANCE]
-        own = np.square(values[index, SIGMA]) + np.square(agn_error * point[index])
+        point_variance = np.square(values[index, SIGMA]) + np.square(agn_error * point[index])
         host = np.clip(total[index] - point[index], 0.0, np.maximum(total[index], 0.0))
-        of_points = np.diag(own) + stars**2 * np.outer(host, host)
+        of_points = np.diag(point_variance) + stars**2 * np.outer(host, host)
+        # covariance L L^T of the points, so that L^-1 P has unit errors
         lower = np.linalg.cholesky(of_points)
         block = np.ix_(index, index)
         root[block] = solve_triangular(lower, np.eye(len(index)), lower=True)
+        # K = cov(T, P) cov(P)^-1: the rest T - K P is not correlated with P
         mix[block] = covariance[:, None] * (root[block].T @ root[block])
         paired = np.any(mix != 0.0, axis=1)
-        rest = total - mix @ np.where(usable, point, 0.0)
+        remainder = total - mix @ np.where(usable, point, 0.0)
         # not 0, for errors of templates are parts of what is there
-        small = np.abs(rest) < _LEAST_REST * np.abs(total)
-        rest = np.where(small, _LEAST_REST * total, rest)
+        small = np.abs(remainder) < _LEAST_REST * np.abs(total)
+        remainder = np.where(small, _LEAST_REST * total, remainder)
         of_totals = np.square(sigma[bands[index]])
+        # variance of the rest: var(T) - K cov(P, T)
         of_rests = of_totals - np.diag(mix)[index] * covariance
-        rest_sigma = np.full(n, np.inf)
-        rest_sigma[index] = np.sqrt(of_rests)
-        rest_sigma[~paired] = np.inf
+        remainder_sigma = np.full(n, np.inf)
+        remainder_sigma[index] = np.sqrt(of_rests)
+        remainder_sigma[~paired] = np.inf
         own_sigma = np.array(sigma)
         own_sigma[bands[paired]] = np.inf
         point_sigma = np.where(limited, values[:, SIGMA], np.where(usable, 1.0, np.inf))
@@ -169,8 +174,8 @@ class ObjectNuclei:
             mix=mix,
             root=root,
             paired=paired,
-            flux=np.concatenate([flux, rest, root @ point]),
-            sigma=np.concatenate([own_sigma, rest_sigma, point_sigma]),
+            flux=np.concatenate([flux, remainder, root @ point]),
+            sigma=np.concatenate([own_sigma, remainder_sigma, point_sigma]),
             limit=np.concatenate([limit, np.zeros(n, bool), usable & limited]),
             total=total,
             log_errors=float(log_errors),
@@ -183,43 +188,45 @@ class ObjectNuclei:
         return len(self.flux) - 2 * len(self.bands)
 
     def extended(self, flux, agn):
-        """Fluxes of models with AGN of fluxes ``agn``, both (..., nb), in all data: (..., nb + 2 n)."""
+        """Compute all data of models, (..., nb + 2 n), from fluxes and those of their AGN, both (..., nb)."""
         light = agn[..., self.bands]
         # not matrix products, whose last digits depend on how many rows there are
-        rest = flux[..., self.bands] - np.einsum("...k,jk->...j", light, self.mix)
+        remainder = flux[..., self.bands] - np.einsum("...k,jk->...j", light, self.mix)
         nuclei = np.einsum("...k,jk->...j", light, self.root)
-        return np.concatenate([flux, rest, nuclei], axis=-1)
+        return np.concatenate([flux, remainder, nuclei], axis=-1)
 
     def template_errors(self, errors):
-        """Errors of templates, (nz, nb), as parts of all data: those of the totals in the rests."""
+        """Convert errors of templates, (nz, nb), to parts of all data: those of the totals in the rests."""
         n = len(self.bands)
-        rest = self.flux[self.n_bands : self.n_bands + n]
-        ratio = np.divide(np.abs(self.total), np.abs(rest), out=np.ones(n), where=rest != 0.0)
+        remainder = self.flux[self.n_bands : self.n_bands + n]
+        ratio = np.divide(
+            np.abs(self.total), np.abs(remainder), out=np.ones(n), where=remainder != 0.0
+        )
         nuclei = np.zeros((len(errors), n))
         return np.concatenate([errors, errors[:, self.bands] * ratio, nuclei], axis=1)
 
     def photometry(self, data, log_prior):
-        """Keywords of `GridEngine.fit` for the object, the one row of ``data``."""
+        """Make the keywords of `GridEngine.fit` for the object, the one row of ``data``."""
         row = {"flux": self.flux, "sigma": self.sigma, "limit": self.limit}
         arrays = {name: value[None] for name, value in row.items()}
         extended = FitData(data.ids, flux_err=None, flags=data.flags, **arrays)
         return extended.of_engine(log_prior)
 
     def mixture(self, mixture):
-        """`NuclearMixture` of the `BandMixture` of the bands; None without."""
+        """Make the `NuclearMixture` of the `BandMixture` of the bands; None without."""
         return NuclearMixture.of_mixture(mixture, self.bands)
 
     def kernel(self):
-        """`_core.Nuclei` with memory."""
+        """Make `_core.Nuclei` with memory."""
         memory = np.zeros((3, len(self.flux) + 1))
         return _core.Nuclei(self.bands, self.mix, self.root, memory)
 
     def of_bands(self, values):
-        """Values of all data, (..., nb + 2 n), for the bands: of rests where these replace totals."""
+        """Select values of all data, (..., nb + 2 n), for the bands: of rests where these replace totals."""
         n_bands = self.n_bands
         out = np.array(values[..., :n_bands])
-        rest = values[..., n_bands : n_bands + len(self.bands)]
-        out[..., self.bands[self.paired]] = rest[..., self.paired]
+        remainder = values[..., n_bands : n_bands + len(self.bands)]
+        out[..., self.bands[self.paired]] = remainder[..., self.paired]
         return out
 
 
@@ -256,14 +263,14 @@ class NuclearGrid(Frozen):
         return extended_engine(self.engine, self.index)
 
     def of_object(self, data):
-        """`ObjectNuclei` of the object in the one row of ``data``."""
+        """Make the `ObjectNuclei` of the object in the one row of ``data``."""
         return ObjectNuclei.of_values(
             self.index, data.nuclei[0], data[0], self.stars, self.agn_error
         )
 
 
 def extended_engine(engine, bands):
-    """Engine with places for the rests of totals and for nuclei of bands, (n,), the nuclei being 0 yet."""
+    """Make an engine with places for the rests of totals and for nuclei of bands, (n,), which are 0 yet."""
 
     def with_places(flux):
         return np.concatenate([flux, flux[..., bands], 0.0 * flux[..., bands]], axis=-1)
@@ -280,7 +287,7 @@ def extended_engine(engine, bands):
 
 def object_engine(extended, nuclei):
     """
-    Engine for one object.
+    Make an engine for one object.
 
     Parameters
     ----------
@@ -328,27 +335,27 @@ def fit_with_nuclei(fit, data, log_prior, pairs):
     -------
     results : `~miricigale.fitting.FitResults`
     """
-    some = np.isfinite(data.nuclei[:, :, SIGMA]).any(axis=1)
-    some &= np.isfinite(log_prior).any(axis=1)
-    rows = np.flatnonzero(some)
-    others = np.flatnonzero(~some)
+    has_nuclei = np.isfinite(data.nuclei[:, :, SIGMA]).any(axis=1)
+    has_nuclei &= np.isfinite(log_prior).any(axis=1)
+    rows = np.flatnonzero(has_nuclei)
+    rows_without = np.flatnonzero(~has_nuclei)
     parts = []
-    if others.size or not rows.size:
-        plain = data._changed(nuclei=None)[others]
-        parts.append(fit.fit_piece(pairs, (plain, log_prior[others])))
+    if rows_without.size or not rows.size:
+        totals = data._changed(nuclei=None)[rows_without]
+        parts.append(fit.fit_piece(pairs, (totals, log_prior[rows_without])))
     workspaces = {}
     for i in rows:
         row = slice(i, i + 1)
         parts.append(_fit_object(fit, data[row], log_prior[row], pairs, workspaces))
-    order = np.argsort(np.concatenate([others, rows]), kind="stable")
+    order = np.argsort(np.concatenate([rows_without, rows]), kind="stable")
     return FitResults.concatenate(parts)[order]
 
 
 def _fit_object(fit, data, log_prior, pairs, workspaces):
-    """Results of one object; ``workspaces`` keeps memory for the next."""
+    """Fit one object; ``workspaces`` keeps memory for the next."""
     grid = fit.nuclei
     nuclei = grid.of_object(data)
-    plain = data._changed(nuclei=None)
+    totals = data._changed(nuclei=None)
     z = 0.0
     node = None
     at_redshift = fit.between is not None and data.redshift is not None
@@ -356,10 +363,10 @@ def _fit_object(fit, data, log_prior, pairs, workspaces):
         z = float(data.redshift[0])
         node = int(np.argmax(log_prior[0]))
         extended = extended_engine(fit.between.at_redshift(z, node), grid.index)
-        photometry = nuclei.photometry(plain, log_prior[:, node : node + 1])
+        photometry = nuclei.photometry(totals, log_prior[:, node : node + 1])
     else:
         extended = grid.extended
-        photometry = nuclei.photometry(plain, log_prior)
+        photometry = nuclei.photometry(totals, log_prior)
     engine = object_engine(extended, nuclei)
 
     def memory(kind, **options):
@@ -382,7 +389,7 @@ def _fit_object(fit, data, log_prior, pairs, workspaces):
         workspace = memory("draws", n_draws=N_START)
         engine.fit(**photometry, n_draws=N_START, each=place, workspace=workspace)
         if posteriors:
-            results = between_results(fit, plain, posteriors, pairs)
+            results = between_results(fit, totals, posteriors, pairs)
     if results is None:
         joint = joint_names(pairs, fit.priors.axes)
         out = engine.fit(**photometry, joint=joint, workspace=memory("joint", joint=joint))
@@ -392,9 +399,9 @@ def _fit_object(fit, data, log_prior, pairs, workspaces):
             outlier=nuclei.of_bands(out.outlier),
         )
         if node is not None:
-            results = fit.results_at_redshift(plain, out, log_prior, pairs)
+            results = fit.results_at_redshift(totals, out, log_prior, pairs)
         else:
-            results = fit.results_on_nodes(plain, out, pairs)
+            results = fit.results_on_nodes(totals, out, pairs)
         if fit.between is not None:
             results = with_axis_summaries(results)
     return results._changed(
