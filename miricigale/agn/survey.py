@@ -80,11 +80,25 @@ class AGNResult(Interactive):
             facts[f"AGN with fracAGN >= {row['frac_agn']:g}"] = f"{row['n']:.0f} ({interval})"
         return facts
 
-    def write(self, folder):
-        """Write the tables into a folder, in place of those that are there."""
+    def write(self, folder, *, overwrite=False):
+        """
+        Write the tables into a folder.
+
+        Parameters
+        ----------
+        folder : path-like
+            The folder, which exists.
+        overwrite : bool, optional
+            Whether tables that are there are replaced.
+
+        Raises
+        ------
+        OSError
+            If a table is there and ``overwrite`` is not set.
+        """
         tables = (self.numbers, self.totals, self.prior, self.sources, self.injected)
         for name, table in zip(FILES, tables, strict=True):
-            with replacing(Path(folder) / name, overwrite=True) as partial:
+            with replacing(Path(folder) / name, overwrite=overwrite) as partial:
                 table.write(partial, format="ascii.ecsv")
 
 
@@ -177,7 +191,7 @@ class AGNSurvey:
         injected = self._inject(fits, sample, output, options)
         result = self._result(sample, injected)
         output.mkdir(parents=True, exist_ok=True)
-        result.write(output)
+        result.write(output, overwrite=True)
         from miricigale.agn.page import write_page
 
         write_page(result, output / "page.html", Path(path).name)
