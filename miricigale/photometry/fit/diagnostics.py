@@ -137,7 +137,7 @@ def rim_pixels(usable):
     rim : `~numpy.ndarray` of bool, shape (ny, nx)
     """
     rows, columns = np.ogrid[: usable.shape[0], : usable.shape[1]]
-    return usable & binary_dilation(_beyond(_ends(usable), rows, columns))
+    return usable & binary_dilation(_is_beyond(_ends(usable), rows, columns))
 
 
 def _light_on(mask, values, boxes, starts):
@@ -164,7 +164,7 @@ def _ends(usable):
     return ends
 
 
-def _beyond(ends, rows, columns):
+def _is_beyond(ends, rows, columns):
     """Return whether pixels are before the first or after the last usable pixel of their row or column."""
     (first, last), (lowest, highest) = ends
     is_beyond = (columns < first[rows]) | (columns > last[rows])
@@ -184,7 +184,7 @@ def _cut_by_rim(usable, boxes):
     ends = _ends(usable)
     for k, (y, x, ny, nx) in enumerate(boxes):
         rows, columns = np.ogrid[y : y + ny, x : x + nx]
-        is_beyond = _beyond(ends, rows, columns)
+        is_beyond = _is_beyond(ends, rows, columns)
         is_cut[k] = np.sum(is_beyond) > 0.5 * np.sum(~usable[y : y + ny, x : x + nx])
     return is_cut
 
