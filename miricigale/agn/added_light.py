@@ -94,28 +94,30 @@ def add_light(photometry, light, *, curves, seed):
     ValueError
         If a column is missing, or light is negative or not finite.
     """
-    columns = [column for band in light for column in (band, error_column(band))]
-    require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
+    columns = []
+    for band in light:
+        columns += [band, error_column(band)]
+    require_columns(photometry, ["id"] + columns, "photometry", units=dict.fromkeys(columns, FNU))
     seed = check_seed(seed)
-    out = QTable(photometry, copy=True)
-    ids = read_ids(out)
-    for band, more in light.items():
-        more = to_array(more, FNU, "light", ndim=1)
-        if not np.all(np.isfinite(more) & (more >= 0)):
+    table = QTable(photometry, copy=True)
+    ids = read_ids(table)
+    for band, agn_flux in light.items():
+        agn_flux = to_array(agn_flux, FNU, "light", ndim=1)
+        if not np.all(np.isfinite(agn_flux) & (agn_flux >= 0)):
             raise argument_error("light", f"finite and 0 or more in {band}", "others")
-        flux = out[band].to_value(FNU)
-        error = out[error_column(band)].to_value(FNU)
-        changed = np.isfinite(flux) & np.isfinite(error) & (error > 0) & (more > 0)
-        if f"{band}_limit" in out.colnames:
-            changed &= ~np.asarray(out[f"{band}_limit"], bool)
-        ratio = np.ones(len(out))
+        flux = table[band].to_value(FNU)
+        error = table[error_column(band)].to_value(FNU)
+        changed = np.isfinite(flux) & np.isfinite(error) & (error > 0) & (agn_flux > 0)
+        if f"{band}_limit" in table.colnames:
+            changed &= ~np.asarray(table[f"{band}_limit"], bool)
+        ratio = np.ones(len(table))
         if changed.any():
-            ratio[changed] = curves[band].ratio(flux[changed], more[changed])
+            ratio[changed] = curves[band].ratio(flux[changed], agn_flux[changed])
         noise = [stream(seed, "agn", "noise", band, str(key)).standard_normal() for key in ids]
         wider = error * np.sqrt(np.maximum(ratio**2 - 1.0, 0.0))
-        out[band] = np.where(changed, flux + more + wider * np.array(noise), flux) * FNU
-        out[error_column(band)] = np.where(changed, error * ratio, error) * FNU
-    return out
+        table[band] = np.where(changed, flux + agn_flux + wider * np.array(noise), flux) * FNU
+        table[error_column(band)] = np.where(changed, error * ratio, error) * FNU
+    return table
 
 
 def draw_agn_parameters(axes, n, rng):
@@ -136,14 +138,14 @@ def draw_agn_parameters(axes, n, rng):
     values : dict of str to `~numpy.ndarray`, shape (n,)
         By name: labels at nodes, others anywhere in the cells of these.
     """
-    out = {}
+    values = {}
     for name, axis in axes.items():
         if axis.kind != "agn":
             continue
         low, high = np.clip(axis.cells(axis.bounds), axis.values[0], axis.values[-1])
         node = rng.choice(axis.values.size, n, p=axis.weights)
-        out[name] = (low[node] + rng.random(n) * (high[node] - low[node])) * axis.unit
-    return out
+        values[name] = (low[node] + rng.random(n) * (high[node] - low[node])) * axis.unit
+    return values
 
 
 def agn_light(model, hosts, luminosity, parameters, bands, *, quantity="accretion_power"):
@@ -201,7 +203,7 @@ def agn_light(model, hosts, luminosity, parameters, bands, *, quantity="accretio
         power = np.where(wanted > 0, fraction / (1.0 - fraction), 0.0)
     light = {}
     for band in bands:
-        own = (half[band] - without[band]).to_value(FNU)
+        flux = (half[band] - without[band]).to_value(FNU)
         # rounding may make a little less than nothing of it
-        light[band] = np.maximum(own, 0.0) * power * FNU
+        light[band] = np.maximum(flux, 0.0) * power * FNU
     return light, fraction

@@ -79,11 +79,17 @@ class SampleNumbers:
 
     def volume(self, i):
         """Comoving volume of a bin of redshift in Mpc3."""
-        low, high = (COSMOLOGY.comoving_volume(z).to_value(u.Mpc**3) for z in self._edges(i))
+        z_low, z_high = self._edges(i)
+        low = COSMOLOGY.comoving_volume(z_low).to_value(u.Mpc**3)
+        high = COSMOLOGY.comoving_volume(z_high).to_value(u.Mpc**3)
         return (high - low) * self.area / (4.0 * np.pi * u.sr).to_value(u.deg**2)
 
     def _edges(self, i):
         return self.bins.redshift[i], self.bins.redshift[i + 1]
+
+    def _luminosity_edges(self):
+        """Edges of the bins of log10 of the luminosity, the last of which is open."""
+        return tuple(self.bins.log_luminosity) + (np.inf,)
 
     def by_luminosity(self):
         """
@@ -109,19 +115,22 @@ class SampleNumbers:
         return self.bins.frac_agn.index(fraction) + 1
 
     def _row(self, i, k):
-        edges = (*self.bins.log_luminosity, np.inf)
-        low, high = edges[k - 1], edges[k]
+        edges = self._luminosity_edges()
+        low = edges[k - 1]
+        high = edges[k]
         z_low, z_high = self._edges(i)
         row = {"redshift_low": z_low, "redshift_high": z_high}
         row |= {"log_luminosity_low": low, "log_luminosity_high": high}
-        part = np.s_[i, self._first(self.floor) :, k]
-        by_class = {
-            name: counts[(slice(None), *part)].sum(axis=1)
-            for name, counts in self.draws.counts.items()
-        }
+        first = self._first(self.floor)
+        by_class = {}
+        for name, counts in self.draws.counts.items():
+            by_class[name] = counts[:, i, first:, k].sum(axis=1)
         number = sum(by_class.values())
         row |= _summary(number, "n")
-        row["n_shipped"] = float(sum(shipped[part].sum() for shipped in self.shipped.values()))
+        n_shipped = 0.0
+        for shipped in self.shipped.values():
+            n_shipped += shipped[i, first:, k].sum()
+        row["n_shipped"] = float(n_shipped)
         injected = {name: int(counts[i, k]) for name, counts in self.injected.items()}
         row["n_injected"] = injected["all"]
         for name, kind in (("completeness", "selected"), ("above", "above")):
@@ -157,7 +166,7 @@ class SampleNumbers:
 
     def _density(self, number, n_shipped, injected, i, k):
         """Luminosity function of all AGN of a bin, also those below the floor, which injected ones tell."""
-        width = np.diff((*self.bins.log_luminosity, np.inf))[k - 1]
+        width = np.diff(self._luminosity_edges())[k - 1]
         if not injected["all"] or not injected["above"] or np.isinf(width):
             return _summary(np.full(1, np.nan), "density") | {"density_shipped": np.nan}
         rng = stream(self.seed, "agn", "rates", i, k)
@@ -175,8 +184,8 @@ class SampleNumbers:
             return _summary(np.full(1, np.nan), "obscured")
         rng = stream(self.seed, "agn", "obscured", i, k)
         hidden = rng.standard_gamma(by_class["galaxy"] + _JEFFREYS)
-        seen = rng.standard_gamma(by_class["quasar"] + _JEFFREYS)
-        return _summary(hidden / (hidden + seen), "obscured")
+        unobscured = rng.standard_gamma(by_class["quasar"] + _JEFFREYS)
+        return _summary(hidden / (hidden + unobscured), "obscured")
 
     def totals(self):
         """
@@ -190,11 +199,15 @@ class SampleNumbers:
         n_z = len(self.bins.redshift) - 1
         rows = []
         for fraction in sorted({self.floor, self.limit}):
-            part = np.s_[:n_z, self._first(fraction) :, :]
-            counts = self.draws.counts.values()
-            number = sum(number[(slice(None), *part)].sum(axis=(1, 2, 3)) for number in counts)
+            first = self._first(fraction)
+            number = 0
+            for counts in self.draws.counts.values():
+                number = number + counts[:, :n_z, first:].sum(axis=(1, 2, 3))
             row = {"frac_agn": fraction} | _summary(number, "n")
-            row["n_shipped"] = float(sum(weights[part].sum() for weights in self.shipped.values()))
+            n_shipped = 0.0
+            for weights in self.shipped.values():
+                n_shipped += weights[:n_z, first:].sum()
+            row["n_shipped"] = float(n_shipped)
             row["n_selected"] = int(self.selected[:n_z].sum())
             row |= _summary(self._total_corrected(fraction), "n_corrected")
             rows.append(row)
@@ -209,23 +222,24 @@ class SampleNumbers:
         kind = "above" if fraction == self.floor else "limit"
         n_z = len(self.bins.redshift) - 1
         rng = stream(self.seed, "agn", "corrected", kind)
-        every = (int(self.injected[name][:n_z].sum()) for name in ("right", kind))
-        of_all = self._selected_share(rng, *every)
+        n_right = int(self.injected["right"][:n_z].sum())
+        n_injected = int(self.injected[kind][:n_z].sum())
+        of_all = self._selected_share(rng, n_right, n_injected)
         total = np.zeros(self.draws.n_draws)
-        rest = 0.0
+        n_uncorrected = 0.0
         for i in range(n_z):
             for k in range(self.bins.shape[2]):
                 number = self._corrected(i, k, kind)
                 if np.all(np.isfinite(number)):
                     total += number
                 else:
-                    rest += self.pure[i, k]
-        if rest > 0:
-            total += rng.standard_gamma(rest, total.size) / of_all
+                    n_uncorrected += self.pure[i, k]
+        if n_uncorrected > 0:
+            total += rng.standard_gamma(n_uncorrected, total.size) / of_all
         return total
 
 
-def prior_table(bins, prior, draws, every):
+def prior_table(bins, prior, by_redshift, all_redshifts):
     """
     Prior of the AGN fraction as shipped, and as measured on the sample.
 
@@ -235,7 +249,7 @@ def prior_table(bins, prior, draws, every):
         The bins.
     prior : `~numpy.ndarray`, shape (n_frac,)
         Prior of the fits.
-    draws, every : `~miricigale.agn.ShareDraws`
+    by_redshift, all_redshifts : `~miricigale.agn.ShareDraws`
         Measured for each bin of redshift, and for all redshifts together.
 
     Returns
@@ -243,11 +257,11 @@ def prior_table(bins, prior, draws, every):
     table : `~astropy.table.QTable`
         A row for each bin of the fraction, first for all redshifts.
     """
-    edges = (0.0, *bins.frac_agn)
+    edges = (0.0,) + tuple(bins.frac_agn)
     rows = []
-    samples = [(bins.redshift[0], bins.redshift[-1], every.shares[:, 0])]
+    samples = [(bins.redshift[0], bins.redshift[-1], all_redshifts.shares[:, 0])]
     for i in range(len(bins.redshift) - 1):
-        samples.append((bins.redshift[i], bins.redshift[i + 1], draws.shares[:, i]))
+        samples.append((bins.redshift[i], bins.redshift[i + 1], by_redshift.shares[:, i]))
     for z_low, z_high, shares in samples:
         for j, shipped in enumerate(prior):
             row = {"redshift_low": z_low, "redshift_high": z_high}

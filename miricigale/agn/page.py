@@ -54,8 +54,8 @@ def write_page(result, path, name):
 
 def _rows(table):
     """Rows as dictionaries, with the edges of their bins as text."""
-    plain = Table(table)
-    rows = [dict(zip(plain.colnames, row, strict=True)) for row in plain]
+    unitless = Table(table)
+    rows = [dict(zip(unitless.colnames, row, strict=True)) for row in unitless]
     for row in rows:
         for name in ("redshift", "log_luminosity", "frac_agn"):
             if f"{name}_low" in row:
@@ -83,7 +83,8 @@ def _span(low, high):
 def _bars(table, name):
     """Values and the lengths of their bars."""
     value = np.asarray(Table(table)[name])
-    low, high = (np.asarray(Table(table)[f"{name}_{end}"]) for end in ("low", "high"))
+    low = np.asarray(Table(table)[f"{name}_low"])
+    high = np.asarray(Table(table)[f"{name}_high"])
     return value, np.maximum([value - low, high - value], 0.0)
 
 
@@ -112,9 +113,9 @@ def _luminosity_function(numbers):
             continue
         value, bars = _bars(rows, "density")
         good = np.asarray(rows["constrained"], bool)
-        for some, filled, label in ((good, _MEASURED, "measured prior"), (~good, "none", None)):
+        for points, filled, label in ((good, _MEASURED, "measured prior"), (~good, "none", None)):
             style = {"fmt": "o", "color": _MEASURED, "mfc": filled, "label": label}
-            ax.errorbar(middle[some], value[some], bars[:, some], **style)
+            ax.errorbar(middle[points], value[points], bars[:, points], **style)
         shipped = Table(rows)["density_shipped"]
         ax.plot(
             middle,
@@ -137,9 +138,9 @@ def _completeness(numbers):
         middle = np.where(np.isinf(high), rows["log_luminosity_low"] + 0.5, 0.0)
         middle = np.where(np.isinf(high), middle, 0.5 * (rows["log_luminosity_low"] + high))
         value, bars = _bars(rows, "completeness")
-        known = np.isfinite(value)
+        finite = np.isfinite(value)
         style = {"fmt": "o", "color": _MEASURED, "label": "completeness"}
-        ax.errorbar(middle[known], value[known], bars[:, known], **style)
+        ax.errorbar(middle[finite], value[finite], bars[:, finite], **style)
         ax.plot(middle, np.asarray(rows["purity"]), "s", color="0.5", mfc="none", label="purity")
         ax.set(xlabel="log L (erg/s)", title=_title(rows), ylim=(-0.05, 1.05))
         ax.legend(frameon=False, fontsize=8)
@@ -150,8 +151,8 @@ def _completeness(numbers):
 def _prior(prior):
     """Shares of the AGN fraction, shipped and measured, for all redshifts."""
     low, high = prior["redshift_low"][0], prior["redshift_high"][0]
-    whole = (prior["redshift_low"] == low) & (prior["redshift_high"] == high)
-    rows = prior[whole][: np.count_nonzero(whole)]
+    of_all = (prior["redshift_low"] == low) & (prior["redshift_high"] == high)
+    rows = prior[of_all][: np.count_nonzero(of_all)]
     figure, [[ax]] = new_figure(1, 1, size=(WIDTH / 1.6, 3.2))
     place = np.arange(len(rows))
     value, bars = _bars(rows, "measured")

@@ -119,9 +119,9 @@ def draw_shares(table, prior, *, others=None, n_draws=1000, seed=None):
     rng = stream(check_seed(seed), "agn", "shares")
     n, n_z, n_frac, _ = table.shape
     classes = _other_classes(others, n)
-    ratio = (
-        np.stack([ratio for ratio, _ in classes.values()], axis=1) if classes else np.zeros((n, 0))
-    )
+    ratio = np.zeros((n, len(classes)))
+    for k, (class_ratio, _) in enumerate(classes.values()):
+        ratio[:, k] = class_ratio
     divided = np.divide(
         table.sum(axis=3), prior, out=np.zeros((n, n_z, n_frac)), where=prior > 0
     ).reshape(n, -1)
@@ -129,7 +129,9 @@ def draw_shares(table, prior, *, others=None, n_draws=1000, seed=None):
     shares = np.tile(prior, (n_z, 1))
     class_shares = np.full(1 + ratio.shape[1], 1.0 / (1 + ratio.shape[1]))
     kept_shares = np.empty((n_draws, n_z, n_frac))
-    counts = {name: np.zeros((n_draws, *table.shape[1:]), int) for name in ("galaxy", *classes)}
+    counts = {}
+    for name in ["galaxy"] + list(classes):
+        counts[name] = np.zeros((n_draws,) + table.shape[1:], int)
     probability = np.zeros((n, divided.shape[1] + ratio.shape[1]))
     n_burn = int(np.ceil(_BURN_IN * n_draws))
     for turn in range(-n_burn, n_draws):
@@ -150,28 +152,28 @@ def draw_shares(table, prior, *, others=None, n_draws=1000, seed=None):
         probability += weight / cumulative[:, -1:]
         luminosity = rng.random(n)
         counts["galaxy"][turn] = _galaxy_counts(table, component, luminosity)
-        for k, (name, (_, own)) in enumerate(classes.items()):
-            if own is not None:
+        for k, (name, (_, class_table)) in enumerate(classes.items()):
+            if class_table is not None:
                 members = np.flatnonzero(component == n_z * n_frac + k)
-                counts[name][turn] = _member_counts(own, members, luminosity)
+                counts[name][turn] = _member_counts(class_table, members, luminosity)
     probability /= n_draws
-    every = {"galaxy": _by_luminosity(table, probability[:, : n_z * n_frac])}
+    by_class = {"galaxy": _by_luminosity(table, probability[:, : n_z * n_frac])}
     for k, name in enumerate(classes):
-        every[name] = probability[:, n_z * n_frac + k]
-    return ShareDraws(kept_shares, counts, every)
+        by_class[name] = probability[:, n_z * n_frac + k]
+    return ShareDraws(kept_shares, counts, by_class)
 
 
-def _other_classes(others, n):
+def _other_classes(posteriors, n):
     """Ratios of evidences, at most a large number, and tables of other classes that were fitted: dict by name."""
-    out = {}
-    for name, (log_ratio, table) in (others or {}).items():
+    classes = {}
+    for name, (log_ratio, table) in (posteriors or {}).items():
         log_ratio = np.asarray(log_ratio, float)
         check_that(log_ratio.shape == (n,), "others", f"{n} ratios of {name}", f"{log_ratio.shape}")
         ratio = np.exp(
             np.minimum(np.where(np.isnan(log_ratio), -np.inf, log_ratio), _LARGEST_RATIO)
         )
-        out[name] = ratio, table
-    return out
+        classes[name] = ratio, table
+    return classes
 
 
 def _dirichlet(rng, numbers):
@@ -194,16 +196,16 @@ def _galaxy_counts(table, component, uniform):
     """Galaxies in the bins, (n_z, n_frac, n_lum): those of redshift and fraction are drawn, flat, or too large."""
     n, n_z, n_frac, n_lum = table.shape
     rows = np.flatnonzero(component < n_z * n_frac)
-    own = table.reshape(n, n_z * n_frac, n_lum)[rows, component[rows]]
-    flat = component[rows] * n_lum + _draw_places(own, uniform[rows])
+    weights = table.reshape(n, n_z * n_frac, n_lum)[rows, component[rows]]
+    flat = component[rows] * n_lum + _draw_places(weights, uniform[rows])
     return np.bincount(flat, minlength=n_z * n_frac * n_lum).reshape(table.shape[1:])
 
 
 def _member_counts(table, members, uniform):
     """Members of another class in the bins, which are drawn from their own posteriors."""
-    own = table[members].reshape(len(members), np.prod(table.shape[1:]))
-    flat = _draw_places(own, uniform[members])
-    return np.bincount(flat, minlength=own.shape[1]).reshape(table.shape[1:])
+    weights = table[members].reshape(len(members), np.prod(table.shape[1:]))
+    flat = _draw_places(weights, uniform[members])
+    return np.bincount(flat, minlength=weights.shape[1]).reshape(table.shape[1:])
 
 
 def _by_luminosity(table, probability):

@@ -153,7 +153,7 @@ class AGNSurvey:
         good = is_number(limit) and CLASS_LIMITS[0] <= limit < 1
         check_that(good, "limit", f"from {CLASS_LIMITS[0]:g} to below 1", limit)
         self.limit = float(limit)
-        edges = sorted({*AGNBins(redshift, log_luminosity).frac_agn, FLOOR, self.limit})
+        edges = sorted(set(AGNBins(redshift, log_luminosity).frac_agn) | {FLOOR, self.limit})
         self.bins = AGNBins(redshift, log_luminosity, tuple(edges))
         self.n_injections = check_count(n_injections, "n_injections", least=0)
         self.n_draws = check_count(n_draws, "n_draws")
@@ -202,39 +202,37 @@ class AGNSurvey:
     def _inject(self, fits, sample, output, options):
         """Table of injected AGN and what was fitted of them."""
         results = fits["galaxy"]
+        texts = declared("miricigale.agn", "columns.toml")["injected"]
         truth = self._injections(results, sample) if self.n_injections else None
         if truth is None:
-            return described_columns(
-                {
-                    name: np.zeros(0)
-                    for name in declared("miricigale.agn", "columns.toml")["injected"]
-                },
-                declared("miricigale.agn", "columns.toml")["injected"],
-            )
+            columns = {}
+            for name in texts:
+                columns[name] = np.zeros(0)
+            return described_columns(columns, texts)
         photometry, truth = self._photometry(results, truth, options.get("redshift"))
         catalog = output / "injected.fits"
         with replacing(catalog, overwrite=True) as partial:
             photometry.write(partial, format="fits")
-        own = {name: value for name, value in options.items() if name not in _OF_CATALOG}
+        fit_options = {name: value for name, value in options.items() if name not in _OF_CATALOG}
         # errors and zero points are those of the catalog
         measured = measured_calibration(results)
         if measured is not None:
-            own["calibration"] = measured
-        own["calibrate"] = False
-        found = fit_classes(catalog, output / "injected", agn_bins=self.bins, **own)
-        again = _Sample.of_fits(found, self.bins, self.limit)
+            fit_options["calibration"] = measured
+        fit_options["calibrate"] = False
+        refits = fit_classes(catalog, output / "injected", agn_bins=self.bins, **fit_options)
+        refitted = _Sample.of_fits(refits, self.bins, self.limit)
         columns = {
-            "id": again.ids,
+            "id": refitted.ids,
             "host": truth["host"],
             "redshift": truth["redshift"],
             "log_luminosity": truth["log_luminosity"],
             "frac_agn": truth["frac_agn"],
-            "selected": again.selected,
-            "redshift_fitted": again.redshift,
-            "log_luminosity_fitted": again.log_luminosity,
-            "frac_agn_fitted": again.frac_agn,
+            "selected": refitted.selected,
+            "redshift_fitted": refitted.redshift,
+            "log_luminosity_fitted": refitted.log_luminosity,
+            "frac_agn_fitted": refitted.frac_agn,
         }
-        return described_columns(columns, declared("miricigale.agn", "columns.toml")["injected"])
+        return described_columns(columns, texts)
 
     def _injections(self, results, sample):
         """Hosts, and redshifts and luminosities of the AGN that they get: the same number in each bin."""
@@ -242,11 +240,14 @@ class AGNSurvey:
         edges = self.bins.log_luminosity
         # above the last edge as far as below the last but one
         step = edges[-1] - edges[-2] if len(edges) > 1 else 1.0
-        edges = np.array([*edges, edges[-1] + step])
+        edges = np.append(edges, edges[-1] + step)
         z_bin, _, _ = self.bins.place(sample.redshift, np.ones(len(sample)), np.ones(len(sample)))
-        free = sample.used & ~sample.selected & (sample.main == "galaxy")
-        hosts = [np.flatnonzero(free & (z_bin == i)) for i in range(n_z)]
-        cells = [(i, k) for i in range(n_z) for k in range(len(edges) - 1) if hosts[i].size]
+        without_agn = sample.used & ~sample.selected & (sample.main == "galaxy")
+        hosts = [np.flatnonzero(without_agn & (z_bin == i)) for i in range(n_z)]
+        cells = []
+        for i in range(n_z):
+            if hosts[i].size:
+                cells += [(i, k) for k in range(len(edges) - 1)]
         if not cells:
             log.warning("no galaxy without an AGN in the bins of redshift: no AGN are injected")
             return None
@@ -283,20 +284,18 @@ class AGNSurvey:
             results.model, hosts, luminosity, parameters, bands, quantity=self.bins.quantity
         )
         usable = np.all([np.isfinite(light[band]) for band in bands], axis=0)
-        light = {
-            band: np.where(usable, light[band].to_value(FNU) / points[j], 0.0) * FNU
-            for j, band in enumerate(bands)
-        }
+        for j, band in enumerate(bands):
+            light[band] = np.where(usable, light[band].to_value(FNU) / points[j], 0.0) * FNU
         curves = _noise_curves(results, bands, points)
         table = add_light(table, light, curves=curves, seed=self.seed)
-        out = QTable({"host": hosts.ids, "redshift": hosts.best["redshift"].value})
-        out["log_luminosity"] = truth["log_luminosity"]
-        out["frac_agn"] = fraction
+        truth_table = QTable({"host": hosts.ids, "redshift": hosts.best["redshift"].value})
+        truth_table["log_luminosity"] = truth["log_luminosity"]
+        truth_table["frac_agn"] = fraction
         n_lost = int(np.count_nonzero(~usable))
         if n_lost:
             text = "injected AGN are left out: the best models of their galaxies have no dust, or are too old"
             warn(f"{n_lost} of {len(hosts)} {text}", FitWarning)
-        return table[usable], out[usable]
+        return table[usable], truth_table[usable]
 
     # ---------------------------------------------------------------------- result
 
@@ -304,11 +303,17 @@ class AGNSurvey:
         bins = self.bins
         prior = bins.prior(sample.axis)
         table = sample.tables["galaxy"][sample.used]
-        others = sample.others()
-        options = {"n_draws": self.n_draws, "seed": self.seed, "others": others}
+        other_classes = sample.other_classes()
+        options = {"n_draws": self.n_draws, "seed": self.seed, "others": other_classes}
         draws = draw_shares(table, prior, **options)
-        every = draw_shares(table.sum(axis=1, keepdims=True), prior, **options | {"others": None})
+        all_redshifts = draw_shares(
+            table.sum(axis=1, keepdims=True), prior, **options | {"others": None}
+        )
         shipped = sample.shipped()
+        shipped_numbers = {}
+        for name, weights in shipped.items():
+            if weights.ndim > 1:
+                shipped_numbers[name] = weights.sum(axis=0)
         first = bins.frac_agn.index(self.limit) + 1
         probability = {
             "agn_probability": _agn_probability(draws.probability, first),
@@ -327,7 +332,7 @@ class AGNSurvey:
             limit=self.limit,
             floor=FLOOR,
             draws=draws,
-            shipped={name: one.sum(axis=0) for name, one in shipped.items() if one.ndim > 1},
+            shipped=shipped_numbers,
             area=self.area,
             n_all=len(sample),
             n_used=int(sample.used.sum()),
@@ -347,7 +352,7 @@ class AGNSurvey:
         return AGNResult(
             numbers=numbers.by_luminosity(),
             totals=numbers.totals(),
-            prior=prior_table(bins, prior, draws, every),
+            prior=prior_table(bins, prior, draws, all_redshifts),
             sources=sources,
             injected=injected,
             meta=meta,
@@ -364,8 +369,10 @@ class AGNSurvey:
             "selected": selected,
             "right": selected & (fraction >= self.limit),
         }
-        place = injected["redshift"], injected["log_luminosity"]
-        return {name: self._counts(*place, rows) for name, rows in chosen.items()}
+        counts = {}
+        for name, rows in chosen.items():
+            counts[name] = self._counts(injected["redshift"], injected["log_luminosity"], rows)
+        return counts
 
     def _counts(self, redshift, log_luminosity, chosen, weight=None):
         """Numbers of objects, or sums of their weights, by redshift and luminosity."""
@@ -374,14 +381,17 @@ class AGNSurvey:
         z_bin, _, l_bin = self.bins.place(redshift, np.ones(redshift.size), luminosity)
         n_z, _, n_lum = self.bins.shape
         flat = np.ravel_multi_index((z_bin[chosen], l_bin[chosen]), (n_z, n_lum))
-        weight = None if weight is None else weight[chosen]
+        if weight is not None:
+            weight = weight[chosen]
         return np.bincount(flat, weight, n_z * n_lum).reshape(n_z, n_lum)
 
 
 def _agn_probability(probability, first):
     """Probability of an AGN fraction from a bin on, of all classes that have them."""
-    with_bins = [weights for weights in probability.values() if weights.ndim > 1]
-    total = sum(weights[:, :, first:].sum(axis=(1, 2, 3)) for weights in with_bins)
+    total = 0.0
+    for weights in probability.values():
+        if weights.ndim > 1:
+            total = total + weights[:, :, first:].sum(axis=(1, 2, 3))
     if "quasar" in probability and probability["quasar"].ndim == 1:
         total = total + probability["quasar"]
     return total
@@ -432,31 +442,36 @@ class _Sample:
         names = np.array(list(columns))
         main = names[np.argmax(np.where(np.isnan(evidence), -np.inf, evidence), axis=0)]
         galaxy = columns["galaxy"]
-        used = np.isfinite(galaxy["weights"].sum(axis=(1, 2, 3)))
+        usable = np.isfinite(galaxy["weights"].sum(axis=(1, 2, 3)))
         values = {}
         for name in ("redshift", "log_luminosity", "frac_agn"):
             values[name] = galaxy[name].copy()
             if "quasar" in columns:
-                here = main == "quasar"
-                values[name][here] = columns["quasar"][name][here]
+                quasars = main == "quasar"
+                values[name][quasars] = columns["quasar"][name][quasars]
         with np.errstate(invalid="ignore"):
-            known = np.where(np.isfinite(values["frac_agn"]), values["frac_agn"], np.nan)
-        selected = classify(known, limits=(CLASS_LIMITS[0], limit)) == "agn"
+            fraction = np.where(np.isfinite(values["frac_agn"]), values["frac_agn"], np.nan)
+        selected = classify(fraction, limits=(CLASS_LIMITS[0], limit)) == "agn"
         selected &= np.isin(main, _WITH_AGN)
-        tables = {name: columns[name]["weights"] for name in _WITH_AGN if name in columns}
-        log_evidence = {name: one["log_evidence"] for name, one in columns.items()}
+        tables = {}
+        for name in _WITH_AGN:
+            if name in columns:
+                tables[name] = columns[name]["weights"]
+        log_evidence = {}
+        for name, of_class in columns.items():
+            log_evidence[name] = of_class["log_evidence"]
         first = next(iter(fits["galaxy"].parts()))
         axis = first.axes.get("frac_agn")
         if axis is None:
             raise argument_error("axes", "a grid with several AGN fractions", "one without")
         return cls(
-            galaxy["ids"], used, selected, main, **values, tables=tables,
+            galaxy["ids"], usable, selected, main, **values, tables=tables,
             log_evidence=log_evidence, axis=axis,
         )  # fmt: skip
 
-    def others(self):
+    def other_classes(self):
         """Other classes of the objects that are used, as `draw_shares` takes them."""
-        out = {}
+        posteriors = {}
         for name, evidence in self.log_evidence.items():
             if name == "galaxy":
                 continue
@@ -464,35 +479,38 @@ class _Sample:
             table = self.tables.get(name)
             if table is not None:
                 table = np.nan_to_num(table[self.used])
-            out[name] = ratio, table
-        return out
+            posteriors[name] = ratio, table
+        return posteriors
 
     def shipped(self):
         """Posteriors as they were fitted, all classes being equally frequent: as `ShareDraws.probability`."""
-        others = self.others()
+        other_classes = self.other_classes()
         evidence = [np.zeros(int(self.used.sum()))]
-        evidence += [np.where(np.isnan(ratio), -np.inf, ratio) for ratio, _ in others.values()]
+        evidence += [
+            np.where(np.isnan(ratio), -np.inf, ratio) for ratio, _ in other_classes.values()
+        ]
         evidence = np.array(evidence)
         weight = np.exp(evidence - evidence.max(axis=0))
         weight = weight / weight.sum(axis=0)
-        out = {}
-        for name, part in zip(("galaxy", *others), weight, strict=True):
+        probability = {}
+        for name, part in zip(["galaxy"] + list(other_classes), weight, strict=True):
             table = self.tables.get(name)
             if table is None:
-                out[name] = part
+                probability[name] = part
             else:
-                out[name] = part[:, None, None, None] * np.nan_to_num(table[self.used])
-        return out
+                probability[name] = part[:, None, None, None] * np.nan_to_num(table[self.used])
+        return probability
 
 
 def _columns(results, bins):
     """Arrays of a class for all objects: dict by name."""
-    out = {}
+    by_name = {}
     for part in results.parts():
         n = len(part)
         columns = {"ids": np.array(part.ids), "log_evidence": np.array(part.log_evidence)}
-        weights = part.agn_weights
-        columns["weights"] = np.full((n, *bins.shape), np.nan) if weights is None else weights
+        columns["weights"] = part.agn_weights
+        if part.agn_weights is None:
+            columns["weights"] = np.full((n,) + tuple(bins.shape), np.nan)
         for name in ("redshift", "frac_agn", bins.quantity):
             values = np.full(n, np.nan)
             if name in part.parameters:
@@ -504,5 +522,5 @@ def _columns(results, bins):
             log_luminosity = np.log10(columns.pop(bins.quantity) * LUMINOSITY.to("erg / s"))
         columns["log_luminosity"] = log_luminosity
         for name, values in columns.items():
-            out.setdefault(name, []).append(values)
-    return {name: np.concatenate(parts) for name, parts in out.items()}
+            by_name.setdefault(name, []).append(values)
+    return {name: np.concatenate(parts) for name, parts in by_name.items()}
