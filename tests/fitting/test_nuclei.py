@@ -148,7 +148,7 @@ def test_likelihoods_between_nodes_are_those_of_correlated_data(grid, catalog, m
         assert_allclose(results.log_evidence[i], log_evidence, rtol=1e-6)
 
 
-@pytest.mark.parametrize("interpolate", [0, 30])
+@pytest.mark.parametrize("interpolate", [0, 300])
 def test_without_nuclei_nothing_changes(grid, catalog, interpolate):
     settings = GridSettings(interpolate=interpolate)
     fitter = BayesFitter(grid, nuclei=True, settings=settings)

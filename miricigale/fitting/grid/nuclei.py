@@ -303,13 +303,13 @@ def object_engine(extended, nuclei):
     n_bands = nuclei.n_bands
     of_bands = extended.agn[..., :n_bands]
     agn = nuclei.extended(of_bands, of_bands)
-    tables = extended._tables
+    tables = extended.tables
     unit = tables.agn_unit[:, : agn.shape[1], None]
     tables = tables._replace(agn=agn, agn32=(agn / unit).astype(np.float32, order="C"))
     errors = nuclei.template_errors(extended.template_error[:, :n_bands])
-    new = {"agn": agn, "template_error": errors, "_tables": tables}
+    new = {"agn": agn, "template_error": errors, "tables": tables}
     if extended.mixture is not None:
-        new["_tangents"] = replace(extended._tangents, tables=tables)
+        new["tangents"] = replace(extended.tangents, tables=tables)
     engine = object.__new__(type(extended))
     # what else is worked out once is shared
     engine.__dict__.update(extended.__dict__ | new)
