@@ -130,12 +130,9 @@ model : `~miricigale.sed.SEDModel`, optional
             raise argument_error("index", wanted, "none")
 
     def __repr__(self):
-        objects = f"{len(self)} objects"
-        ending = " each"
         if self.isscalar:
-            objects = repr(np.asarray(self.ids).item())
-            ending = ""
-        return f"<Samples of {objects}, {self.n_draws} draws{ending}>"
+            return f"<Samples of {np.asarray(self.ids).item()!r}, {self.n_draws} draws>"
+        return f"<Samples of {len(self)} objects, {self.n_draws} draws each>"
 
     @property
     def n_draws(self):
