@@ -99,7 +99,9 @@ def test_the_same_hits_are_found_and_cost_the_same(mode):
     assert len(drawn.jumps) == pytest.approx(len(fitted.jumps), rel=0.02)
     for flag in (DQ.JUMP_DET, DQ.JUMP_NEIGHBOR, DQ.SATURATED):
         a, b = ((fit.flags & flag) != 0 for fit in (fitted, drawn))
-        assert b.sum() == pytest.approx(a.sum(), rel=0.02, abs=3 * np.sqrt(a.sum()))
+        # a jump at the threshold, which the noise decides, cuts four neighbors
+        within = 0.02 if flag == DQ.SATURATED else 0.04
+        assert b.sum() == pytest.approx(a.sum(), rel=within, abs=3 * np.sqrt(a.sum()))
         # those about the threshold are told by the noise
         assert np.mean(a != b) < 0.02 + 0.03 * a.mean()
     hit &= (drawn.flags & DQ.JUMP_DET) != 0

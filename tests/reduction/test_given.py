@@ -93,5 +93,5 @@ def test_integrations_and_pixels_of_a_ramp(ramps):
 
 def test_a_reducer_says_what_is_not_by_default():
     assert repr(Reducer()) == "<Reducer native>"
-    changed = Reducer(skip_first=3, ramps=RampSettings(neighbor_threshold=5.0))
+    changed = Reducer(skip_first=3, ramps=RampSettings(neighbor_threshold=7.0))
     assert repr(changed) == "<Reducer native, skip_first=3, own ramps>"
