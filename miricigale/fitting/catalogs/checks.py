@@ -142,7 +142,7 @@ class MockResult:
     >>> mock
     <MockResult of 2 objects, 2 fitted>
     >>> mock.true("redshift").round(2)
-    <Quantity [0.49, 1.  ]>
+    <Quantity [0.49, 1.01]>
     """
 
     truth: object
@@ -313,7 +313,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     >>> fitter = BayesFitter(model, bands, axes=axes)
     >>> leave_out(fitter, photometry, ["irac.ch1"]).pull.round(1)
     array([[-1. ],
-           [ 1.4]])
+           [ 1.5]])
     """
     check_that(isinstance(fitter, BayesFitter), "fitter", "a BayesFitter", type(fitter).__name__)
     if isinstance(bands, str) or not len(bands):

@@ -327,10 +327,10 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
     >>> print(points)
        band     n  factor factor_err
     ---------- --- ------ ----------
-     acs.f814w  40   1.12       0.03
+     acs.f814w  40   1.12       0.02
     wfc3.f160w  40    1.0       0.01
       irac.ch1  40    1.2       0.02
-    miri.f770w  40   1.07        inf
+    miri.f770w  40   1.07       1.79
     """
     flux, _, model, good = _residuals(results)
     if longest is not None:
