@@ -616,7 +616,13 @@ class BayesFitter(Interactive):
         if nuclei and not self.nuclei:
             text = "fluxes of nuclei are not fitted (nuclei=True does)"
             warn(f"{text}: {', '.join(nuclei)}", FitWarning)
-        unused = unused_bands(photometry, self._reader.fitted(photometry))
+        fitted = self._reader.fitted(photometry)
+        if self.nuclei and self.filters is None:
+            without_total = [column for column, band in nuclei.items() if band not in fitted]
+            if without_total:
+                text = "fluxes of nuclei in bands that have no total flux are not fitted"
+                warn(f"{text}: {', '.join(without_total)}", FitWarning)
+        unused = unused_bands(photometry, fitted)
         if unused and self.filters is None:
             text = "bands of the photometry that the grid lacks are not fitted"
             warn(f"{text}: {', '.join(unused)}", FitWarning)

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers import grids
 from helpers.errors import refuses
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings
+from miricigale.fitting.grid.nuclei import _cholesky
 from miricigale.utils.exceptions import FitWarning
 
 N = 5
@@ -164,6 +165,12 @@ def test_without_nuclei_nothing_changes(grid, catalog, interpolate):
     table["band5_flux_point"][1], table["band5_flux_point_err"][1] = 1.0 * u.uJy, 1e9 * u.uJy
     results = fitter.fit(table)
     assert_array_equal(results.chi2[2:], plain.chi2[2:])
+    if interpolate:
+        # enough draws for the two to be compared: they begin in other places
+        settings = GridSettings(interpolate=1000)
+        fitter = fitter.replace(settings=settings)
+        results = fitter.fit(table[:2])
+        plain = fitter.replace(nuclei=False).fit(without(catalog, *NAMES)[:2])
     assert_allclose(results.pdf_2d[1], plain.pdf_2d[1], atol=1e-5 if interpolate == 0 else 0.1)
 
 
@@ -204,11 +211,48 @@ def test_unusable_fluxes_are_flagged(grid, catalog):
     assert_array_equal(flags > 0, [True, True, True, False, False])
 
 
+def test_covariance_of_points_is_that_of_their_sum():
+    rng = np.random.default_rng(1)
+    sigma = rng.uniform(0.5, 2.0, 4)
+    light = rng.uniform(0.0, 5.0, 4)
+    lower = _cholesky(sigma, light)
+    expected = np.linalg.cholesky(np.diag(sigma**2) + np.outer(light, light))
+    assert_allclose(lower, expected, rtol=1e-12)
+    # with errors of next to nothing, two points whose host's light is the same differ by their errors
+    inverse = np.linalg.inv(_cholesky(np.full(2, 1e-10), np.ones(2)))
+    apart = inverse @ [1e-10, -1e-10]
+    assert_allclose(apart @ apart, 2.0, rtol=1e-6)
+
+
+def test_correlations_have_no_unit_but_percent(grid, catalog):
+    fitter = BayesFitter(grid, nuclei=True, settings=GridSettings(interpolate=0))
+    table = catalog[:2]
+    table["band3_flux_point_corr"] = 100.0 * table["band3_flux_point_corr"] * u.percent
+    results = fitter.fit(table)
+    assert np.all(results.flags & FitFlags.NUCLEUS_LEFT_OUT == 0)
+    assert_allclose(results.chi2, fitter.fit(catalog[:2]).chi2)
+    table["band3_flux_point_corr"] = [0.1, 0.1] * u.uJy**2
+    match = "column 'band3_flux_point_corr' must be a number without a unit"
+    refuses(match, fitter.fit, table, error=u.UnitsError)
+
+
+def test_points_of_bands_without_totals_are_told(grid, catalog):
+    table = catalog[:2]
+    table.remove_columns(["band5", "band5_err"])
+    fitter = BayesFitter(grid, nuclei=True, settings=GridSettings(interpolate=0))
+    with pytest.warns(FitWarning, match="no total flux are not fitted: band5_flux_point"):
+        results = fitter.fit(table)
+    assert results.meta["fit"]["nuclei"] == ["band1", "band3"]
+
+
 def test_refuses(grid, catalog):
     make = partial(BayesFitter, grid, settings=GridSettings(interpolate=0))
     refuses("'nuclei' must be True or False", make, nuclei="yes")
     fitter = make(nuclei=True)
     refuses("<filter>_flux_point_err for 'nuclei'", fitter.fit, without(catalog, *NAMES))
+    table = catalog.copy()
+    table.remove_column("band3_flux_point_err")
+    refuses("the errors 'band3_flux_point_err' of 'band3_flux_point'", fitter.fit, table)
     refuses("draws of nodes are without nuclei", fitter.sample, catalog, 10, seed=1)
     table = catalog.copy()
     table["band1_nucleus"] = table["band1"]

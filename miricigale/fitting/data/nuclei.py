@@ -9,7 +9,7 @@ import numpy as np
 from miricigale.filters.band_names import find_filter
 from miricigale.filters.photometry_table import unit_of_fluxes
 from miricigale.fitting.data.likelihood import NUCLEUS_SUFFIXES, flux_column, limits
-from miricigale.utils.exceptions import units_error
+from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, flux_unit
@@ -55,9 +55,10 @@ class NucleusColumns:
         Raises
         ------
         ValueError
-            If two columns are of the same band.
+            If two columns are of the same band, or one has no errors.
         """
         bands = tuple(bands)
+        _check_errors(colnames, bands)
         column_of_band = {}
         for column, band in nucleus_columns(colnames).items():
             if band not in bands:
@@ -78,13 +79,28 @@ def nucleus_columns(colnames):
     """Find the columns that hold fluxes of nuclei and have errors: dict of band, by our names, by column."""
     band_of_column = {}
     for column in colnames:
-        for suffix in NUCLEUS_SUFFIXES:
-            if not column.endswith(suffix) or error_column(column) not in colnames:
-                continue
-            name = column.removesuffix(suffix)
-            band = find_filter(name) or name
+        band = _band_of_nucleus(column)
+        if band is not None and error_column(column) in colnames:
             band_of_column[column] = band
     return band_of_column
+
+
+def _check_errors(colnames, bands):
+    """Refuse fluxes of nuclei of bands without a column of errors."""
+    for column in colnames:
+        band = _band_of_nucleus(column)
+        if band in bands and error_column(column) not in colnames:
+            wanted = f"a table with the errors {error_column(column)!r} of {column!r} for 'nuclei'"
+            raise argument_error("photometry", wanted, "none")
+
+
+def _band_of_nucleus(column):
+    """Name a band, by our names, whose fluxes of nuclei a column holds by its name; None for another column."""
+    for suffix in NUCLEUS_SUFFIXES:
+        if column.endswith(suffix):
+            name = column.removesuffix(suffix)
+            return find_filter(name) or name
+    return None
 
 
 def with_units(table, unit):
@@ -153,7 +169,7 @@ def read_nuclei(table, columns, data, reader):
     ValueError
         If a column holds something else than numbers.
     `~astropy.units.UnitsError`
-        If a flux has no unit of flux density.
+        If a flux has no unit of flux density, or a correlation has a unit.
     """
     n = len(table)
     values = np.zeros((n, len(columns.bands), 4))
@@ -202,8 +218,11 @@ def _fluxes(table, name):
 
 
 def _numbers(table, name):
-    """Read numbers of a column without unit, NaN where masked."""
+    """Read numbers of a column without unit (10 % is 0.1), NaN where masked."""
     column = table[name]
+    unit = getattr(column, "unit", None) or u.dimensionless_unscaled
+    if not unit.is_equivalent(u.dimensionless_unscaled):
+        raise units_error("photometry", "a number without a unit", repr(str(unit)), column=name)
     mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), (len(table),))
     try:
         numbers = np.array(getattr(column, "unmasked", column), float)
@@ -211,4 +230,4 @@ def _numbers(table, name):
         wanted = f"a table with numbers in column {name!r}"
         check_that(False, "photometry", wanted, str(column.dtype))
     numbers[mask] = np.nan
-    return numbers
+    return numbers * unit.to(u.dimensionless_unscaled)

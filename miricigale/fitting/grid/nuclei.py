@@ -146,9 +146,8 @@ class ObjectNuclei:
         covariance = values[index, COVARIANCE]
         point_variance = np.square(values[index, SIGMA]) + np.square(agn_error * point[index])
         host = np.clip(total[index] - point[index], 0.0, np.maximum(total[index], 0.0))
-        of_points = np.diag(point_variance) + stars**2 * np.outer(host, host)
         # covariance L L^T of the points, so that L^-1 P has unit errors
-        lower = np.linalg.cholesky(of_points)
+        lower = _cholesky(np.sqrt(point_variance), stars * host)
         block = np.ix_(index, index)
         root[block] = solve_triangular(lower, np.eye(len(index)), lower=True)
         # K = cov(T, P) cov(P)^-1: the rest T - K P is not correlated with P
@@ -267,6 +266,30 @@ class NuclearGrid(Frozen):
         return ObjectNuclei.of_values(
             self.index, data.nuclei[0], data[0], self.stars, self.agn_error
         )
+
+
+def _cholesky(sigma, light):
+    """
+    Calculate L of the covariance L L^T = D + h h^T of points, D being their own variances.
+
+    With v = h / sigma and t_j the sum of 1 and of v_k^2 up to k = j, the diagonal of L over sigma is
+    sqrt(t_j / t_(j-1)), and what stands below it v_i v_j / sqrt(t_j t_(j-1)). No difference is taken, so that
+    errors may be as small as they like beside h.
+
+    Parameters
+    ----------
+    sigma, light : `~numpy.ndarray`, shape (n,)
+        Errors of the points, and h.
+
+    Returns
+    -------
+    lower : `~numpy.ndarray`, shape (n, n)
+    """
+    ratio = light / sigma
+    total = 1.0 + np.cumsum(np.square(ratio))
+    before = np.concatenate([[1.0], total])[:-1]
+    below = np.tril(np.outer(ratio, ratio / np.sqrt(total * before)), -1)
+    return sigma[:, None] * (below + np.diag(np.sqrt(total / before)))
 
 
 def extended_engine(engine, bands):
