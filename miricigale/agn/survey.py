@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+from io import BytesIO
 from pathlib import Path
 
 import astropy.units as u
@@ -16,7 +17,7 @@ from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.fitting import AGNBins
 from miricigale.fitting.catalogs.catalog_calibration import measured_calibration
 from miricigale.fitting.catalogs.classes import fit_classes
-from miricigale.utils.exceptions import FitWarning, argument_error, warn
+from miricigale.utils.exceptions import FitWarning, OtherResultsError, argument_error, warn
 from miricigale.utils.files import replacing
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
@@ -34,6 +35,8 @@ LOG_LUMINOSITY = (43.0, 44.0, 45.0, 46.0)
 _OF_CATALOG = ("catalog_map", "flux_unit", "hdu")
 #: Files that a run writes besides the folders of fits.
 FILES = ("numbers.ecsv", "totals.ecsv", "prior.ecsv", "sources.ecsv", "injected.ecsv")
+#: Solid angle of the whole sky in square degrees.
+_SKY = (4.0 * np.pi * u.sr).to_value(u.deg**2)
 #: Classes whose fits have an AGN luminosity.
 _WITH_AGN = ("galaxy", "quasar")
 
@@ -150,6 +153,9 @@ class AGNSurvey:
         seed=1,
     ):
         self.area = positive(area, u.deg**2, "area")
+        check_that(
+            self.area <= 1.000001 * _SKY, "area", f"at most the sky of {_SKY:.0f} deg2", area
+        )
         good = is_number(limit) and CLASS_LIMITS[0] <= limit < 1
         check_that(good, "limit", f"from {CLASS_LIMITS[0]:g} to below 1", limit)
         self.limit = float(limit)
@@ -180,11 +186,14 @@ class AGNSurvey:
         Raises
         ------
         ValueError
-            If models between nodes are left out (``interpolate=0``), the models have no AGN fraction, or nothing
-            was fitted.
+            If models between nodes are left out (``interpolate=0``), fluxes of nuclei are to be fitted (injected
+            AGN have none), the models have no AGN fraction, or nothing was fitted.
+        `~miricigale.utils.exceptions.OtherResultsError`
+            If the folder has fits of another catalog, of other settings or of other injected AGN.
         """
         output = Path(output)
         check_that(options.get("interpolate", 1), "interpolate", "above 0 for numbers of AGN", 0)
+        check_that(not options.get("nuclei"), "nuclei", "False for numbers of AGN", True)
         fits = fit_classes(path, output / "fits", agn_bins=self.bins, **options)
         sample = _Sample.of_fits(fits, self.bins, self.limit)
         check_that(sample.used.any(), "path", "a catalog of which objects can be fitted", "none")
@@ -211,8 +220,7 @@ class AGNSurvey:
             return described_columns(columns, texts)
         photometry, truth = self._photometry(results, truth, options.get("redshift"))
         catalog = output / "injected.fits"
-        with replacing(catalog, overwrite=True) as partial:
-            photometry.write(partial, format="fits")
+        _write_injected(photometry, catalog, resume=options.get("resume", True))
         fit_options = {name: value for name, value in options.items() if name not in _OF_CATALOG}
         # errors and zero points are those of the catalog
         measured = measured_calibration(results)
@@ -384,6 +392,20 @@ class AGNSurvey:
         if weight is not None:
             weight = weight[chosen]
         return np.bincount(flat, weight, n_z * n_lum).reshape(n_z, n_lum)
+
+
+def _write_injected(photometry, path, *, resume):
+    """Write photometry with AGN, unless the fits beside it, which are to be resumed, are of another one."""
+    content = BytesIO()
+    photometry.write(content, format="fits")
+    content = content.getvalue()
+    fits = path.with_name("injected")
+    if resume and fits.exists() and path.exists() and path.read_bytes() != content:
+        reason = f"{fits} holds fits of other injected AGN, of another number or seed"
+        reason += " (without this folder they alone are fitted anew)"
+        raise OtherResultsError(reason, "resume=False to replace them")
+    with replacing(path, overwrite=True) as partial:
+        Path(partial).write_bytes(content)
 
 
 def _agn_probability(probability, first):

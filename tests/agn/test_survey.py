@@ -9,6 +9,7 @@ from helpers.commands import command
 from helpers.errors import refuses
 from miricigale import BayesFitter, ErrorModel, FitResults, SEDModel
 from miricigale.agn import AGNSurvey, NoiseCurve, add_light, agn_light
+from miricigale.agn.survey import _write_injected
 from miricigale.fitting import AGNBins, GridSettings
 from miricigale.utils.parallel import threads
 
@@ -214,12 +215,32 @@ def test_workers_and_a_second_call_change_no_byte(result, run):
         assert words in page
 
 
+def test_other_injections_replace_nothing(photometry, tmp_path):
+    path = tmp_path / "injected.fits"
+    photometry = photometry.copy()
+    photometry.meta = {}
+    _write_injected(photometry, path, resume=True)
+    before = path.read_bytes()
+    (tmp_path / "injected").mkdir()
+    _write_injected(photometry, path, resume=True)
+    match = "injected holds fits of other injected AGN"
+    refuses(match, _write_injected, photometry[:3], path, resume=True)
+    assert path.read_bytes() == before
+    _write_injected(photometry[:3], path, resume=False)
+    assert path.read_bytes() != before
+
+
 def test_refusals(run, tmp_path):
     area = 20 * u.arcmin**2
     refuses("'limit' must be from 0.1 to below 1, got 0.05", AGNSurvey, area, limit=0.05)
     refuses("'area' must be", AGNSurvey, 0 * u.arcmin**2)
+    refuses("'area' must be at most the sky of 41253 deg2", AGNSurvey, 50000 * u.deg**2)
+    refuses("'redshift' must be edges of 0 or more", AGNSurvey, area, redshift=(-1, 2))
+    refuses("'redshift' must be 2 or more ascending", AGNSurvey, area, redshift="ab")
+    refuses("log10 of luminosities", AGNSurvey, area, log_luminosity=(1e44, 1e45))
     refuses("'n_injections' must be", AGNSurvey, area, n_injections=-1)
     survey = AGNSurvey(area)
+    refuses("'nuclei' must be False", survey.run, "no.fits", tmp_path, nuclei=True)
     refuses("'interpolate' must be above 0", survey.run, "no.fits", tmp_path, interpolate=0)
 
 

@@ -9,6 +9,8 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.units import LUMINOSITY
 
+#: Log10 of luminosities in erg/s that edges may have: from below that of the Sun to above that of all galaxies.
+_LOG_LUMINOSITY = (30.0, 60.0)
 #: erg/s in the unit of luminosities.
 _ERG_PER_S = LUMINOSITY.to("erg / s")
 
@@ -34,7 +36,8 @@ class AGNBins:
     Raises
     ------
     ValueError
-        If edges do not ascend, or those of the fraction do not reach from 0 to 1.
+        If edges do not ascend, a redshift is negative, an edge of luminosity is no logarithm of one in erg/s (30
+        to 60), or those of the fraction do not reach from 0 to 1.
 
     Examples
     --------
@@ -51,13 +54,22 @@ class AGNBins:
     def __post_init__(self):
         min_edges = {"redshift": 2, "log_luminosity": 1, "frac_agn": 2}
         for name, n_least in min_edges.items():
-            edges = floats(getattr(self, name))
             wanted = f"{n_least} or more ascending edges"
+            try:
+                edges = floats(getattr(self, name))
+            except (TypeError, ValueError):
+                raise argument_error(name, wanted, repr(getattr(self, name))) from None
             if edges.ndim != 1 or edges.size < n_least or not np.all(np.diff(edges) > 0):
                 raise argument_error(name, wanted, f"{getattr(self, name)}")
             if not np.all(np.isfinite(edges)):
                 raise argument_error(name, "finite edges", f"{getattr(self, name)}")
             object.__setattr__(self, name, tuple(edges.tolist()))
+        if self.redshift[0] < 0:
+            raise argument_error("redshift", "edges of 0 or more", f"{self.redshift}")
+        low, high = _LOG_LUMINOSITY
+        if self.log_luminosity[0] < low or self.log_luminosity[-1] > high:
+            wanted = f"log10 of luminosities in erg/s, from {low:g} to {high:g}"
+            raise argument_error("log_luminosity", wanted, f"{self.log_luminosity}")
         if self.frac_agn[0] != 0 or self.frac_agn[-1] != 1:
             raise argument_error("frac_agn", "edges from 0 to 1", f"{self.frac_agn}")
 
