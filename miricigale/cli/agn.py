@@ -53,8 +53,8 @@ def _plan(args, hdu):
     from miricigale.fitting.catalogs.catalog_rows import open_catalog
     from miricigale.fitting.catalogs.class_names import chosen_classes
 
-    given = chosen(args, "catalog_map flux_unit")
-    rows = open_catalog(args.photometry, args.chunk_rows, hdu=hdu, **given)
+    options = chosen(args, "catalog_map flux_unit")
+    rows = open_catalog(args.photometry, args.chunk_rows, hdu=hdu, **options)
     names = chosen_classes(args.classes, **chosen(args, "quasars red_dots stars"))
     n_classes = 1 + len(names)
     n_fits = (rows.n_rows + args.n_injections) * n_classes

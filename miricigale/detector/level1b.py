@@ -43,20 +43,23 @@ def header(exposure, *, filename="", start=None):
         raise argument_error("start", "one astropy Time", repr(start))
     duration = TimeDelta(exposure.duration.to_value("s"), format="sec")
     # as in real files, only the linear part of the WCS stands here
-    wcs, where = exposure.wcs.wcs, exposure.pointing_keywords()
+    wcs = exposure.wcs.wcs
+    pointing = exposure.pointing_keywords()
     matrix = wcs.pc * np.asarray(wcs.cdelt)[:, None] if not wcs.has_cd() else wcs.cd
     times = {
         "TFRAME": exposure.frame_time, "TGROUP": exposure.group_time, "EFFINTTM": exposure.integration_time,
         "EFFEXPTM": exposure.exposure_time, "DURATION": exposure.duration,
     }  # fmt: skip
     days = {"EXPSTART": start, "EXPMID": start + duration / 2, "EXPEND": start + duration}
-    n_int, number = exposure.n_integrations, exposure.dither + 1
+    n_int = exposure.n_integrations
+    number = exposure.dither + 1
     name = exposure.filter.rpartition(".")[2]
-    values = where | {
+    values = pointing | {
         # not the time of writing: the same exposure gives the same bytes
         "DATE": days["EXPEND"].utc.isot, "DATE-OBS": start.utc.isot[:10], "TIME-OBS": start.utc.isot[11:],
         "FILENAME": filename, "FILTER": name.upper(), "READPATT": exposure.readout,
-        "TARG_RA": where["RA_REF"], "TARG_DEC": where["DEC_REF"], "APERNAME": f"MIRIM_{where['SUBARRAY']}",
+        "TARG_RA": pointing["RA_REF"], "TARG_DEC": pointing["DEC_REF"],
+        "APERNAME": f"MIRIM_{pointing['SUBARRAY']}",
         "NINTS": n_int, "INTEND": n_int, "NGROUPS": exposure.n_groups, "NFRAMES": exposure.n_frames,
         "NSAMPLES": 9 if exposure.readout.startswith("SLOW") else 1,
         "EXPOSURE": f"{number:05d}", "PATT_NUM": number,

@@ -173,12 +173,12 @@ class Ramp(Interactive, NDData):
     @property
     def group_time(self):
         """Time between groups in s: that of the header, or of the exposure."""
-        own = self.exposure.group_time.to_value("s")
-        stated = None if self._header is None else self._header.get("TGROUP")
-        if stated is None or (self.exposure.n_frames > 1 and stated < 0.75 * own):
+        computed = self.exposure.group_time.to_value("s")
+        in_header = None if self._header is None else self._header.get("TGROUP")
+        if in_header is None or (self.exposure.n_frames > 1 and in_header < 0.75 * computed):
             # files of 2023 and before state the time of a frame for groups that are averaged on board
-            return own
-        return float(stated)
+            return computed
+        return float(in_header)
 
     def integration(self, number):
         """

@@ -162,28 +162,32 @@ def _check_header(path, header, exposure):
     if header.get("NFRAMES") == 1 and header.get("FRMDIVSR", n_frames) == n_frames:
         # before calwebb_detector1 has multiplied them, for groups that are averaged on board
         del wanted["NFRAMES"]
-    for name, (stated, true, where) in wanted.items():
-        what = f"{name} is {stated} in the header and {true} {where}"
-        check_data(not (stated is not None and stated != true), path, f"contradicts itself: {what}")
+    for name, (in_header, true, context) in wanted.items():
+        conflict = f"{name} is {in_header} in the header and {true} {context}"
+        check_data(
+            not (in_header is not None and in_header != true),
+            path,
+            f"contradicts itself: {conflict}",
+        )
     times = {"TFRAME": frame, "TGROUP": n_frames * frame}
     for name, true in times.items():
-        stated = header.get(name)
-        if name == "TGROUP" and n_frames > 1 and _is_time(stated, frame):
+        in_header = header.get(name)
+        if name == "TGROUP" and n_frames > 1 and _is_time(in_header, frame):
             msg = (
-                f"{path}: TGROUP = {stated} s is the time of a frame, as in files of 2023 and before; a group of "
-                f"{exposure.readout} takes {true:.6g} s, which is used"
+                f"{path}: TGROUP = {in_header} s is the time of a frame, as in files of 2023 and before; "
+                f"a group of {exposure.readout} takes {true:.6g} s, which is used"
             )
             warn(msg, DetectorWarning)
-        elif stated is not None and not _is_time(stated, true):
+        elif in_header is not None and not _is_time(in_header, true):
             truth = f"the frame of {exposure.readout} {exposure.subarray} takes {frame} s"
             group = "one group" if n_frames == 1 else f"one of {n_frames} of a group"
-            what = f"{name} = {stated} s, but {truth}, and is {group}"
-            raise data_error(path, f"contradicts itself: {what}")
+            conflict = f"{name} = {in_header} s, but {truth}, and is {group}"
+            raise data_error(path, f"contradicts itself: {conflict}")
 
 
-def _is_time(stated, true):
+def _is_time(value, true):
     """Whether a time in a header is that of the table, which is rounded to a millisecond or three digits."""
-    return stated is not None and abs(stated - true) < 5e-3 * true
+    return value is not None and abs(value - true) < 5e-3 * true
 
 
 def _counts(hdu):

@@ -112,26 +112,26 @@ class Work:
         shape = (self.shape[0], self.frames.n_groups, wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape[2:], np.uint32)
         group_dq = np.zeros(shape, np.uint8)
-        where = (self.frames, self.properties, wide, pixel_dq, group_dq)
-        _, array, rest = self._lit(Block, where, self.keyed)
-        for effect, key in rest:
-            array = effect.apply(array, Block(*where, key, self.previous))
+        block_arguments = (self.frames, self.properties, wide, pixel_dq, group_dq)
+        _, array, later = self._lit(Block, block_arguments, self.keyed)
+        for effect, key in later:
+            array = effect.apply(array, Block(*block_arguments, key, self.previous))
         counts, flags = array[:, :, inner], group_dq[:, :, inner]
         if self.exposure.n_frames > 1:
             counts, flags = _averaged(counts, flags, self.exposure.n_frames)
         return counts, pixel_dq[inner], flags
 
-    def _lit(self, kind, where, chain):
+    def _lit(self, kind, block_arguments, chain):
         """
         Draw the electrons of light and dark current together: a sum of Poisson numbers is one.
 
         Returns the mean rate, the ramp, and the effects of the chain that are left.
         """
-        light = self.light[where[2]]
+        light = self.light[block_arguments[2]]
         n = next(i for i, (effect, _) in enumerate(chain) if isinstance(effect, Photons))
         for effect, key in chain[:n]:
-            light = effect.apply(light, kind(*where, key))
-        block = kind(*where, chain[n][1])
+            light = effect.apply(light, kind(*block_arguments, key))
+        block = kind(*block_arguments, chain[n][1])
         mean = chain[n][0].expected(light, block)
         if type(chain[n][0]).apply is not Photons.apply:
             # a kind of its own, that may draw otherwise
@@ -139,7 +139,7 @@ class Work:
         for effect, key in chain[n + 1 :]:
             if type(effect).apply is not Dark.apply:
                 break
-            mean = effect.expected(mean, kind(*where, key))
+            mean = effect.expected(mean, kind(*block_arguments, key))
             n += 1
         ramp = np.zeros(block.ramp_shape, np.float32)
         electrons = np.ascontiguousarray(mean * block.group_time, float)

@@ -22,7 +22,8 @@ _LDDE = _TABLES["ldde"]
 _PSI = {"at": 0.43, "evolution": 0.48, "slope": 0.24, "low": 0.2, "high": 2.7 / 4.7, "until": 2.0}
 
 #: Edges of redshift, and pairs of Schechter functions between them, of Davidzon et al. 2017.
-_SMF_EDGES, _SMF = (np.array(_TABLES["schechter"][name]) for name in ("edges", "rows"))
+_SMF_EDGES = np.array(_TABLES["schechter"]["edges"])
+_SMF = np.array(_TABLES["schechter"]["rows"])
 
 #: Aird et al. 2013: slopes of the probability in specific accretion rate below and above the Eddington
 #: limit, and scatter of the black hole's mass in dex.

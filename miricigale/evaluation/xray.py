@@ -152,13 +152,13 @@ def completeness(values, found, edges):
     24.0 25.0   2       2   1.0
     25.0 26.0   3       1  0.33
     """
-    values, found = one_by_one(values=values, found=found)
-    found = found > 0
+    values, detected = one_by_one(values=values, found=found)
+    detected = detected > 0
     edges = floats(edges)
     if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
         raise argument_error("edges", "ascending", edges)
     n, _ = np.histogram(values, edges)
-    n_found, _ = np.histogram(values[found], edges)
+    n_found, _ = np.histogram(values[detected], edges)
     shares = np.array([fraction_interval(*pair) for pair in zip(n_found, n, strict=True)])
     columns = {
         "low": edges[:-1],
@@ -204,12 +204,12 @@ def half_complete(values, found):
     >>> print(f"{half_complete(log_flux, found):.2f}")
     1.00
     """
-    values, found = one_by_one(values=values, found=found)
-    found = found > 0
+    values, detected = one_by_one(values=values, found=found)
+    detected = detected > 0
     good = np.isfinite(values)
     values = values[good]
-    found = found[good]
-    if not found.any() or found.all():
+    detected = detected[good]
+    if not detected.any() or detected.all():
         return np.nan
     scale = max(float(values.std()), 1e-6)
 
@@ -221,9 +221,9 @@ def half_complete(values, found):
     def unlikely(parameters):
         center, width, top = curve(parameters)
         chance = top * ndtr((values - center) / width)
-        return -np.log(np.clip(np.where(found, chance, 1.0 - chance), 1e-300, 1.0)).sum()
+        return -np.log(np.clip(np.where(detected, chance, 1.0 - chance), 1e-300, 1.0)).sum()
 
-    start = 0.5 * (np.median(values[found]) + np.median(values[~found]))
+    start = 0.5 * (np.median(values[detected]) + np.median(values[~detected]))
     begin = [start, np.log(0.5 * scale), 3.0]
     best = minimize(unlikely, begin, method="Nelder-Mead", options={"maxiter": 1000}).x
     center, width, top = curve(best)

@@ -155,7 +155,9 @@ def _of_table(path, unit):
     meta = full_meta(table.meta)
     if path.suffix.lower() in (".xml", ".vot", ".votable"):
         meta = _parameters(path) | meta
-    keywords = {str(key).lower().replace("_", ""): value for key, value in meta.items()}
+    keywords = {}
+    for keyword, entry in meta.items():
+        keywords[str(keyword).lower().replace("_", "")] = entry
     energy = str(keywords.get("detectortype", "")).strip().lower() in _ENERGY
     name = keywords.get("name") or keywords.get("filterid") or path.stem
     options = {}
@@ -164,7 +166,11 @@ def _of_table(path, unit):
         if value is not None:
             options[key] = float(value) * reference
     carried = ("citations", "flux_convention", "n_negative")
-    options["meta"] = {key: meta[key] for key in carried if key in meta}
+    carried_meta = {}
+    for key in carried:
+        if key in meta:
+            carried_meta[key] = meta[key]
+    options["meta"] = carried_meta
     return wave, throughput, energy, str(name), options
 
 
@@ -174,7 +180,11 @@ def _parameters(path):
 
     with packed_open(path) as stream:
         first = votable.parse(stream, verify="ignore").get_first_table()
-    return {param.name: param.value for param in first.params if param.name is not None}
+    parameters = {}
+    for param in first.params:
+        if param.name is not None:
+            parameters[param.name] = param.value
+    return parameters
 
 
 def _of_text(path, unit):

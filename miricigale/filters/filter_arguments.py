@@ -89,7 +89,10 @@ def given_filters(names):
     An X-ray band by its name (``xray_boxcar_0p5to2keV``) is a filter of that name, by which `xray_energies` knows
     it; a curve at its wavelengths is refused.
     """
-    return {band: _as_named_filter(band, curve) for band, curve in (names or {}).items()}
+    filters = {}
+    for band, curve in (names or {}).items():
+        filters[band] = _as_named_filter(band, curve)
+    return filters
 
 
 def _as_named_filter(band, curve):

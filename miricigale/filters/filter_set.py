@@ -57,7 +57,10 @@ class FilterSet(Interactive):
             items = [items]
         # a set of sedpy's holds its filters
         items = getattr(items, "filters", items)
-        filters = tuple(band for item in items for band in _members(item, unit))
+        members = []
+        for item in items:
+            members += _members(item, unit)
+        filters = tuple(members)
         names = [f.name for f in filters]
         if not names or len(set(names)) < len(names):
             raise argument_error("filters", "one or more filters of different names", names)
@@ -144,7 +147,10 @@ class FilterSet(Interactive):
             If ``wave`` does not ascend or leaves more of a band uncovered.
         """
         wave = check_wave(wave)
-        return np.stack([band.weights(wave, tolerance=tolerance) for band in self.filters])
+        weights = []
+        for band in self.filters:
+            weights.append(band.weights(wave, tolerance=tolerance))
+        return np.stack(weights)
 
     def synthetic_fluxes(self, sed):
         """
@@ -222,7 +228,11 @@ def filter_table(pattern=""):
     wfc3.f140w 1.392 0.384
     wfc3.f160w 1.537 0.268
     """
-    return _table([Filter.from_name(name) for name in Filter.names() if pattern.lower() in name])
+    filters = []
+    for name in Filter.names():
+        if pattern.lower() in name:
+            filters.append(Filter.from_name(name))
+    return _table(filters)
 
 
 def _table(filters):

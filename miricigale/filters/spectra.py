@@ -106,4 +106,7 @@ def _without_missing(wave, fnu, missing):
 
 def _inside(bands):
     """Wavelengths of the curves of bands, refined."""
-    return np.unique(np.concatenate([band._fine[0] for band in bands])) * WAVE
+    nodes = []
+    for band in bands:
+        nodes.append(band._fine[0])
+    return np.unique(np.concatenate(nodes)) * WAVE

@@ -62,7 +62,11 @@ SURVEYS = types.MappingProxyType(
 
 def flux_bands(colnames):
     """Those of some columns that are the fluxes of filters of the library."""
-    return [name for name in colnames if is_band(name) and not name.endswith(error_column(""))]
+    bands = []
+    for name in colnames:
+        if is_band(name) and not name.endswith(error_column("")):
+            bands.append(name)
+    return bands
 
 
 def is_band(name):

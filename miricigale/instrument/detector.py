@@ -86,7 +86,10 @@ class DetectorProperties:
         coefficients = tuple(float(c) for c in self.nonlinearity)
         object.__setattr__(self, "nonlinearity", coefficients)
         object.__setattr__(self, "ipc", tuple(float(c) for c in self.ipc))
-        rows = tuple((str(f), str(part), float(value)) for f, part, value in self.response)
+        response = []
+        for filter, array, ratio in self.response:
+            response.append((str(filter), str(array), float(ratio)))
+        rows = tuple(response)
         object.__setattr__(self, "response", rows)
         for *_, value in rows:
             check_positive(value, "response")

@@ -67,7 +67,10 @@ def dither_patterns():
     >>> dither_patterns()
     ('ceers', '4-point', 'none', 'cycling-small', 'cycling-medium', 'cycling-large')
     """
-    return tuple(name for kind in table("dithers").values() for name in kind)
+    patterns = []
+    for kind in table("dithers").values():
+        patterns += list(kind)
+    return tuple(patterns)
 
 
 def dither_offsets(pattern, n=None, *, start=0):
@@ -303,9 +306,10 @@ def read_centers(path, roll):
     if not centers:
         raise data_error(path, f"has no exposures of the full imager; it has {sorted(detectors)}")
     pa = roll + aperture().v3_ideal_y_angle * u.deg
-    return [_looks_at(*np.mean(places, axis=0), pa) for places in centers.values()], sorted(
-        detectors
-    )
+    fields = []
+    for places in centers.values():
+        fields.append(_looks_at(*np.mean(places, axis=0), pa))
+    return fields, sorted(detectors)
 
 
 def _looks_at(ra, dec, x, y, pa):

@@ -67,7 +67,10 @@ class ExposureHistory:
         steps = self.steps
         if isinstance(steps, str):
             steps = steps.replace(",", " ").split()
-        object.__setattr__(self, "steps", frozenset(str(name).lower() for name in steps))
+        done = []
+        for name in steps:
+            done.append(str(name).lower())
+        object.__setattr__(self, "steps", frozenset(done))
         for name in ("day", "gain"):
             value = getattr(self, name)
             if value is not None and not isinstance(value, numbers.Real):
@@ -142,7 +145,11 @@ class ExposureHistory:
             **{name: getattr(self, name) for name in ("day", "gain")},
             **{f"reference_{name}": text for name, text in self.references.items()},
         }
-        return {name: value for name, value in values.items() if value is not None}
+        recorded = {}
+        for name, value in values.items():
+            if value is not None:
+                recorded[name] = value
+        return recorded
 
     @property
     def simulated(self):

@@ -116,7 +116,10 @@ def companion(hdus, index, name):
     if len(same_version) == 1:
         # of a file with two images and one map the map is that of the first by chance
         return same_version[0]
-    alike = [hdu for hdu in hdus if hdu.name == image.name and plane_shape(hdu) is not None]
+    alike = []
+    for hdu in hdus:
+        if hdu.name == image.name and plane_shape(hdu) is not None:
+            alike.append(hdu)
     if len(named) == 1 and len(alike) <= 1:
         return named[0]
     return None

@@ -57,11 +57,11 @@ def steps_done(header):
     ... )
     ['dark', 'linearity']
     """
-    return frozenset(
-        step
-        for keyword, step in STEPS.items()
-        if str(header.get(keyword, "")).strip().upper() == "COMPLETE"
-    )
+    done = []
+    for keyword, step in STEPS.items():
+        if str(header.get(keyword, "")).strip().upper() == "COMPLETE":
+            done.append(step)
+    return frozenset(done)
 
 
 def joined_header(hdus, name="SCI"):

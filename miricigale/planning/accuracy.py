@@ -50,7 +50,10 @@ def columns_of(sources, agn_limit):
         "selected": weight * np.asarray(sources["selected"], bool),
         "found": weight * (agn & np.asarray(sources["selected"], bool)),
     }
-    return {name: np.asarray(values, float) for name, values in columns.items()}
+    arrays = {}
+    for name, values in columns.items():
+        arrays[name] = np.asarray(values, float)
+    return arrays
 
 
 def accuracy(sources, *, agn_limit=0.4, seed=0):

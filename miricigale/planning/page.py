@@ -49,7 +49,10 @@ def write_page(path, planner, plans, comparison, areas=None, *, overwrite=False)
     page.table("accuracy", rows)
     page.figure("figure", _comparison_figure(comparison))
     _write_exposures(page, config, miri, deepest)
-    shown = list({plan.name: plan for plan in (plans[0], best, deepest)}.values())
+    by_name = {}
+    for plan in (plans[0], best, deepest):
+        by_name[plan.name] = plan
+    shown = list(by_name.values())
     chosen = planner.common(plans)
     page.section("fits")
     fits = {plan.name: plan.sources[chosen] for plan in shown}
@@ -77,8 +80,11 @@ def answer(planner, plans, comparison):
     else:
         facts["mix"] = ""
     facts["bands"] = " + ".join(name.removeprefix("miri.").upper() for name in plan.bands)
+    times = []
+    for band in bands:
+        times.append(f"{band.time.to_value(u.s):.0f}")
     for key, values in {
-        "times": [f"{band.time.to_value(u.s):.0f}" for band in bands],
+        "times": times,
         "dithers": [str(band.n_dithers) for band in bands],
         "limits": [f"{band.errors().limiting_magnitude(band.filter).value:.1f}" for band in bands],
     }.items():
@@ -136,11 +142,14 @@ def _notices(page, planner):
 def _write_exposures(page, config, plans, full_plan):
     """The section on the exposures of all sets of bands, the one of most bands first."""
     n = config.exposures.pointings
+    hours = []
+    for band in full_plan.bands.values():
+        hours.append(band.time.to_value(u.h))
     page.section(
         "exposures",
         "budget" if config.exposures.hours else "text",
         plan=full_plan.name,
-        light=sum(band.time.to_value(u.h) for band in full_plan.bands.values()),
+        light=sum(hours),
         where="one pointing" if n == 1 else f"each of {n} pointings",
         area=full_plan.area.value,
         time=full_plan.time.to_value(u.h),

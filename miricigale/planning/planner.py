@@ -207,7 +207,10 @@ class Planner:
         low = float(np.max(_LEAST * group * dithers / times))
         shortest = charged(low)
         if shortest > exposures.hours:
-            names = ", ".join(name.removeprefix("miri.") for name in bands)
+            labels = []
+            for name in bands:
+                labels.append(name.removeprefix("miri."))
+            names = ", ".join(labels)
             raise config_error(
                 "[exposures] hours",
                 f"must be at least {shortest:.2f} for {names}, got {exposures.hours:g}",
@@ -252,12 +255,11 @@ class Planner:
         """
         table = QTable(self._existing, copy=True)
         for plan in plans:
-            if measured is None:
-                found = self._mock(plan)
-            else:
-                found = measured
+            photometry = measured
+            if photometry is None:
+                photometry = self._mock(plan)
             for column in (plan.filter, error_column(plan.filter)):
-                table[column] = found[column]
+                table[column] = photometry[column]
         return table
 
     def _mock(self, plan):
@@ -348,7 +350,11 @@ class Planner:
         """The table of sources of a `Plan`."""
         agn = self.config.agn
         source_columns = ("id", "redshift", "frac_agn", "sky")
-        table = self.sources[[name for name in source_columns if name in self.sources.colnames]]
+        columns = []
+        for name in source_columns:
+            if name in self.sources.colnames:
+                columns.append(name)
+        table = self.sources[columns]
         if plans:
             detected = detected_bands(photometry, list(plans))
         else:

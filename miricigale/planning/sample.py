@@ -143,7 +143,10 @@ def make_sample(config, bands, *, executor=None):
     light = library_fluxes(model, sources, list(bands))
     for name in bands:
         sources[name] = light[name]
-    usable = np.all([np.isfinite(sources[name].value) for name in bands], axis=0)
+    finite = []
+    for name in bands:
+        finite.append(np.isfinite(sources[name].value))
+    usable = np.all(finite, axis=0)
     sources = _cut(sources, usable, "the models")
     sources.meta = {"density": density, "agn": agn, "n_skies": n_skies}
     sources.meta["libraries"] = list(model.meta["libraries"])
@@ -199,8 +202,14 @@ def _by_luminosity(sources, options, rng):
     high = np.minimum(options.redshift[1], steps[-1]), np.minimum(options.luminosity[1], levels[-1])
     z, logs = (np.linspace(a, b, 201) for a, b in zip(low, high, strict=True))
     z, logs = (0.5 * (v[1:] + v[:-1]) for v in (z, logs))
-    at_levels = np.array([np.interp(logs, levels, row) for row in values])
-    fine = np.array([np.interp(z, steps, column) for column in at_levels.T]).T
+    levels_of_rows = []
+    for row in values:
+        levels_of_rows.append(np.interp(logs, levels, row))
+    at_levels = np.array(levels_of_rows)
+    columns = []
+    for column in at_levels.T:
+        columns.append(np.interp(z, steps, column))
+    fine = np.array(columns).T
     volume = model.cosmology.differential_comoving_volume(z).to_value(u.Mpc**3 / u.arcmin**2)
     cells = fine * volume[:, None] * (high[0] - low[0]) / 200 * (high[1] - low[1]) / 200
     wanted = "phi of at least 0, and not 0 everywhere"

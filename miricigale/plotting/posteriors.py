@@ -246,13 +246,13 @@ def plot_sed_fit(
         ax.set_xlabel("observed wavelength (µm)")
         return ax
     # a band that was left out may have an error that is none
-    stated = have & (err > 0)
-    pull = np.where(stated, (flux - model) / np.where(stated, err, 1.0), np.nan)
+    with_error = have & (err > 0)
+    pull = np.where(with_error, (flux - model) / np.where(with_error, err, 1.0), np.nan)
     residual_ax.axhline(0.0, color="0.6", linewidth=0.8)
     for rows, _, style in points:
         residual_ax.plot(wave[rows], pull[rows], **style)
     # of limits only those that the model passes have to be seen
-    shown_pull = stated & ~(limit & (pull > 0))
+    shown_pull = with_error & ~(limit & (pull > 0))
     size = np.nanmax(np.abs(pull[shown_pull]), initial=2.5) * 1.15
     if np.any(bound):
         residual_ax.errorbar(wave[bound], pull[bound], yerr=0.25 * size, **_ARROW)
@@ -261,15 +261,15 @@ def plot_sed_fit(
     return ax, residual_ax
 
 
-def _points(groups, used, limit):
+def _points(groups, is_used, limit):
     """Rows, label and style of the measured bands of each group, fitted (full) and not (open)."""
     if groups is None:
-        names = np.full(used.size, "")
+        names = np.full(is_used.size, "")
     else:
         names = np.asarray(groups, str)
     points = []
     for name, (color, marker) in zip(dict.fromkeys(names.tolist()), itertools.cycle(_GROUPS)):
-        for rows, fill in ((used, "full"), (~used, "none")):
+        for rows, fill in ((is_used, "full"), (~is_used, "none")):
             style = {"color": color, "marker": marker, "fillstyle": fill, "markersize": 5, "ls": ""}
             if name and fill == "full":
                 label = name

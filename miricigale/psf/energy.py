@@ -190,7 +190,10 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
     ----------- ------ ----------- ------- -----
     miri.f1500w  0.513       0.488   0.681 0.818
     """
-    psfs = [instrument_psf(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
+    sampled = []
+    for i, item in enumerate(psfs):
+        sampled.append(instrument_psf(item, f"psfs[{i}]"))
+    psfs = sampled
     names = [psf.filter or "" for psf in psfs]
     columns = {
         "filter": names,
@@ -207,6 +210,9 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
     texts = dict(declared("miricigale.psf", "columns.toml"))
     for radius in radii:
         name = f"eef_{radius.to_value(ANGLE):g}"
-        columns[name] = [encircled_energy(psf, radius) for psf in psfs]
+        energies = []
+        for psf in psfs:
+            energies.append(encircled_energy(psf, radius))
+        columns[name] = energies
         texts[name] = f"fraction of all light within {radius}"
     return described_columns(columns, texts)

@@ -149,9 +149,10 @@ def grid_weights(grid, x, y):
     hats = []
     for values, grid_nodes in ((x, positions[:, 0]), (y, positions[:, 1])):
         nodes = np.unique(grid_nodes)
-        hats.append(
-            [np.interp(values, nodes, (nodes == node).astype(float)) for node in grid_nodes]
-        )
+        hats_of_axis = []
+        for node in grid_nodes:
+            hats_of_axis.append(np.interp(values, nodes, (nodes == node).astype(float)))
+        hats.append(hats_of_axis)
     return (np.array(hats[0]) * np.array(hats[1])).T
 
 
@@ -191,11 +192,14 @@ def psf_at(grid, x, y):
         raise TypeError(msg)
     weights = grid_weights(grid, float(x), float(y))[0]
     grid_keys = ("oversampling", "grid_xypos", "grid_shape")
+    meta = {}
+    for name in SHARED:
+        meta[name] = getattr(grid, name)
     return InstrumentPSF(
         np.tensordot(weights, np.asarray(grid.data), axes=1),
         pixel_scale=weights @ grid.pixel_scales,
         oversampling=int(grid.oversampling[0]),
         position=(x, y),
         meta={key: value for key, value in grid.meta.items() if key not in grid_keys},
-        **{name: getattr(grid, name) for name in SHARED},
+        **meta,
     )

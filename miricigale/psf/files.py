@@ -211,10 +211,10 @@ class PSFFile:
             return make_psf(self.planes.mean(axis=0), **options)
         centers = np.array([core_position(data) for data in self.planes])
         middle = centers.mean(axis=0)
-        planes = [
-            _shifted(data, middle - center)
-            for data, center in zip(self.planes, centers, strict=True)
-        ]
+        centered = []
+        for plane, center in zip(self.planes, centers, strict=True):
+            centered.append(_shifted(plane, middle - center))
+        planes = centered
         return make_psf(np.mean(planes, axis=0), origin=tuple(middle), **options)
 
 

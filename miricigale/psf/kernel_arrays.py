@@ -38,6 +38,9 @@ def blended(kernels, weights=None):
     mean = {}
     for name in names:
         if getattr(kernels[0], name) is not None:
-            mean[name] = np.tensordot(w, [getattr(k, name) for k in kernels], axes=1)
+            planes = []
+            for k in kernels:
+                planes.append(getattr(k, name))
+            mean[name] = np.tensordot(w, planes, axes=1)
     meta = {"weights": w.tolist(), "lost": float(w @ [k.meta.get("lost", 0) for k in kernels])}
     return {**mean, "pixel_scale": kernels[0].pixel_scale, "meta": meta}

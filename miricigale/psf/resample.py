@@ -286,8 +286,11 @@ def psf_mosaic(
     axis = (np.arange(n) - n // 2) * cell
     # dithers of one roll are alike
     different, counts = np.unique(turns, return_counts=True)
+    stamps = []
+    for turn in different:
+        stamps.append(sampled(psf, axis, axis[:, None], turn, blurred))
     data = np.average(
-        [sampled(psf, axis, axis[:, None], turn, blurred) for turn in different],
+        stamps,
         axis=0,
         weights=counts,
     )

@@ -368,5 +368,7 @@ class StarPSF:
             mean = values / (weight + prior)
             return mean - mean.sum() * image
 
-        without_each = [mean_change(total[0] - part[0], total[1] - part[1]) for part in sums]
+        without_each = []
+        for left_out in sums:
+            without_each.append(mean_change(total[0] - left_out[0], total[1] - left_out[1]))
         return mean_change(total[0], total[1]), np.array(without_each)

@@ -61,7 +61,10 @@ def check_resources():
     >>> [row.name for row in check_resources() if row.bad]
     []
     """
-    return [_state(record) for record in resources().values()]
+    states = []
+    for record in resources().values():
+        states.append(_state(record))
+    return states
 
 
 def _state(record):

@@ -75,7 +75,10 @@ def resources():
     ['catalog.goodss', 'dust.dale2014', 'dust.dl07']
     """
     entries = declared("miricigale.refdata", "resources.toml").items()
-    return {name: Resource(name=name, **entry) for name, entry in entries}
+    records = {}
+    for name, entry in entries:
+        records[name] = Resource(name=name, **entry)
+    return records
 
 
 def resource(name):
@@ -107,7 +110,10 @@ def citations(*names):
     >>> citations("igm.inoue2014")
     ['Inoue et al. 2014, MNRAS 442, 1805']
     """
-    return sorted({resource(name).citation for name in names})
+    texts = set()
+    for name in names:
+        texts.add(resource(name).citation)
+    return sorted(texts)
 
 
 class Registry:

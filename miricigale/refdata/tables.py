@@ -14,7 +14,10 @@ def read_images(path, names, *, wanted):
     What ``wanted`` says that the file should be stands in the `DataError` if it is something else.
     """
     with file_errors(path, f"is not {wanted}"), open_fits(path, wanted=wanted) as hdus:
-        return {name: frozen_array(hdus[name].data) for name in names}
+        images = {}
+        for name in names:
+            images[name] = frozen_array(hdus[name].data)
+        return images
 
 
 @cached_by_file(maxsize=2)

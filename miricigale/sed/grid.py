@@ -165,8 +165,14 @@ class ModelGrid(Frozen):
     def __post_init__(self):
         new = {"filters": tuple(map(str, self.filters)), "meta": dict(self.meta)}
         new["recipe"] = dict(self.recipe)
-        new["axes"] = {name: frozen_array(values, float) for name, values in self.axes.items()}
-        new["bounds"] = {name: (float(a), float(b)) for name, (a, b) in self.bounds.items()}
+        arrays = {}
+        for name, values in self.axes.items():
+            arrays[name] = frozen_array(values, float)
+        new["axes"] = arrays
+        limits = {}
+        for name, (low, high) in self.bounds.items():
+            limits[name] = (float(low), float(high))
+        new["bounds"] = limits
         if self.agn is None:
             new["agn"] = np.zeros((len(self.redshift), 0, len(self.filters)))
         self.__dict__.update(new)

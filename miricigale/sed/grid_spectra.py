@@ -43,7 +43,11 @@ def band_names(grid, filters):
     else:
         by_name = {}
     names = list(by_name or filters)
-    return names, {name: by_name.get(name) for name in names if name not in grid.filters}
+    curves = {}
+    for name in names:
+        if name not in grid.filters:
+            curves[name] = by_name.get(name)
+    return names, curves
 
 
 def draw_fluxes(grid, index, scale, names, extra, model):

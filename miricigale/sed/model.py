@@ -337,7 +337,11 @@ class SEDModel(Interactive):
             "frac_agn_definition": self.frac_agn_definition if self.has_agn else None,
             "cosmology": f"H0={self.cosmology.H0.value:g}, Om0={self.cosmology.Om0:g}",
         }
-        return {name: value for name, value in out.items() if value is not None}
+        settings = {}
+        for name, value in out.items():
+            if value is not None:
+                settings[name] = value
+        return settings
 
     @property
     def meta(self):
@@ -373,9 +377,10 @@ class SEDModel(Interactive):
             xray_columns = xray.columns
         else:
             xray_columns = {}
-        return out | {
-            n: Derived(unit, text, False, "xray") for n, (unit, text) in xray_columns.items()
-        }
+        xray_derived = {}
+        for n, (unit, text) in xray_columns.items():
+            xray_derived[n] = Derived(unit, text, False, "xray")
+        return out | xray_derived
 
     def __getstate__(self):
         state = self.__dict__.copy()
@@ -410,7 +415,10 @@ class SEDModel(Interactive):
         ValueError
             If a value is outside its bounds, or the galaxy older than the universe.
         """
-        parameters = {_OTHER_NAMES.get(name, name): value for name, value in parameters.items()}
+        by_our_name = {}
+        for name, value in parameters.items():
+            by_our_name[_OTHER_NAMES.get(name, name)] = value
+        parameters = by_our_name
         parameters = tables.plain_mass(parameters)
         for name in parameters:
             if name not in self._parameters:

@@ -246,7 +246,11 @@ def grid_axes(name, *, agn=True):
     axes = _values(GRIDS[name][1])
     if agn:
         return axes
-    return {n: values for n, values in axes.items() if n not in _OF_AGN}
+    galaxy_axes = {}
+    for n, values in axes.items():
+        if n not in _OF_AGN:
+            galaxy_axes[n] = values
+    return galaxy_axes
 
 
 def red_dot_axes():

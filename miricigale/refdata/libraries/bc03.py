@@ -188,7 +188,11 @@ def _check_set(parts):
             "limits of mass": part.mass_limits == first.mass_limits,
             "ages": ages,
         }
-        differ = ", ".join(name for name, is_same in pairs.items() if not is_same)
+        differing = []
+        for name, is_same in pairs.items():
+            if not is_same:
+                differing.append(name)
+        differ = ", ".join(differing)
         check_data(not differ, other_file, f"and {file.name} are not one set: other {differ}")
         if metallicity in files:
             twice = f"the same metallicity as {files[metallicity].name}, {metallicity:g}"
@@ -198,7 +202,10 @@ def _check_set(parts):
 
 def _version(part):
     """Year of the version that made a file, by its second age, or None."""
-    years = [y for y, age in SECOND_AGE.items() if np.isclose(part.age[1], age, rtol=1e-3)]
+    years = []
+    for year, age in SECOND_AGE.items():
+        if np.isclose(part.age[1], age, rtol=1e-3):
+            years.append(year)
     if years:
         return years[0]
     return None
@@ -219,7 +226,10 @@ def _surviving(part, file):
     elif _version(part) is not None:
         take = _version(part) == 2003
     else:
-        ages = " or ".join(f"{second:g} yr ({year})" for year, second in SECOND_AGE.items())
+        ages_of_versions = []
+        for year, second in SECOND_AGE.items():
+            ages_of_versions.append(f"{second:g} yr ({year})")
+        ages = " or ".join(ages_of_versions)
         problem = "does not tell whether its mass of stars includes remnants: wanted a mass of gas"
         raise data_error(file, f"{problem}, or a second age of {ages}, got {part.age[1]:g} yr")
     if take:

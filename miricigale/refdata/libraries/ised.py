@@ -266,7 +266,10 @@ class _Records(_Source):
         if len(self.data) - self.at >= 16 + 3 * _TEXT:
             # four times lie between
             places += [self.at + _TEXT + 16, self.at + 2 * _TEXT + 16]
-        return [self.data[k : k + _TEXT].decode("latin-1").strip() for k in places]
+        texts = []
+        for start in places:
+            texts.append(self.data[start : start + _TEXT].decode("latin-1").strip())
+        return texts
 
 
 # ---------------------------------------------------------------------------- ASCII
@@ -304,7 +307,10 @@ class _Words(_Source):
 
     def texts(self):
         self._take(6)  # four times, a number and a truth value
-        return [line.strip() for line in itertools.islice(self.lines, 3)]
+        texts = []
+        for line in itertools.islice(self.lines, 3):
+            texts.append(line.strip())
+        return texts
 
 
 def _repeated(line):

@@ -71,7 +71,10 @@ def read_skirtor(path):
         wave, axes, spectra, files = _read_fits(path)
     else:
         wave, axes, spectra, files = _read_texts(path)
-    order = np.lexsort([axes[name] for name in reversed(SKIRTOR_AXES)])
+    keys = []
+    for name in reversed(SKIRTOR_AXES):
+        keys.append(axes[name])
+    order = np.lexsort(keys)
     axes = {name: np.asarray(axes[name])[order] for name in SKIRTOR_AXES}
     _check_product(path, axes)
     n = len(order)
@@ -81,11 +84,14 @@ def read_skirtor(path):
         part = f"a part of the library, {n:,} of {_WHOLE:,}"
     span = f"{wave.size} wavelengths, {wave[0]:g}-{wave[-1]:g} um"
     summary = (f"SKIRTOR 2016: {n:,} spectra ({part}) at {span}",)
+    ordered = {}
+    for name, array in spectra.items():
+        ordered[name] = array[order]
     return LibraryTable(
         name="torus.skirtor2016",
         wave=wave,
         axes=axes,
-        spectra={name: array[order] for name, array in spectra.items()},
+        spectra=ordered,
         units={"opening_angle": "deg", "inclination": "deg", "disk": "um-1", "dust": "um-1"},
         meta={
             "files": files,
@@ -224,7 +230,10 @@ def _read_fits(path):
     if lacking:
         raise data_error(path, f"is not {_WANTED}: its table has no column {lacking[0]}")
     with file_errors(path, "has another unit"):
-        table = {name: to_array(table[name], unit, name) for name, unit in _FITS_UNITS.items()}
+        columns = {}
+        for name, unit in _FITS_UNITS.items():
+            columns[name] = to_array(table[name], unit, name)
+        table = columns
     order = np.argsort(table["WAVE_REST"][0])
     wave = table["WAVE_REST"][0][order]
     if wave.shape != (_ROWS,) or not np.all(table["WAVE_REST"] == table["WAVE_REST"][0]):

@@ -85,7 +85,10 @@ class LibraryTable:
                 if kind == "axes" and not np.all(np.isfinite(column)):
                     raise argument_error(name, "finite in every row", "NaN or infinity")
         for kind in ("axes", "values"):
-            self.__dict__[kind] = {k: frozen_array(v) for k, v in getattr(self, kind).items()}
+            arrays = {}
+            for name, values in getattr(self, kind).items():
+                arrays[name] = frozen_array(values)
+            self.__dict__[kind] = arrays
         self.__dict__.update(summary=tuple(self.summary), _index=self._make_index())
 
     def _check_names(self):
@@ -94,7 +97,10 @@ class LibraryTable:
         check_that(self.axes and self.spectra, "axes", wanted, got)
         names = [*self.axes, *self.values, *self.spectra]
         # columns of a FITS table have names without case
-        if len({name.lower() for name in names}) < len(names):
+        lower_names = set()
+        for name in names:
+            lower_names.add(name.lower())
+        if len(lower_names) < len(names):
             raise argument_error("axes", "of other names than values and spectra", names)
         for name in names:
             if not (name.isascii() and name.isidentifier()):
@@ -136,9 +142,10 @@ class LibraryTable:
         index = dict(zip(places.tolist(), range(self.n_rows), strict=True))
         if len(index) < self.n_rows:
             row = next(i for i, place in enumerate(places.tolist()) if index[place] != i)
-            coordinates = ", ".join(
-                f"{name} = {column[row]:g}" for name, column in self.axes.items()
-            )
+            coordinates_of_row = []
+            for name, column in self.axes.items():
+                coordinates_of_row.append(f"{name} = {column[row]:g}")
+            coordinates = ", ".join(coordinates_of_row)
             got = f"{coordinates} in rows {row} and {index[places[row]]}"
             raise argument_error("axes", "different in every row", got)
         return index

@@ -308,11 +308,11 @@ class StudyRunner:
                 f"earlier version), and this run has another configuration, which would replace it: "
                 f"{advice} {edited} itself to use it"
             )
-        again = [key for key, state in states.items() if state in ("changed", "surplus")]
-        if again:
+        outdated = [key for key, state in states.items() if state in ("changed", "surplus")]
+        if outdated:
             reasons.append(
-                f"{self.folder} holds {len(again)} finished steps of another run ({self._differences(store)}), "
-                f"which would be done again or removed: {_summary(again)}"
+                f"{self.folder} holds {len(outdated)} finished steps of another run ({self._differences(store)}), "
+                f"which would be done again or removed: {_summary(outdated)}"
             )
         if reasons:
             raise OtherResultsError("; ".join(reasons), _REMEDY)

@@ -147,11 +147,11 @@ def _draw_zoom(ax, small, middle, number, shade):
     """Mark a square of a picture, and show it larger on other axes (``small``)."""
     from matplotlib.patches import Rectangle
 
-    left = middle[0] - _ZOOM / 2
+    left_edge = middle[0] - _ZOOM / 2
     bottom = middle[1] - _ZOOM / 2
     top = bottom + _ZOOM
-    ax.add_patch(Rectangle((left, bottom), _ZOOM, _ZOOM, fc="none", ec=shade, lw=1))
-    ax.text(left + 1, top - 1, number, color=shade, fontsize=7, va="top")
+    ax.add_patch(Rectangle((left_edge, bottom), _ZOOM, _ZOOM, fc="none", ec=shade, lw=1))
+    ax.text(left_edge + 1, top - 1, number, color=shade, fontsize=7, va="top")
     picture = ax.images[0]
     small.imshow(
         picture.get_array(),
@@ -161,8 +161,8 @@ def _draw_zoom(ax, small, middle, number, shade):
         cmap=picture.cmap,
         extent=picture.get_extent(),
     )
-    small.set(xlim=(left, left + _ZOOM), ylim=(bottom, top), xticks=[], yticks=[])
-    small.text(left + 0.5, top - 0.5, number, color=shade, fontsize=8, va="top")
+    small.set(xlim=(left_edge, left_edge + _ZOOM), ylim=(bottom, top), xticks=[], yticks=[])
+    small.text(left_edge + 0.5, top - 0.5, number, color=shade, fontsize=8, va="top")
 
 
 def residual_figure(images, names, *, size=220):
@@ -266,7 +266,7 @@ def convolution_figure(kernels):
 
     reach = min(k.target.shape[0] // 2 * k.pixel_scale.to_value(u.arcsec) for k in kernels.values())
     radius = np.linspace(0.03, min(2.5, reach), 60)
-    figure, [[left, right]] = new_figure(1, 2, size=(5.25, 3.4), sharex=True)
+    figure, [[left_ax, right_ax]] = new_figure(1, 2, size=(5.25, 3.4), sharex=True)
     largest = _SMALL_ERROR
     steps = np.linspace(0.0, 0.82, max(len(kernels), 2))
     for k, (name, kernel) in enumerate(kernels.items()):
@@ -274,17 +274,17 @@ def convolution_figure(kernels):
         before = 100 * energy_error(kernel.source, kernel.target, pixels)
         after = 100 * kernel.encircled_energy_error(radius * u.arcsec)
         style = {"color": colormaps["viridis"](steps[k]), "ls": ("-", "--")[k % 2], "lw": 1.6}
-        left.plot(radius, before, label=band_title(name), **style)
-        right.plot(radius, after, **style)
+        left_ax.plot(radius, before, label=band_title(name), **style)
+        right_ax.plot(radius, after, **style)
         largest = max(largest, np.nanmax(np.abs(after)))
-    for ax, when in ((left, "before"), (right, "after")):
+    for ax, when in ((left_ax, "before"), (right_ax, "after")):
         ax.axhline(0, color=TRUE, lw=0.8)
         ax.set_title(f"{when} convolution", fontsize="medium")
         ax.set_xlabel("radius (arcsec)")
-    right.axhspan(-_SMALL_ERROR, _SMALL_ERROR, color="0.92", zorder=0)
-    right.set_ylim(-1.15 * largest, 1.15 * largest)
-    left.set_ylabel("difference of encircled energy (%)")
-    legend(left, ncols=2)
+    right_ax.axhspan(-_SMALL_ERROR, _SMALL_ERROR, color="0.92", zorder=0)
+    right_ax.set_ylim(-1.15 * largest, 1.15 * largest)
+    left_ax.set_ylabel("difference of encircled energy (%)")
+    legend(left_ax, ncols=2)
     return figure
 
 

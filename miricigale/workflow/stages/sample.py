@@ -105,8 +105,8 @@ def good_redshifts(catalog, rules):
     good = np.ones(len(catalog), bool)
     wanted = "must be as 'column=value', '<=', '<', '>=' or '>', of a column of the catalog"
     for rule in rules:
-        column, *rest = re.split(r"\s*(<=|>=|<|>|=)\s*", rule.strip(), maxsplit=1)
-        sign, limit = rest or ("", "")
+        column, *comparison = re.split(r"\s*(<=|>=|<|>|=)\s*", rule.strip(), maxsplit=1)
+        sign, limit = comparison or ("", "")
         usable = limit and column in catalog.colnames
         require(usable, "fit", "redshift_quality", wanted, f"{rule!r}; {catalog.colnames}")
         values = np.ma.asarray(getattr(catalog[column], "value", catalog[column]))
