@@ -409,7 +409,7 @@ def read_psf(
     psf_file = PSFFile.open(path, ext=ext, plane=plane)
     header = psf_file.header
     if oversampling is None:
-        oversampling = int(header.get("OVERSAMP", 1))
+        oversampling = _stated_oversampling(path, header)
     pixel_scale = psf_file.pixel_scale(pixel_scale, oversampling=oversampling)
     if pixel_scale is None:
         raise argument_error("pixel_scale", "given where the header does not state it", None)
@@ -427,6 +427,17 @@ def read_psf(
     return psf_file.make_psf(
         pixel_scale=pixel_scale, frame=frame, oversampling=oversampling, angle=angle, **options
     )
+
+
+def _stated_oversampling(path, header):
+    """Read OVERSAMP of a header, 1 without it; a `DataError` unless it is a whole number."""
+    value = header.get("OVERSAMP", 1)
+    is_whole = isinstance(value, (int, float)) and value >= 1 and value == int(value)
+    if not is_whole:
+        raise data_error(
+            path, f"has an OVERSAMP of {value!r}, which is no whole number of 1 or more"
+        )
+    return int(value)
 
 
 def is_written(path):

@@ -115,6 +115,14 @@ def test_brackets_name_an_extension_everywhere(mosaic, tmp_path):
     refuses("no such extension", read_psf, f"{path}[9]", error=DataError)
 
 
+@pytest.mark.parametrize("oversampling", [2.5, 0, "four"])
+def test_oversampling_of_a_header_is_a_whole_number(oversampling, tmp_path):
+    path = tmp_path / "psf.fits"
+    header = fits.Header({"OVERSAMP": oversampling, "PIXELSCL": CELL})
+    fits.writeto(path, np.ones((9, 9)), header)
+    refuses("which is no whole number of 1 or more", read_psf, path, error=DataError)
+
+
 def test_planes_of_a_cube_are_named(tmp_path):
     path = tmp_path / "cube.fits"
     cube = np.stack([gaussian(fwhm=0.2), gaussian(fwhm=0.4)])
