@@ -20,6 +20,7 @@ _ROWS = "1 1\n2 2\n3 3\n"
         ("# wavelength [micron]  Fnu [microJy]\n", _ROWS),
         ("# a model at 7.7 um\n# lambda (nm), f_nu (nJy)\n", "1000 1000\n2000 2000\n3000 3000\n"),
         ("wave(um),flux(uJy)\n", _ROWS.replace(" ", ",")),
+        ("wave_um,flux_uJy\n", _ROWS.replace(" ", ",")),
     ],
 )
 def test_units_are_those_of_the_comments_or_names(tmp_path, head, rows):
@@ -40,11 +41,26 @@ def test_without_a_word_they_are_angstrom_and_flux_per_wavelength(tmp_path, head
     assert_allclose(spectrum.fnu.to_value(u.uJy), [3335.64095, 13342.5638], rtol=1e-8)
 
 
+def test_an_a_is_an_angstrom_and_units_of_fluxes_are_none_of_wavelengths(tmp_path):
+    path = tmp_path / "s.txt"
+    fluxes = []
+    heads = ("# wave (Angstrom) flux (1e-15 erg/s/cm^2/A)", "# wave(Angstrom) flux(1e-11 W/m2/um)")
+    for head, value in zip(heads, (1.0, 1e-3), strict=True):
+        path.write_text(f"{head}\n10000 {value}\n20000 {value}\n")
+        (spectrum,) = read_spectra(path).values()
+        fluxes.append(spectrum.fnu.to_value(u.uJy))
+    assert_allclose(fluxes[0], [3335.64095, 13342.5638], rtol=1e-8)
+    # 1 erg/s/cm2/Angstrom are 10 W/m2/um
+    assert_allclose(fluxes[1], fluxes[0], rtol=1e-8)
+
+
 @pytest.mark.parametrize(
     ("head", "message"),
     [
         ("# wave (um or nm) flux\n", "names um and nm as units"),
         ("# wave(um) flux(counts per bin)\n", "names 'counts per bin' as the unit of its fluxes"),
+        ("# frequency (Hz) fnu (Jy)\n", "frequencies or energies in place of wavelengths"),
+        ("# wave(AA) nuFnu(erg/s/cm2)\n", "fluxes times frequencies or wavelengths"),
         ("# wave fnu\n", "has fluxes per frequency without a unit"),
     ],
 )
