@@ -22,7 +22,8 @@ def extended_outliers(excess, good, threshold):
     Find places where an image is brighter than the other dithers, over many pixels.
 
     The excess is smoothed on three scales. Its noise is that of the smoothed map itself, below its median, so
-    that correlated noise counts, and light that is only positive does not.
+    that correlated noise counts, and light that is only positive does not. It is at least that of independent
+    pixels, for a small image has too few places of a large scale for it to be measured.
 
     Parameters
     ----------
@@ -40,6 +41,9 @@ def extended_outliers(excess, good, threshold):
     """
     values = np.clip(np.where(good, excess, 0.0), -_CLIP, _CLIP).astype(np.float32)
     extended = np.zeros(good.shape, bool)
+    if not good.any():
+        return extended
+    of_pixels = _lower_width(values[good])[1]
     for size, width, stricter in _SCALES:
         if size == 1:
             cells = values
@@ -53,8 +57,9 @@ def extended_outliers(excess, good, threshold):
         covered = (share >= 0.5) & (weight >= 0.3)
         if np.count_nonzero(covered) < _LEAST:
             continue
-        level, low = np.percentile(smooth[covered], (50.0, 15.87))
-        sigma = level - low
+        level, sigma = _lower_width(smooth[covered])
+        # a Gaussian weights 4 pi width^2 cells
+        sigma = max(sigma, of_pixels / (size * width * np.sqrt(4.0 * np.pi)))
         if not sigma > 0:
             continue
         significant = covered & (smooth - level > stricter * threshold * sigma)
@@ -62,3 +67,9 @@ def extended_outliers(excess, good, threshold):
         place = binary_propagation(significant, mask=surroundings)
         extended |= pixels_of(place, good.shape, size)
     return extended & good
+
+
+def _lower_width(values):
+    """Measure the median of values, and how far below it their 16th percentile is."""
+    level, low = np.percentile(values, (50.0, 15.87))
+    return level, level - low
