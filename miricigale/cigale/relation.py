@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting import FitFlags
-from miricigale.fitting.posterior.quantities import node_shares, put_draws
+from miricigale.fitting.posterior.quantities import draws_summary, node_shares, put_draws
 from miricigale.fitting.samplers.run import chi2_at
 from miricigale.utils.exceptions import FitWarning
 from miricigale.utils.parallel import chunks
@@ -62,6 +62,7 @@ def near_relation(fitter, photometry, results, max_deviation, *, redshift=None, 
             samples = fitter.sample(photometry[rows], N_DRAWS, seed=seed, redshift=z)
         is_near = _is_near(samples, max_deviation)
         values = {name: samples.values(name).value for name in results.parameters}
+        fluxes = samples.fluxes().value
         for j in np.flatnonzero(samples.fitted & results.fitted[rows]):
             i = range(len(results))[rows][j]
             draws_near = is_near[j]
@@ -70,10 +71,10 @@ def near_relation(fitter, photometry, results, max_deviation, *, redshift=None, 
                 continue
             index = samples.index[j][draws_near]
             scale = samples.scale[j][draws_near]
+            flux = fluxes[j][draws_near]
             mine = {name: array[j][draws_near] for name, array in values.items()}
             _summarize(results, new, i, index, mine)
             new["log_evidence"][i] += np.log(np.mean(draws_near))
-            flux = scale[:, None] * fitter.grid.flux(*np.maximum(index, 0).T)
             new["model_flux"][i] = flux.mean(axis=0)
             new["model_flux_std"][i] = flux.std(axis=0)
             if not _best_is_near(results, i, max_deviation):
@@ -83,7 +84,10 @@ def near_relation(fitter, photometry, results, max_deviation, *, redshift=None, 
 
 def _is_near(samples, max_deviation):
     """Which draws are near the relation, or have no AGN: shape (n, n_draws)."""
-    slope = samples.grid.agn_parameters["alpha_ox"].value[np.maximum(samples.index[..., 2], 0)]
+    if "alpha_ox" in samples.axes:
+        slope = samples.values("alpha_ox").value
+    else:
+        slope = samples.grid.agn_parameters["alpha_ox"].value[0]
     return ~(_distance(slope, samples.values("l_2500")) > max_deviation)
 
 
@@ -108,11 +112,18 @@ def _summarize(results, new, i, index, values):
     new["pdf_2d"][i] = node_shares((index[:, 0], index[:, 3]), new["pdf_2d"].shape[1:])
     for name, axis in results.axes.items():
         finite = values[name][np.isfinite(values[name])]
-        node = np.argmin(np.abs(finite[:, None] - axis.values), axis=1)
+        node = axis.cell_of(finite)
         # of parameters of an AGN that is not there the posterior is the prior
         n_lost = (len(index) - finite.size) * axis.weights
         new["pdf"][name][i] = (np.bincount(node, minlength=axis.values.size) + n_lost) / len(index)
     put_draws(results, new, i, values)
+    if results.axis_moments is None:
+        return
+    for j, name in enumerate(results.axes):
+        # between nodes parameters have moments and quantiles of their own
+        moments, quantiles = draws_summary(values[name])
+        new["axis_moments"][i, j] = moments[:2]
+        new["axis_quantiles"][i, j] = quantiles
 
 
 def _take_best(results, new, i, index, scale, flux, values):

@@ -718,7 +718,10 @@ class BayesFitter(Interactive):
         progress_bar=False,
     ):
         """
-        Draw models of the grid from the posterior of every object.
+        Draw models from the posterior of every object.
+
+        They are some of the models between the nodes that the results of `fit` rest on, in proportion to their
+        weights; where these are of nodes alone, models of the grid.
 
         Parameters
         ----------
@@ -727,7 +730,8 @@ class BayesFitter(Interactive):
         n_draws : int
             Draws for each object, independent and of equal weight.
         seed : int
-            Every object has its own stream, by its id: neither order nor workers change a draw.
+            Every object has its own stream, by its photometry (on nodes alone by its id): neither order nor
+            workers change a draw.
 
         Returns
         -------
@@ -754,7 +758,7 @@ class BayesFitter(Interactive):
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
         if self.nuclei:
-            msg = "draws of nodes are without nuclei: fitter.replace(nuclei=False).sample(...)"
+            msg = "draws are without nuclei: fitter.replace(nuclei=False).sample(...)"
             raise ValueError(msg)
         n_draws = check_count(n_draws, "n_draws")
         seed = check_seed(seed)

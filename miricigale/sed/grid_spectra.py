@@ -1,5 +1,7 @@
 """Fluxes and spectra of models of a grid, also in bands and wavelengths that it does not have."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from astropy.table import QTable
 
@@ -9,6 +11,33 @@ from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
+
+
+@dataclass(frozen=True, eq=False)
+class ListedModels:
+    """
+    Models that are none of a grid, for functions of this module that take one: model i is (i, i, i, i).
+
+    Parameters
+    ----------
+    redshift, frac_agn : `~numpy.ndarray`, shape (n,)
+        Their redshifts and AGN fractions.
+    galaxy_parameters, agn_parameters : `~astropy.table.QTable`
+        Their other parameters, n rows.
+    n_agn : int
+        Number of AGN models; 0 if the models have no AGN.
+    """
+
+    redshift: np.ndarray
+    frac_agn: np.ndarray
+    galaxy_parameters: QTable
+    agn_parameters: QTable
+    n_agn: int
+
+    @property
+    def index(self):
+        """Indices of all of them, shape (n, 4)."""
+        return np.tile(np.arange(len(self.redshift))[:, None], (1, 4))
 
 
 def check_model(model, grid):
@@ -108,7 +137,11 @@ def model_fluxes(model, grid, index, filters):
 
 
 def _factors(model, grid, index):
-    """L_nu in W/Hz of different galaxies (per solar mass) and AGN (per W), and their places."""
+    """
+    L_nu in W/Hz of different galaxies (per solar mass) and AGN (per W), and their places.
+
+    Last comes what AGN fractions refer to, in W for each solar mass, of the galaxies.
+    """
     chain = model.chain
     galaxies, galaxy = np.unique(index[:, 1], return_inverse=True)
     models, agn = np.unique(index[:, 2], return_inverse=True)
@@ -118,6 +151,10 @@ def _factors(model, grid, index):
     for i, row in enumerate(rows):
         if (excess := row.get("dust_excess", 1.0)) != 1.0:
             light[i] += (excess - 1.0) * absorbed[i] * chain.dust(keys[2][i])
+            absorbed[i] *= excess
+    reference = absorbed
+    if model.frac_agn_definition != "dust":
+        reference = chain.reference(light)
     nuclei = np.zeros((1, chain.wave.size))
     if grid.n_agn and np.any(grid.frac_agn[index[:, 3]] > 0):
         parts = [chain.agn(row_values(model, grid.agn_parameters, k)) for k in models.tolist()]
@@ -126,7 +163,7 @@ def _factors(model, grid, index):
             nuclei = nuclei / chain.reference(nuclei)[:, None]
     else:
         agn = np.zeros_like(agn)
-    return chain.lnu(light), galaxy.ravel(), chain.lnu(nuclei), agn.ravel()
+    return chain.lnu(light), galaxy.ravel(), chain.lnu(nuclei), agn.ravel(), reference
 
 
 def row_values(model, table, row):
@@ -147,9 +184,9 @@ def rest_spectra(model, grid, index, scale):
     in W/Hz, shape (n, n_wave).
     """
     index = plain_index(grid, index)
-    light, galaxy, nuclei, agn = _factors(model, grid, index)
+    light, galaxy, nuclei, agn, reference = _factors(model, grid, index)
     f = grid.frac_agn[index[:, 3]]
-    power = scale * f / (1.0 - f) * grid.dust_luminosity[index[:, 1]]
+    power = scale * f / (1.0 - f) * reference[galaxy]
     lnu = scale[:, None] * light[galaxy] + power[:, None] * nuclei[agn]
     return model.chain.wave, lnu
 

@@ -705,6 +705,13 @@ def test_x_ray_bands_are_fitted_where_there_is_a_module(three, tmp_path):
         got = results.mean(name)[0]
         assert got.value == pytest.approx(mean, abs=5 * std / np.sqrt(500)), name
     assert results.log_evidence[0] < fitter.fit(catalog, redshift=[0.5]).log_evidence[0]
+    # between nodes the numbers of parameters are those of the same draws as their distributions
+    results = setup.fit(catalog, compat=None)
+    for name in ("frac_agn", "ebv"):
+        if name in results.axes:
+            nodes = results.axes[name].values
+            cell = np.max(np.diff(nodes))
+            assert abs(results.mean(name)[0].value - results.pdf[name][0] @ nodes) < cell
     # without the module the band is left out, and reported
     setup = quiet(write(tmp_path, WITH_BAND))
     assert "band xray_boxcar_0p5to2keV (no module xray)" in setup.describe()

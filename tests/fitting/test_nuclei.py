@@ -253,7 +253,7 @@ def test_refuses(grid, catalog):
     table = catalog.copy()
     table.remove_column("band3_flux_point_err")
     refuses("the errors 'band3_flux_point_err' of 'band3_flux_point'", fitter.fit, table)
-    refuses("draws of nodes are without nuclei", fitter.sample, catalog, 10, seed=1)
+    refuses("draws are without nuclei", fitter.sample, catalog, 10, seed=1)
     table = catalog.copy()
     table["band1_nucleus"] = table["band1"]
     table["band1_nucleus_err"] = table["band1_err"]

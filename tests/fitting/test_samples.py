@@ -227,7 +227,7 @@ def test_files_that_are_no_samples_are_refused(real, grid, samples, tmp_path):
     path = tmp_path / "samples.fits"
     samples.write(path)
     with fits.open(path) as hdus:
-        assert hdus[0].header["FORMAT"] == "miricigale-samples-1"
+        assert hdus[0].header["FORMAT"] == "miricigale-samples-2"
     text = "'grid' must be the one of the samples, <ModelGrid 4 red"
     refuses(text, Samples.read, path, real.grid)
     text = "'grid' must be the ModelGrid that was fitted, got str"

@@ -354,6 +354,32 @@ class Continuation(Frozen):
             agn[present] = power[present, None] * light
         return nuclei.extended(flux, agn)
 
+    def draws(self, posterior, rows):
+        """
+        Parameters, derived quantities and fluxes of some models of a posterior.
+
+        Parameters
+        ----------
+        posterior : `BetweenPosterior`
+            The posterior.
+        rows : `~numpy.ndarray` of int, shape (n,)
+            Which of its models.
+
+        Returns
+        -------
+        index : `~numpy.ndarray` of int, shape (n, 4)
+            Models of the grid in whose cells they lie; see `index_of_nodes`.
+        values : dict of str to `~numpy.ndarray`, shape (n,)
+            Parameters and derived quantities.
+        flux : `~numpy.ndarray`, shape (n, nb)
+            Fluxes in uJy.
+        """
+        node = np.stack([posterior.node[name][rows] for name in self.axes], axis=1)
+        parameters = {name: value[rows] for name, value in posterior.values.items()}
+        derived = {name: value[rows] for name, value in posterior.derived.items()}
+        flux, _ = self.models.fluxes(parameters, parameters["redshift"], parameters["frac_agn"])
+        return self.index_of_nodes(node), derived | parameters, flux * derived["mass"][:, None]
+
     def _derived(self, values, models, scale):
         """Derive quantities by name, shape (n,), of models with scales (n,)."""
         return self.models.describe(values, values["redshift"], models.power, scale)

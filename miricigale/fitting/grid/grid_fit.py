@@ -11,6 +11,7 @@ from miricigale.fitting.data.settings import GridSettings
 from miricigale.fitting.data.template_error import TemplateError, grid_errors
 from miricigale.fitting.grid.between_results import between_results, with_axis_summaries
 from miricigale.fitting.grid.continuation import N_START, Continuation
+from miricigale.fitting.grid.drawn_models import draw_samples
 from miricigale.fitting.grid.grid import GridEngine
 from miricigale.fitting.grid.interpolation import InterpolatedModels
 from miricigale.fitting.grid.mixture import BandMixture
@@ -25,12 +26,10 @@ from miricigale.fitting.posterior.priors import (
 )
 from miricigale.fitting.posterior.quantities import Quantities, column_values
 from miricigale.fitting.results.results import CIGALE_LEAST_STD, FitResults
-from miricigale.fitting.results.samples import Samples
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_that
-from miricigale.utils.parallel import chunks, parallel_map
-from miricigale.utils.random import stream
+from miricigale.utils.parallel import chunks
 from miricigale.utils.units import MASS
 
 #: Best chi2 above which exp(-chi2 / 2) is below the smallest normal number for every model.
@@ -316,6 +315,24 @@ class GridFit:
 
     def _between_nodes(self, data, log_prior, pairs):
         """Results between nodes, and on nodes of objects that no model between them is possible for."""
+        posteriors = self.between_posteriors(data, log_prior)
+        parts = []
+        rows = np.array(sorted(posteriors), int)
+        if rows.size:
+            found = [posteriors[i] for i in rows]
+            parts.append(between_results(self, data[rows], found, pairs))
+        others = np.setdiff1d(np.arange(len(data)), rows)
+        if others.size or not parts:
+            on_nodes = self._on_nodes
+            if self.at_own_redshift(data):
+                on_nodes = self._at_redshifts
+            results = on_nodes(data[others], log_prior[others], pairs)
+            parts.append(with_axis_summaries(results))
+        order = np.argsort(np.concatenate([rows, others]), kind="stable")
+        return FitResults.concatenate(parts)[order]
+
+    def between_posteriors(self, data, log_prior):
+        """`BetweenPosterior` of the objects that a model between nodes is possible for: dict by row."""
         posteriors = {}
         fitted = np.isfinite(log_prior).any(axis=1)
         scanned = fitted & ~data.limit.any(axis=1)
@@ -326,30 +343,16 @@ class GridFit:
         others = np.flatnonzero(fitted & ~scanned)
         if others.size:
             self._sum_up(posteriors, data, log_prior, others)
-        posteriors = {i: posterior for i, posterior in posteriors.items() if posterior is not None}
-        parts = []
-        rows = np.array(sorted(posteriors), int)
-        if rows.size:
-            found = [posteriors[i] for i in rows]
-            parts.append(between_results(self, data[rows], found, pairs))
-        others = np.setdiff1d(np.arange(len(data)), rows)
-        if others.size or not parts:
-            on_nodes = self._on_nodes
-            if self._at_own_redshift(data):
-                on_nodes = self._at_redshifts
-            results = on_nodes(data[others], log_prior[others], pairs)
-            parts.append(with_axis_summaries(results))
-        order = np.argsort(np.concatenate([rows, others]), kind="stable")
-        return FitResults.concatenate(parts)[order]
+        return {i: posterior for i, posterior in posteriors.items() if posterior is not None}
 
-    def _at_own_redshift(self, data):
+    def at_own_redshift(self, data):
         """Whether objects are fitted at redshifts of their own, which are not those of nodes."""
         return data.redshift is not None and self.grid.redshift.size > 1
 
     def _scan(self, posteriors, data, log_prior, rows):
         """Put `BetweenPosterior` of some objects, without limits, into a dict by row; None if there is none."""
         nodes = None
-        at_redshift = self._at_own_redshift(data)
+        at_redshift = self.at_own_redshift(data)
         if at_redshift:
             nodes = np.argmax(log_prior[rows], axis=1)
 
@@ -368,7 +371,7 @@ class GridFit:
 
     def _sum_up(self, posteriors, data, log_prior, rows):
         """Do what `_scan` does, by way of the sums over all nodes, for objects with limits and priors of rates."""
-        if not self._at_own_redshift(data):
+        if not self.at_own_redshift(data):
 
             def place(known):
                 posterior = self.between.place(self.given.interpolate, known, None, 0.0)
@@ -552,25 +555,6 @@ class GridFit:
             best[name] = quantities.evaluate(name, grid, g, k, frac, scale)
         return best
 
-    # ----------------------------------------------------------------------- draws
-
     def sample(self, data, log_prior, n_draws, seed, **parallel):
         """Draw `~miricigale.fitting.Samples` of objects; ``parallel`` is for `parallel_map`."""
-        keys = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
-        keys = np.array(keys, dtype=np.int64)
-        slices = list(chunks(len(data), 16)) or [slice(0, 0)]
-        pieces = [(data[rows], log_prior[rows], keys[rows]) for rows in slices]
-        task = partial(_draw_piece, self.engine, n_draws)
-        parts = parallel_map(task, pieces, desc="draws", **parallel)
-        index = np.concatenate([part[0] for part in parts])
-        scale = np.concatenate([part[1] for part in parts])
-        flags = np.array(data.flags)
-        unfitted = ~np.isfinite(scale).all(axis=1) & ((flags & int(FitFlags.UNFITTED)) == 0)
-        flags[unfitted] |= int(FitFlags.NO_SIGNAL)
-        axes = self.priors.axes
-        return Samples(self.grid, data.ids, flags, index, scale, axes=axes, seed=seed)
-
-
-def _draw_piece(engine, n_draws, piece):
-    data, log_prior, seeds = piece
-    return engine.draw(n_draws=n_draws, seeds=seeds, **data.of_engine(log_prior))
+        return draw_samples(self, data, log_prior, n_draws, seed, **parallel)

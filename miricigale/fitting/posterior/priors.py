@@ -101,6 +101,17 @@ class GridAxis:
             high[0] = 0.0
         return low, high
 
+    def cell_of(self, values):
+        """Find the cells of `cells` in which values lie, the outermost for those beyond: indices."""
+        values = np.asarray(values, dtype=float)
+        if self.label:
+            return np.abs(values[..., None] - self.values).argmin(axis=-1)
+        middle = 0.5 * (self.values[1:] + self.values[:-1])
+        if not self.absent_at_zero:
+            return np.searchsorted(middle, values)
+        present = 1 + np.searchsorted(middle[1:], values)
+        return np.where(values > 0, present, 0)
+
 
 @cached(maxsize=1024)
 def _declared(components, name, attribute):

@@ -28,7 +28,9 @@ from miricigale.utils.tables import ascii_ids
 FORMAT = "miricigale-fitparts-2"
 
 _RESULTS = "miricigale-fitresults-4"
-_SAMPLES = "miricigale-samples-1"
+_SAMPLES = "miricigale-samples-2"
+#: What names of columns of values between nodes begin with.
+_DRAWN = "drawn:"
 _DICTS = ("pdf", "best")
 _TUPLES = ("filters", "quantities", "descriptions", "intensive", "fitted_filters")
 _AXIS = ("values", "unit", "kind", "weights", "bounds")
@@ -103,7 +105,12 @@ def write_samples(samples, path, *, overwrite=False):
         "grid": {"sha256": content_sha256(samples.grid), "text": repr(samples.grid)},
         "n_draws": samples.n_draws,
     }
-    table = Table(dict(samples._per_object()))
+    columns = {}
+    for name, array in samples._per_object():
+        if isinstance(array, np.ndarray):
+            columns[name] = array
+    columns |= {_DRAWN + name: array for name, array in samples.drawn.items()}
+    table = Table(columns)
     shares = {}
     for i, axis in enumerate(samples.axes.values()):
         if axis.share is not None:
@@ -123,6 +130,13 @@ def read_samples(path, grid, *, model=None):
         columns = {name: native(table[name]) for name in ("ids", "flags", "index", "scale")}
         columns["index"] = columns["index"].reshape(*shape, 4)
         columns["scale"] = columns["scale"].reshape(shape)
+        columns["drawn"] = {}
+        for name in table.colnames:
+            if name.startswith(_DRAWN):
+                array = native(table[name]).reshape(shape)
+                columns["drawn"][name.removeprefix(_DRAWN)] = array
+        if "flux" in table.colnames:
+            columns["flux"] = native(table["flux"]).reshape(*shape, len(grid.filters))
         shares = {}
         for i, name in enumerate(text["axes"]):
             if f"SHARE{i}" in parts:

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.posterior.posterior import FitRows, bin_edges, cell_edges, check_levels
@@ -16,7 +17,7 @@ from miricigale.fitting.results.percentile_columns import LEVELS, suffix
 from miricigale.sed import grid_spectra
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
-from miricigale.utils.object_rows import PerObject
+from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_table, error_column
@@ -32,9 +33,10 @@ class Samples(FitRows):
     """
     Models drawn from the posteriors of the objects of a catalog.
 
-    All draws of an object have the same weight. What a model is comes from the grid, so that
-    only four indices and a scale are kept for each. ``samples[id]`` and ``samples[rows]`` are of
-    this class too; of a single object the arrays have no axis of objects.
+    All draws of an object have the same weight. Draws on the nodes of a grid are models of it, of which only four
+    indices and a scale are kept. Draws between the nodes are some of the models that the results of a fit rest on,
+    with values and fluxes of their own. ``samples[id]`` and ``samples[rows]`` are of this class too; of a single
+    object the arrays have no axis of objects.
 
     Parameters
     ----------
@@ -46,7 +48,8 @@ class Samples(FitRows):
         `FitFlags`.
     index : array_like of int, shape (n, n_draws, 4)
         Redshift, galaxy, AGN model and AGN fraction of every draw, as indices of the grid; -1 for
-        objects that could not be fitted. Where the fraction is 0 the AGN model may be -1: none.
+        objects that could not be fitted. Where the fraction is 0 the AGN model may be -1: none. Of draws
+        between the nodes, those in whose cells they lie.
     scale : array_like, shape (n, n_draws)
         Solar masses formed.
     model : `~miricigale.sed.SEDModel`, optional
@@ -59,11 +62,16 @@ class Samples(FitRows):
         posterior is their prior.
     seed : int, optional
         Chooses values of parameters without effect.
+    drawn : dict of str to array_like, shape (n, n_draws), optional
+        Of draws between the nodes: parameters of the grid, redshift and AGN fraction among them, and derived
+        quantities, in their units. Empty on nodes.
+    flux : array_like, shape (n, n_draws, n_filters), optional
+        Of draws between the nodes: fluxes in the bands of the grid in uJy.
 
     Raises
     ------
     ValueError
-        If shapes do not agree or an index is not one of the grid.
+        If shapes do not agree, an index is not one of the grid, or values of draws between nodes are missing.
 
     Examples
     --------
@@ -91,6 +99,8 @@ class Samples(FitRows):
     meta: dict = field(default_factory=dict)
     axes: dict | None = None
     seed: int = 0
+    drawn: PerObjectDict = field(default_factory=dict)
+    flux: PerObject = None
 
     read, write = read_write(
         "draws (FITS: all but grid and model; ECSV: their table, not read back)",
@@ -109,6 +119,7 @@ model : `~miricigale.sed.SEDModel`, optional
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype))
         if self.axes is None:
             object.__setattr__(self, "axes", grid_priors(self.grid).axes)
+        self._check_drawn()
         super().__post_init__()
 
     def _check(self, n):
@@ -128,6 +139,35 @@ model : `~miricigale.sed.SEDModel`, optional
         if np.any((drawn[:, 2] < 0) & (grid.frac_agn[drawn[:, 3]] > 0)):
             wanted = "with an AGN model where the AGN fraction is above 0"
             raise argument_error("index", wanted, "none")
+
+    def _check_drawn(self):
+        """Refuse draws between nodes without all values, or of other shapes."""
+        if self.on_nodes:
+            check_that(self.flux is None, "flux", "None without 'drawn'", "an array")
+            return
+        shape = self.scale.shape
+        for name in self._drawn_names:
+            check_that(name in self.drawn, "drawn", f"with {name!r}", sorted(self.drawn))
+        drawn = {name: np.asarray(array, float) for name, array in self.drawn.items()}
+        for name, array in drawn.items():
+            check_that(
+                array.shape == shape, "drawn", f"of shape {shape}", f"{array.shape} ({name})"
+            )
+        object.__setattr__(self, "drawn", drawn)
+        shape = (*shape, len(self.grid.filters))
+        got = np.shape(self.flux)
+        check_that(got == shape, "flux", f"of shape {shape} with 'drawn'", got)
+        object.__setattr__(self, "flux", np.asarray(self.flux, float))
+
+    @property
+    def on_nodes(self):
+        """Whether draws are models of the grid, and not models between its nodes."""
+        return not self.drawn
+
+    @property
+    def _drawn_names(self):
+        """Names of all values of draws between nodes."""
+        return dict.fromkeys(("redshift", "frac_agn", *self.axes, *self._quantities.names))
 
     def __repr__(self):
         if self.isscalar:
@@ -195,7 +235,7 @@ model : `~miricigale.sed.SEDModel`, optional
         -------
         values : `~astropy.units.Quantity`, shape (n, n_draws)
             NaN for objects that could not be fitted, and for parameters of the AGN where a
-            draw has none.
+            draw has none. Parameters without effect have values of their prior.
         """
         name = self._named(name)
         rows = self._several()
@@ -205,6 +245,8 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def _values(self, name):
         """Look up values without their unit, shape (n, n_draws); of any model for objects without draws."""
+        if name in self.drawn:
+            return self.drawn[name]
         z, g, k, f = np.moveaxis(self.index, -1, 0)
         grid = self.grid
         axis = self.axes.get(name)
@@ -349,7 +391,11 @@ model : `~miricigale.sed.SEDModel`, optional
         values = self.loc[key]._fitted_one().values(name).value
         quantities = self._quantities
         if name in self.axes:
-            return values, cell_edges(self.axes[name].values, self.axes[name].bounds)
+            axis = self.axes[name]
+            if not self.on_nodes:
+                # counted as a fit does, where what is absent has a cell of its own
+                values = axis.values[axis.cell_of(values)]
+            return values, cell_edges(axis.values, axis.bounds)
         check_that(np.isfinite(values).any(), "name", "one with values in the draws", repr(name))
         extensive = name in quantities.names and name not in quantities.intensive
         return values, bin_edges(values, log=extensive)
@@ -363,7 +409,7 @@ model : `~miricigale.sed.SEDModel`, optional
         Parameters
         ----------
         filters : list of str or `~miricigale.filters.FilterSet`, optional
-            Any bands. Those of the grid (all of them by default) are read from it; for others
+            Any bands. Those of the grid (all of them by default) are known; for others
             the model is evaluated, every different model of the draws once.
 
         Returns
@@ -383,10 +429,54 @@ model : `~miricigale.sed.SEDModel`, optional
         rows = self._several()
         out = np.full((*rows.scale.shape, len(names)), np.nan)
         fitted = rows.fitted
+        if not self.on_nodes:
+            for i in np.flatnonzero(fitted):
+                out[i] = rows[int(i)]._fluxes_between(names, extra, model)
+            return out.reshape(*self.scale.shape, len(names)) * FNU
         out[fitted] = grid_spectra.draw_fluxes(
             self.grid, rows.index[fitted], rows.scale[fitted], names, extra, model
         )
         return out.reshape(*self.scale.shape, len(names)) * FNU
+
+    def _fluxes_between(self, names, extra, model):
+        """Fluxes of the draws between nodes of a single object, uJy, shape (n_draws, n_filters)."""
+        out = np.empty((self.n_draws, len(names)))
+        for j, name in enumerate(names):
+            if name not in extra:
+                out[:, j] = self.flux[:, self.grid.filters.index(name)]
+        if extra:
+            bands = []
+            for name, band in extra.items():
+                bands.append(name if band is None else band)
+            models, index = self._models()
+            flux = grid_spectra.model_fluxes(model, models, index, bands)
+            out[:, [names.index(name) for name in extra]] = flux * self.scale[:, None]
+        return out
+
+    def _models(self):
+        """Return the models of the draws of a single object, and their indices, (n_draws, 4)."""
+        if self.on_nodes:
+            return self.grid, self.index
+        grid = self.grid
+        models = grid_spectra.ListedModels(
+            redshift=self.drawn["redshift"],
+            frac_agn=self.drawn["frac_agn"],
+            galaxy_parameters=self._table_of(grid.galaxy_parameters, self.index[:, 1]),
+            agn_parameters=self._table_of(grid.agn_parameters, self.index[:, 2]),
+            n_agn=grid.n_agn,
+        )
+        return models, models.index
+
+    def _table_of(self, table, model):
+        """Parameters of draws between nodes, of which ``model``, (n_draws,), are the nearest rows of a table."""
+        out = QTable()
+        for name in table.colnames:
+            # draws without AGN have any AGN model
+            column = table[name][np.maximum(model, 0)]
+            if name in self.axes:
+                column = self.drawn[name] * (getattr(column, "unit", None) or 1.0)
+            out[name] = column
+        return out
 
     def _model(self):
         check_that(self.model is not None, "model", "an SEDModel (these samples know none)", "None")
@@ -451,7 +541,8 @@ model : `~miricigale.sed.SEDModel`, optional
         if rest:
             function = grid_spectra.rest_spectra
             unit = u.W / u.Hz
-        wave, values = function(self._model(), self.grid, draws.index, draws.scale)
+        models, index = draws._models()
+        wave, values = function(self._model(), models, index, draws.scale)
         return wave * WAVE, values * unit
 
     def sed_band(self, key, levels=LEVELS, *, rest=True):
@@ -523,7 +614,8 @@ model : `~miricigale.sed.SEDModel`, optional
         Returns
         -------
         axes : `~numpy.ndarray` of `~matplotlib.axes.Axes`, shape (n, n)
-            Of derived quantities the outermost 1 % of the draws are beyond the panels.
+            Parameters on nodes and labels of libraries have the cells of the grid. Of others and of derived
+            quantities the outermost 1 % of the draws are beyond the panels.
         """
         from miricigale.plotting.corner import plot_corner
 
@@ -556,7 +648,7 @@ model : `~miricigale.sed.SEDModel`, optional
     def _panel(self, name):
         """Return values of a single object, edges of their cells, and whether both are logarithms."""
         values = self.values(name).value
-        if name in self.axes:
+        if name in self.axes and (self.on_nodes or self.axes[name].label):
             axis = self.axes[name]
             return values, cell_edges(axis.values, axis.bounds), False
         good = values[np.isfinite(values)]
