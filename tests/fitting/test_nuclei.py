@@ -1,5 +1,6 @@
 """Fits to fluxes of nuclei beside total fluxes, against joint Gaussian likelihoods of all models."""
 
+from dataclasses import replace
 from functools import partial
 
 import astropy.units as u
@@ -17,6 +18,8 @@ N = 5
 #: Correlation of the nucleus with the total, by band.
 CORRELATION = {"band1": 0.5, "band3": -0.7, "band5": 0.0}
 NAMES = tuple(CORRELATION)
+#: Mixtures of good and wrong fluxes need bands of known wavelengths.
+REAL_BANDS = ("acs.f606w", "acs.f814w", "wfc3.f160w", "irac.ch1", "miri.f770w", "miri.f1500w")
 
 
 @pytest.fixture(scope="module")
@@ -172,6 +175,22 @@ def test_without_nuclei_nothing_changes(grid, catalog, interpolate):
         results = fitter.fit(table[:2])
         plain = fitter.replace(nuclei=False).fit(without(catalog, *NAMES)[:2])
     assert_allclose(results.pdf_2d[1], plain.pdf_2d[1], atol=1e-5 if interpolate == 0 else 0.1)
+
+
+def test_bands_that_cannot_be_wrong_change_nothing(grid, catalog):
+    """Also of nuclei: a prior fraction of next to nothing is none."""
+    bands = dict(zip(grid.filters, REAL_BANDS, strict=True))
+    table = catalog.copy()
+    for name in catalog.colnames:
+        band = name.partition("_")[0]
+        if band in bands:
+            table.rename_column(name, name.replace(band, bands[band]))
+    settings = GridSettings(interpolate=0)
+    fitter = BayesFitter(replace(grid, filters=REAL_BANDS), nuclei=True, settings=settings)
+    results = fitter.fit(table)
+    mixed = fitter.replace(outliers=1e-12).fit(table)
+    assert_allclose(mixed.pdf_2d, results.pdf_2d, atol=1e-3)
+    assert_allclose(mixed.chi2, results.chi2, rtol=1e-6)
 
 
 def test_redshifts_may_be_known(grid, catalog):
