@@ -296,7 +296,13 @@ def test_local_parts_go_where_weights_are_large():
 
     evidence, before = effective(parts)
     assert evidence == pytest.approx(1.0, abs=0.05)
-    scratch = (np.empty((n_axes + 2, n)), np.empty((4, n)), np.empty((2, 2)), np.empty((2, 2)))
+    scratch = (
+        np.empty((n_axes + 2, n)),
+        np.empty((4, n)),
+        np.empty((n_axes, n)),
+        np.empty((2, 2)),
+        np.empty((2, 2)),
+    )
     known = (points, np.full(n, 1.0 / n), np.exp(log_ridge(points)))
     _core.add_local_parts(_labels(n_axes), parts, 0, 1, n_local, 0.6, 160, 1.1, known, scratch)
     assert parts.share.sum() == pytest.approx(1.0)

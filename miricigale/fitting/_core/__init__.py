@@ -6,10 +6,11 @@ model that can matter are listed by their bounds (`pairs`, down to those of `flo
 (`batched_pairs`, `single` in single precision, `limits` with upper limits) and summed up (`sums`, `histogram`);
 `summarize` turns the sums into moments and quantiles. `weigh_masses` (`masses`) puts a prior of mass in,
 `find_models` (`mixture`) finds wrong bands. `interpolate_light` (`interpolation`) and `evaluate_places`
-(`population`, `nuclei`, `importance`) are of models between nodes. `structs` says what the kernels take and where
-it stands there, `workspace` makes it.
+(`population`, `nuclei`, `importance`) are of models between nodes, `allocation` says where more are wanted.
+`structs` says what the kernels take and where it stands there, `workspace` makes it.
 """
 
+from miricigale.fitting._core.allocation import allocate_places, make_group_sets
 from miricigale.fitting._core.evaluate import sum_up
 from miricigale.fitting._core.histogram import (
     N_SHARE,

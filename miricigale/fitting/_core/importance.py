@@ -387,12 +387,11 @@ def fit_parts(
 
 @njit(**PART)
 def _farthest_of(distance, n, n_near):
-    """Return a distance within which ``n_near`` of n points are, or a few more, and their number."""
+    """Return a distance within which ``n_near`` of n points are, or a few more."""
     low = 0.0
     high = 0.0
     for i in range(n):
         high = max(high, distance[i])
-    count = n
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         inside = 0
@@ -403,10 +402,9 @@ def _farthest_of(distance, n, n_near):
             low = middle
         else:
             high = middle
-            count = inside
-            if count < _ENOUGH * n_near:
+            if inside < _ENOUGH * n_near:
                 break
-    return high, count
+    return high
 
 
 @njit(**KERNEL)
@@ -433,10 +431,10 @@ def add_local_parts(labels, parts, first, n_base, n_local, share, n_near, wide, 
     points : tuple
         Scores of places of the group, shape (n, n_axes), their weights, which sum to 1, and the posterior in
         any unit, both of shape (n,).
-    scratch : tuple of `~numpy.ndarray`, shapes (n_axes + 2, n), (4, n), and two of (n_axes, n_axes)
+    scratch : tuple of `~numpy.ndarray`, shapes (n_axes + 2, n), (4, n), (n_axes, n), and two of (n_axes, n_axes)
     """
     y, weight, target = points
-    coordinate, rows_of_points, cov, cov_inverse = scratch
+    coordinate, rows_of_points, near, cov, cov_inverse = scratch
     n = len(weight)
     n_axes = y.shape[1]
     label = parts.label[first]
@@ -472,24 +470,28 @@ def add_local_parts(labels, parts, first, n_base, n_local, share, n_near, wide, 
         for a in range(n_active):
             mean[a] = coordinate[a, center]
         _squares(coordinate, n, n_active, mean, inverse, row, distance)
-        farthest, count = _farthest_of(distance, n, n_near)
+        farthest = _farthest_of(distance, n, n_near)
+        # those that are near, side by side
         total = 0.0
+        count = 0
         for i in range(n):
-            near_weight[i] = weight[i] if distance[i] <= farthest else 0.0
-            total += near_weight[i]
-        total = max(total, 1e-300)
-        for i in range(n):
-            # between the posterior and the places as they were drawn
-            near_weight[i] = 0.5 * near_weight[i] / total
             if distance[i] <= farthest:
-                near_weight[i] += 0.5 / count
+                for a in range(n_active):
+                    near[a, count] = coordinate[a, i] - mean[a]
+                near_weight[count] = weight[i]
+                total += weight[i]
+                count += 1
+        total = max(total, 1e-300)
+        for i in range(count):
+            # between the posterior and the places as they were drawn
+            near_weight[i] = 0.5 * near_weight[i] / total + 0.5 / count
         for a in range(n_active):
-            for i in range(n):
-                row[i] = near_weight[i] * (coordinate[a, i] - mean[a])
+            for i in range(count):
+                row[i] = near_weight[i] * near[a, i]
             for b in range(a + 1):
                 second = 0.0
-                for i in range(n):
-                    second += row[i] * (coordinate[b, i] - mean[b])
+                for i in range(count):
+                    second += row[i] * near[b, i]
                 cov[a, b] = wide * wide * second
             cov[a, a] += 1e-6
         _set_part(labels, parts, p, label, cov)

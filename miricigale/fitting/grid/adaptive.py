@@ -41,16 +41,12 @@ _N_TRIAL = 2048
 _MAX_SHORTAGE = 1.5
 #: A mixture is given up only if this many times the places of its trial may follow.
 _TRIAL_GROWTH = 2
-#: Weight above which a peak of redshift or a label has to have an effective number of its own.
-_MIN_COUNTED_WEIGHT = 0.02
-#: That number as a part of the effective number wanted in all.
+#: Effective number of a peak of redshift or a label that counts, as a part of that wanted in all.
 _EFFECTIVE_PART = 0.05
 #: Smallest such number.
 _MIN_EFFECTIVE = 30
 #: Smallest number of places with weights that results rest on.
 _MIN_RESULT_PLACES = 2048
-#: Smallest part of them in each label that has weight.
-_MIN_LABEL_SHARE = 0.03
 #: Part of the draws to begin with above which a label in a peak is pursued.
 _MIN_PURSUED = 0.01
 #: Share of the places that it has until its shape is found.
@@ -59,8 +55,6 @@ _PURSUED_SHARE = 0.06
 _MIN_FITTED_PLACES = 20
 #: Share of a mixture that is divided evenly among the labels, whatever their weight.
 _GUARD = 0.05
-#: Smallest efficiency, effective over number of places, that is believed of few places.
-_MIN_RATE = 0.05
 #: Smallest share of each peak of the nodes.
 _MIN_PEAK_SHARE = 0.05
 #: Weight of a node's redshift, over the largest, below which there is a gap between peaks.
@@ -244,7 +238,10 @@ class AdaptiveSampler:
         self.borders = borders
         self.peaks = peaks
         self.wanted = wanted
-        self.members = labels_of_ranges(labels)
+        table = np.arange(self.n_groups).reshape(-1, len(peaks))
+        parts = [table[members].ravel() for members in labels_of_ranges(labels)]
+        # each label, each peak, and each range of a component
+        self.sets = _core.make_group_sets([*table, *table.T, *parts])
         self.pursue = pursue
         self.scramble = scramble
         n_axes = len(space.size)
@@ -470,41 +467,15 @@ class AdaptiveSampler:
         """
         Compute the effective number of weights, whether it is enough, and places wanted in each label and peak.
 
-        Most is had of a number of places if that of each label and peak is as its weight over the root of its
-        efficiency (Neyman allocation). Labels, peaks, and components that count have enough of their own.
+        Labels, peaks, and components that count have enough of their own.
         """
         group = self._groups(self.label[rows], self.peak[rows])
-        total_weight = weight.sum()
-
-        def of_groups(values=None):
-            return np.bincount(group, values, minlength=self.n_groups)
-
-        group_weight = of_groups(weight)
-        square = of_groups(weight * weight)
-        n = of_groups()
-        # effective number of Kish 1965: the sum squared over the sum of squares
-        effective = total_weight**2 / square.sum()
-        enough = bool(effective >= self.wanted)
-        group_effective = np.square(group_weight) / np.maximum(square, 1e-300)
-        rate = np.clip(group_effective / np.maximum(n, 1), _MIN_RATE, 1.0)
-        part = group_weight / total_weight
-        wanted = self.wanted * part / np.sqrt(rate) * np.sum(part / np.sqrt(rate))
-        table = np.arange(n.size).reshape(-1, len(self.peaks))
-        parts = [table[members].ravel() for members in self.members]
         least_each = max(_EFFECTIVE_PART * self.wanted, _MIN_EFFECTIVE)
-        # each label, each peak, and each range of a component
-        for members in list(table) + list(table.T) + parts:
-            total = part[members].sum()
-            if total <= _MIN_COUNTED_WEIGHT:
-                continue
-            joint_effective = (total * total_weight) ** 2 / square[members].sum()
-            enough = enough and bool(joint_effective >= least_each)
-            min_places = least_each * part[members] / total / rate[members]
-            wanted[members] = np.maximum(wanted[members], min_places)
-        # labels and peaks of little weight so far may have more
-        has_weight = part > MIN_WEIGHT
-        wanted[has_weight] = np.maximum(wanted[has_weight], _MIN_LABEL_SHARE * wanted.sum())
-        return effective, enough, wanted
+        limits = (float(self.wanted), float(least_each), MIN_WEIGHT)
+        sums = np.empty((3, self.n_groups))
+        wanted = np.empty(self.n_groups)
+        effective, enough = _core.allocate_places(weight, group, self.sets, *limits, sums, wanted)
+        return effective, bool(enough), wanted
 
     def _guarded(self, share):
         """Raise shares of labels and peaks, so that each label, and each peak of the nodes, has some."""
