@@ -246,6 +246,7 @@ def _add_local_parts(labels, parts, group, places):
     scratch = (
         np.empty((n_axes + 2, rows.size)),
         np.empty((4, rows.size)),
+        np.empty((n_axes, rows.size)),
         np.empty((n_axes, n_axes)),
         np.empty((n_axes, n_axes)),
     )
