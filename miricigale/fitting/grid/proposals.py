@@ -167,8 +167,9 @@ def _groups(labels, n_peaks, places, n_local):
         share = share / share.sum()
     of_peak = flat.sum(axis=0)
     peaks = np.flatnonzero(of_peak > 0)
-    order = np.argsort(index, kind="stable")
-    ends = np.searchsorted(index[order], np.arange(n_groups + 1))
+    # whole numbers of few bits are sorted by counting them
+    order = np.argsort(index.astype(np.min_scalar_type(n_groups)), kind="stable")
+    ends = np.concatenate([[0], np.cumsum(np.bincount(index, minlength=n_groups))])
     groups = []
     first = 0
     for label in range(n_labels):
