@@ -7,6 +7,7 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from miricigale.fitting import _core
+from miricigale.utils.caching import cached
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +125,7 @@ class LabelTable:
         index = tuple(self.range_of[i][node[:, i]] for i in range(n_axes))
         label = self.of_range[index]
         all_axes = np.arange(n_axes)
-        uniform = qmc.Sobol(n_axes, seed=2).random(n)
+        uniform = places_in_cells(n_axes, n)
         labels = self.kernel
         share_below = self.kernel.below
         first = labels.first[label]
@@ -142,6 +143,24 @@ class LabelTable:
         for i, k in enumerate(labels.n_active):
             active[i, labels.axes[i, :k]] = True
         return label, np.where(active[label], score, ndtri(np.clip(uniform, 1e-6, 1.0 - 1e-6)))
+
+
+@cached(maxsize=8)
+def places_in_cells(n_axes, n):
+    """
+    Make quasi-random places in cells, the same for all objects.
+
+    Parameters
+    ----------
+    n_axes, n : int
+        Axes of the space, and number of places.
+
+    Returns
+    -------
+    place : `~numpy.ndarray`, shape (n, n_axes)
+        From 0 to 1.
+    """
+    return qmc.Sobol(n_axes, seed=2).random(n)
 
 
 def labels_of_ranges(labels):
