@@ -71,12 +71,18 @@ def own_segments(segmentation, labels, xy):
     label = np.array(labels, dtype=int)
     flags = np.where(label > 0, 0, int(ForcedFlags.NO_SEGMENT))
     values, counts = np.unique(label[label > 0], return_counts=True)
-    for value in values[counts > 1]:
+    shared = values[counts > 1]
+    places = []
+    if len(shared):
+        # the rectangle of each segment, so that no other pixels are looked at
+        places = scipy.ndimage.find_objects(segmentation)
+    for value in shared:
         rows = np.flatnonzero(label == value)
-        member = np.argwhere(segmentation == value)
         middle = np.zeros(2)
-        if len(member):
-            middle = member.mean(axis=0)
+        if value <= len(places) and places[value - 1] is not None:
+            place = places[value - 1]
+            corner = [place[0].start, place[1].start]
+            middle = (np.argwhere(segmentation[place] == value) + corner).mean(axis=0)
         distance = np.hypot(xy[rows, 1] - middle[0], xy[rows, 0] - middle[1])
         losers = np.delete(rows, np.nanargmin(np.nan_to_num(distance, nan=np.inf)))
         label[losers] = 0
