@@ -92,18 +92,19 @@ def _new_positions(fit, catalog):
     The false ones are taken to be as many as the negative of the residual shows, and those of Gaussian noise.
     Where the evidence decides (``second_pass`` is None) there are none unless they are few.
     """
-    diagnostics = diagnose(fit, catalog.xy)
     xy = catalog.xy + fit.displacement(catalog.xy)
     flux = np.full(len(xy), np.nan)
     flux[catalog.near_rows[fit.bank.order]] = fit.total
-    peaks = diagnostics.peaks
     usable = fit.arrays.usable
     decide = fit.settings.second_pass is None
+    model = fit.model()
+    residual = fit.residual(model)
     # a background that is not fitted is no source
-    residual = diagnostics.residual - usable * np.median(diagnostics.residual[usable])
+    level_residual = residual - usable * np.median(residual[usable])
     if decide:
-        peaks = residual_peaks(fit, residual, diagnostics.model, xy)
-    negative = residual_peaks(fit, -residual, diagnostics.model, xy)
+        residual = level_residual
+    peaks = residual_peaks(fit, residual, model, xy)
+    negative = residual_peaks(fit, -level_residual, model, xy)
     searched = usable if decide else None
     new = new_sources(peaks, xy, flux, usable=searched)
     false = new_sources(negative, xy, flux, usable=searched)
