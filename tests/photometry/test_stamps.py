@@ -11,6 +11,7 @@ from miricigale.photometry._core.stamps import (
     find_pairs,
     pair_products,
     projections,
+    residual_statistics,
     whiten_stamps,
 )
 
@@ -73,6 +74,27 @@ def test_sums_over_stamps_are_those_over_images():
     assert_allclose(found, one * noise, rtol=1e-6)
     parts = one, one * (noise > 0), one**2, found**2
     assert_allclose(sums, np.transpose([np.sum(p, axis=(1, 2)) for p in parts]), rtol=1e-12)
+
+
+def test_statistics_of_stamps_are_sums_of_images_over_their_cores():
+    box = boxes(30, 6)
+    values, start = flat(box, 7)
+    rng = np.random.default_rng(8)
+    residual, light = rng.normal(size=(2, *SHAPE)).astype(np.float32)
+    inverse_sigma = rng.uniform(0.5, 2.0, SHAPE).astype(np.float32)
+    inverse_sigma[rng.random(SHAPE) < 0.2] = 0.0
+    sums = np.empty((len(box), 4))
+    residual_statistics(values, box, start, residual, light, inverse_sigma, sums)
+    for row, template in zip(sums, dense(box, values, start), strict=True):
+        usable = (template > 0) & (inverse_sigma > 0)
+        core = usable & (template > 0.1 * template.max())
+        wanted = [residual[core].sum(), light[core].sum(), template[core].sum()]
+        assert_allclose(row[1:], wanted, rtol=1e-5, atol=1e-5)
+        if usable.any():
+            chi2 = (residual * inverse_sigma)[usable] ** 2
+            assert_allclose(row[0], np.average(chi2, weights=template[usable]), rtol=1e-5)
+        else:
+            assert np.isnan(row[0])
 
 
 def test_sampled_stamps_are_splines_times_the_area_of_the_pixel():

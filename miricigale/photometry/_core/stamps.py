@@ -183,38 +183,46 @@ def add_model(image, values, box, start, flux):
 
 
 @njit(cache=True, nogil=True)
-def residual_statistics(values, box, start, residual, inverse_sigma, out):
+def residual_statistics(values, box, start, residual, light, inverse_sigma, out):
     """
-    Sum the template-weighted mean of (residual / sigma)^2, and the residual below the core.
+    Sum the template-weighted mean of (residual / sigma)^2, and residual and light below the core.
 
-    ``out`` has the shape (n, 3): mean square, sum of residuals over pixels where the
-    template exceeds a tenth of its peak, and the template's own sum there.
+    ``residual`` and ``light`` are images, (ny, nx). ``out`` has the shape (n, 4): mean square, sums of residual
+    and light over pixels where the template exceeds a tenth of its peak, and the template's own sum there.
     """
     for k in range(box.shape[0]):
         peak = 0.0
         for n in range(start[k], start[k + 1]):
             peak = max(peak, values[n])
         n = start[k]
+        nx = box[k, 3]
         square = 0.0
         weight = 0.0
         residual_sum = 0.0
+        light_sum = 0.0
         core = 0.0
         for y in range(box[k, 0], box[k, 0] + box[k, 2]):
-            for x in range(box[k, 1], box[k, 1] + box[k, 3]):
-                t = values[n]
-                if t > 0.0 and inverse_sigma[y, x] > 0.0:
-                    r = residual[y, x]
+            row = values[n : n + nx]
+            noise = inverse_sigma[y, box[k, 1] : box[k, 1] + nx]
+            residual_row = residual[y, box[k, 1] : box[k, 1] + nx]
+            light_row = light[y, box[k, 1] : box[k, 1] + nx]
+            for x in range(nx):
+                t = row[x]
+                if t > 0.0 and noise[x] > 0.0:
+                    r = residual_row[x]
                     # chi of the pixel, weighted by the template
-                    z = r * inverse_sigma[y, x]
+                    z = r * noise[x]
                     square += t * z * z
                     weight += t
                     if t > 0.1 * peak:
                         residual_sum += r
+                        light_sum += light_row[x]
                         core += t
-                n += 1
+            n += nx
         out[k, 0] = square / weight if weight > 0.0 else np.nan
         out[k, 1] = residual_sum
-        out[k, 2] = core
+        out[k, 2] = light_sum
+        out[k, 3] = core
 
 
 @njit(cache=True, nogil=True)

@@ -45,7 +45,7 @@ def diagnose(fit, xy):
     if fit.settings.errors.correlated_noise and len(fit.rows):
         correlation = _correlation(fit, residual, model)
     # the image is its model and the residual
-    chi2, residual_light, core, core_light, rim = _statistics(
+    chi2, residual_light, core_light, core, rim = _statistics(
         fit, residual, residual + fit.arrays.usable * model
     ).T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -96,11 +96,11 @@ def _statistics(fit, residual, light):
     """
     Sum up the images where each template is, shape (n, 5).
 
-    Chi2, residual and light of each template's core (see the kernel), the image's light below it, and the part of
-    the template that is on the rim.
+    Chi2, residual, light and template of each template's core (see the kernel), and the part of the template that
+    is on the rim.
     """
     n = len(fit.bank.order)
-    out = np.full((2, n, 3), np.nan)
+    statistics = np.full((n, 4), np.nan)
     rim_light = np.zeros(n)
     if len(fit.rows):
         rim = rim_pixels(fit.arrays.usable)
@@ -109,15 +109,13 @@ def _statistics(fit, residual, light):
             def measure(part, block=block):
                 rows = slice(block.first + part.start, block.first + part.stop)
                 values, box, start = block.stamps_of(part)
-                for image, statistics in zip((residual, light), out, strict=True):
-                    residual_statistics(
-                        values, box, start, image, fit.inverse_sigma, statistics[rows]
-                    )
+                residual_statistics(
+                    values, box, start, residual, light, fit.inverse_sigma, statistics[rows]
+                )
                 rim_light[rows] = _light_on(rim, values, box, start)
 
             fit.bank.map(measure, block.parts())
-    core_light = out[1, :, 1]
-    return np.column_stack([out[0], core_light, rim_light / fit.bank.full_light()])
+    return np.column_stack([statistics, rim_light / fit.bank.full_light()])
 
 
 def rim_pixels(usable):

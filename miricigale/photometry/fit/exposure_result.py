@@ -276,14 +276,15 @@ def _compared(fit, models, residuals):
         area = part.arrays.areas()
         source = part.row_source
         row_light = np.zeros(len(part.source))
-        statistics, light_statistics = np.full((2, len(part.source), 3), np.nan)
+        statistics = np.full((len(part.source), 4), np.nan)
         residual_flux = np.asarray(residual * area, np.float32)
         # an exposure is its model and the residual
         light = residual_flux + part.arrays.usable * np.asarray(model * area, np.float32)
         for block in part.bank.blocks():
             rows = slice(block.first, block.last)
-            for image, sums in ((residual_flux, statistics), (light, light_statistics)):
-                residual_statistics(*block.stamps, image, part.inverse_sigma, sums[rows])
+            residual_statistics(
+                *block.stamps, residual_flux, light, part.inverse_sigma, statistics[rows]
+            )
             for row, (first, last) in enumerate(itertools.pairwise(block.start)):
                 row_light[block.first + row] = block.values[first:last].sum()
         # sums over exposures by source, chi^2 weighted with the template's light
@@ -291,8 +292,8 @@ def _compared(fit, models, residuals):
         np.add.at(square, source[good], (row_light * statistics[:, 0])[good])
         np.add.at(weight, source[good], row_light[good])
         np.add.at(light_left, source[good], statistics[good, 1])
-        np.add.at(core_light, source[good], light_statistics[good, 1])
-        np.add.at(core, source[good], statistics[good, 2])
+        np.add.at(core_light, source[good], statistics[good, 2])
+        np.add.at(core, source[good], statistics[good, 3])
         checks.append(
             _noise_check(
                 residual_flux * part.inverse_sigma, model * area * part.inverse_sigma, part
