@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 
 from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.detection.residual_sources import ResidualPeaks, residual_peaks
@@ -104,6 +103,7 @@ def _statistics(fit, residual, light):
     rim_light = np.zeros(n)
     if len(fit.rows):
         rim = rim_pixels(fit.arrays.usable)
+        has_rim = rim.any()
         for block in fit.bank.blocks():
 
             def measure(part, block=block):
@@ -112,7 +112,8 @@ def _statistics(fit, residual, light):
                 residual_statistics(
                     values, box, start, residual, light, fit.inverse_sigma, statistics[rows]
                 )
-                rim_light[rows] = _light_on(rim, values, box, start)
+                if has_rim:
+                    rim_light[rows] = _light_on(rim, values, box, start)
 
             fit.bank.map(measure, block.parts())
     return np.column_stack([statistics, rim_light / fit.bank.full_light()])
@@ -134,8 +135,17 @@ def rim_pixels(usable):
     -------
     rim : `~numpy.ndarray` of bool, shape (ny, nx)
     """
+    if usable[[0, -1]].all() and usable[:, [0, -1]].all():
+        # rows and columns begin and end with data
+        return np.zeros_like(usable)
     rows, columns = np.ogrid[: usable.shape[0], : usable.shape[1]]
-    return usable & binary_dilation(_is_beyond(_ends(usable), rows, columns))
+    is_beyond = _is_beyond(_ends(usable), rows, columns)
+    rim = np.zeros_like(usable)
+    rim[1:] |= is_beyond[:-1]
+    rim[:-1] |= is_beyond[1:]
+    rim[:, 1:] |= is_beyond[:, :-1]
+    rim[:, :-1] |= is_beyond[:, 1:]
+    return rim & usable
 
 
 def _light_on(mask, values, boxes, starts):
