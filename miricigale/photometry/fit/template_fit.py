@@ -437,7 +437,7 @@ class TemplateFit:
         """Subtract a model of the sources, and the background, from the image; zero where not usable."""
         residual = np.subtract(self.arrays.flux, model, out=self.arrays.new())
         self.add_background(residual, -1.0)
-        residual *= self.arrays.usable
+        residual[~self.arrays.usable] = 0.0
         return residual
 
 
