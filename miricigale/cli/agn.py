@@ -20,7 +20,10 @@ def agn(args):
         log_luminosity=tuple(args.luminosity_bins),
         **chosen(args, "limit n_injections seed"),
     )
-    hdu = int(args.hdu) if (args.hdu or "").isdigit() else args.hdu
+    if (args.hdu or "").isdigit():
+        hdu = int(args.hdu)
+    else:
+        hdu = args.hdu
     if args.plan:
         print(_plan(args, hdu))
         return 0

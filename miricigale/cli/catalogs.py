@@ -49,12 +49,18 @@ def fit(args):
         if args.plots:
             from miricigale.fitting.results.object_plots import write_plots
 
-            ids = None if args.plots == ["all"] else args.plots
+            if args.plots == ["all"]:
+                ids = None
+            else:
+                ids = args.plots
             options = {"overwrite": True, "progress_bar": not args.no_progress}
             write_plots(results["galaxy"], args.output / "plots", ids, **options)
     except KeyboardInterrupt:
         n_parts = len(list(args.output.glob("part-*.fits")))
-        command = "the same command" if args.resume else "the same command, without --no-resume,"
+        if args.resume:
+            command = "the same command"
+        else:
+            command = "the same command, without --no-resume,"
         args.stopped = (
             f"stopped; {n_parts} finished parts are in {args.output}/; {command} resumes here"
         )
@@ -135,7 +141,10 @@ def photometry(args):
     options["kernel"] = args.kernel
     if args.kernel:
         options["kernel"] = [None if name == "-" else name for name in args.kernel]
-    options["output"] = None if str(args.output) == "-" else args.output
+    if str(args.output) == "-":
+        options["output"] = None
+    else:
+        options["output"] = args.output
     options["n_threads"] = args.threads
     options["progress_bar"] = not args.no_progress
     if args.patches is None:

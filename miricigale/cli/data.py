@@ -27,7 +27,10 @@ def data_list(args):
         return 1
     width = min(shutil.get_terminal_size((100, 24)).columns, 120)
     for name, record in records.items():
-        path = find_resource(name) if record.file else None
+        if record.file:
+            path = find_resource(name)
+        else:
+            path = None
         if path is not None:
             state = str(path)
         elif not record.file:

@@ -26,7 +26,9 @@ def reduce(args):
     print(
         f"{len(table) - len(failed)} of {len(table)} products; page: {args.output / 'index.html'}"
     )
-    return 1 if len(failed) else 0
+    if len(failed):
+        return 1
+    return 0
 
 
 def reducer_of(args):

@@ -32,7 +32,9 @@ class Parser(argparse.ArgumentParser):
 def _nearest(name, names):
     """Say which name may be meant; empty if none is near."""
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return ""
 
 
 def quantity_in(unit):
@@ -163,7 +165,10 @@ def _add_options(parser, options, words):
         if option.get("heading", title) != title:
             title = option["heading"]
             section = parser.add_argument_group(title)
-        target = section if flags.startswith("-") else parser
+        if flags.startswith("-"):
+            target = section
+        else:
+            target = parser
         _add(target, groups, flags, option, words)
 
 

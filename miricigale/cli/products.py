@@ -94,7 +94,10 @@ def show(args):
         return 0
     wanted = "left out for what has no picture"
     check_that(hasattr(product, "plot"), "picture", wanted, type(product).__name__)
-    picture = args.picture if args.picture.name else Path(f"{args.file.name}.png")
+    if args.picture.name:
+        picture = args.picture
+    else:
+        picture = Path(f"{args.file.name}.png")
     check_output(picture, "picture", overwrite=args.overwrite, inputs=[args.file])
     from matplotlib import pyplot as plt
 
@@ -210,7 +213,10 @@ def bibtex(citations):
             lines = [f"  author = {{{authors}}}", f"  year = {{{match['year']}}}"]
             word += match["year"]
         n_keys[word] += 1
-        key = word if n_keys[word] == 1 else f"{word}_{n_keys[word]}"
+        if n_keys[word] == 1:
+            key = word
+        else:
+            key = f"{word}_{n_keys[word]}"
         note = re.sub(r"([&%#_$])", r"\\\1", text)
         lines.append(f"  note = {{{note}}}")
         entries.append(f"@misc{{{key},\n" + ",\n".join(lines) + "\n}")

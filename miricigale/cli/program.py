@@ -27,7 +27,8 @@ def main(argv=None):
     status : int
         0 if all went well, 2 for input that cannot be used, 130 if interrupted, 143 if terminated.
     """
-    argv = sys.argv[1:] if argv is None else argv
+    if argv is None:
+        argv = sys.argv[1:]
     parser = make_parser(argv)
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete
@@ -70,7 +71,10 @@ def _sentence(err):
     """Return the message of an error in one line."""
     if not isinstance(err, KeyError):
         return " ".join(str(err).split())
-    message = str(err.args[0]) if err.args else ""
+    if err.args:
+        message = str(err.args[0])
+    else:
+        message = ""
     if " " in message:
         return " ".join(message.split())
     # the message of a KeyError may be the key alone

@@ -47,7 +47,10 @@ def run(args):
             **chosen(args, "redo until again"),
             progress_bar=not args.no_progress,
         )
-    products = f"report: {report}" if args.until is None else f"products: {folder}"
+    if args.until is None:
+        products = f"report: {report}"
+    else:
+        products = f"products: {folder}"
     print(f"done in {(time.monotonic() - begin) / 60:.1f} min; {products}")
     return 0
 

@@ -42,7 +42,9 @@ def _read(level):
 
 def of_filter(values, k):
     """Return the value of the k-th filter, of values of all filters or a single one for all."""
-    return values[k] if len(values) > 1 else values[0]
+    if len(values) > 1:
+        return values[k]
+    return values[0]
 
 
 def text_by_filter(texts):

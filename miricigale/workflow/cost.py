@@ -96,7 +96,10 @@ class _Size:
         self.native = _n_pixels(config, config.reduction.pixel_scale, patches)
         self.fine = _n_pixels(config, config.highres.pixel_scale, patches)
         # patches have no mosaics on the prior's pixels
-        self.drizzled = 0 if config.patches.size else self.fine
+        if config.patches.size:
+            self.drizzled = 0
+        else:
+            self.drizzled = self.fine
         self.n_bands = len(config.exposures.filters)
         self.n_sets = len(config.fit.sets)
         self.n_kernels = len(patch_bands(config))
@@ -133,7 +136,10 @@ class _Size:
             elif exposure.dither == 0:
                 # slopes of one dither of each band of the reference
                 n_rates += pixels[name]
-        measured = self.fine if config.photometry.method == "yang2021" else self.native
+        if config.photometry.method == "yang2021":
+            measured = self.fine
+        else:
+            measured = self.native
         pointed = min(2, self.n_bands) / len(study_pointings(config)) * config.point_sources.enabled
         n = self.n
         truths = self.truths

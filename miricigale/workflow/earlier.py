@@ -48,7 +48,10 @@ def keys_of_today(values, earlier):
     """
     sections = {}
     for name, entries in values.items():
-        sections[name] = dict(entries) if isinstance(entries, dict) else entries
+        if isinstance(entries, dict):
+            sections[name] = dict(entries)
+        else:
+            sections[name] = entries
     renamed = []
     gone = []
     refused = []

@@ -141,7 +141,9 @@ _sources = cached_by_file(1, copies=True)(read_catalog)
 
 def _catalog(inputs):
     """Return ids and positions of the sources, if there is a catalog."""
-    return None if inputs.catalog is None else _sources(inputs.catalog)["id", "sky"]
+    if inputs.catalog is None:
+        return None
+    return _sources(inputs.catalog)["id", "sky"]
 
 
 _SECTIONS = ("files", "patches")

@@ -64,7 +64,10 @@ class Perturbation:
         if "psf" in self.effects:
             # the same telescope in all bands
             seed = int(self._random("psf").integers(2, 2**31))
-        model = psf.miri_psf(filter) if seed is None else psf.miri_psf(filter, seed=seed)
+        if seed is None:
+            model = psf.miri_psf(filter)
+        else:
+            model = psf.miri_psf(filter, seed=seed)
         factor = 1.0 + self._signed("psf_width", filter)
         if factor == 1.0:
             return model
@@ -135,7 +138,9 @@ class Perturbation:
 
     def point_column(self, filter):
         """Return the column of a catalog with the share of the light that is in a point, or None."""
-        return point_column(filter) if "point_agn" in self.effects else None
+        if "point_agn" in self.effects:
+            return point_column(filter)
+        return None
 
     @functools.cached_property
     def detector(self):

@@ -41,7 +41,9 @@ _CLASSES = (
 
 def absolute(path):
     """Return the same path for workers, which have another working directory; None stays."""
-    return None if path is None else os.path.abspath(path)
+    if path is None:
+        return None
+    return os.path.abspath(path)
 
 
 def _field_values(instance):

@@ -115,7 +115,9 @@ class PointingSection(Section):
         if len(self.centers) != 1:
             return None
         path = Path(self.centers[0]).expanduser()
-        return path if path.is_file() else None
+        if path.is_file():
+            return path
+        return None
 
 
 def _is_position(text):

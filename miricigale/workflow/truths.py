@@ -106,7 +106,9 @@ def perturbed_values(config):
 
 
 def _name(frac_agn):
-    return frac_agn if isinstance(frac_agn, str) else f"agn{100 * frac_agn:02.9g}"
+    if isinstance(frac_agn, str):
+        return frac_agn
+    return f"agn{100 * frac_agn:02.9g}"
 
 
 def _effects(options, frac_agn):

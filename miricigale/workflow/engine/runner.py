@@ -93,7 +93,10 @@ class StudyRunner:
     ):
         self.config = config
         self.folder = Path(folder)
-        self._source = stages if callable(stages) else tuple(stages)
+        if callable(stages):
+            self._source = stages
+        else:
+            self._source = tuple(stages)
         self.stages = tuple(stages() if callable(stages) else stages)
         self.executor = executor
         self.redo = redo
@@ -156,7 +159,10 @@ class StudyRunner:
         checksums of the products it reads and of its reference data.
         """
         stage, unit = self._parts[key]
-        resources = stage.resources() if callable(stage.resources) else stage.resources
+        if callable(stage.resources):
+            resources = stage.resources()
+        else:
+            resources = stage.resources
         values = {
             "stage": stage.name,
             "unit": unit,
@@ -200,7 +206,10 @@ class StudyRunner:
                 state = "changed"
             else:
                 # making them again gives the same bytes, so that dependent stages stay current
-                state = "current" if store.is_whole(key) else "lost"
+                if store.is_whole(key):
+                    state = "current"
+                else:
+                    state = "lost"
             states[key] = state
             if state in ("new", "changed"):
                 moved.add(key)
@@ -432,7 +441,10 @@ class StudyRunner:
 
         def finish(result):
             products, seconds, warned = result
-            notes = {"warnings": [text for _, text in warned]} if warned else {}
+            if warned:
+                notes = {"warnings": [text for _, text in warned]}
+            else:
+                notes = {}
             store.finish(key, digest, products, seconds=round(seconds, 2), **notes)
             for category, text in warned:
                 display.warn(category, text)
@@ -460,7 +472,10 @@ def _values(config):
 def _unused_name(path):
     """Return the first of ``config.edited.toml``, ``config.edited2.toml``, ... that is not there."""
     for n in itertools.count(1):
-        number = n if n > 1 else ""
+        if n > 1:
+            number = n
+        else:
+            number = ""
         copy = path.with_name(f"config.edited{number}.toml")
         if not os.path.lexists(copy):
             return copy
@@ -474,4 +489,6 @@ def _summary(keys):
 
 def _short(value):
     text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    if len(text) <= 60:
+        return text
+    return f"{text[:57]}..."

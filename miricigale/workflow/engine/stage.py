@@ -85,7 +85,9 @@ class Stage:
 
     def unit_names(self, config):
         """Return names of the pieces; a single empty one for a stage that has none."""
-        return tuple(self.units(config)) if self.units else ("",)
+        if self.units:
+            return tuple(self.units(config))
+        return ("",)
 
     def needed(self, config, unit, units):
         """
@@ -120,7 +122,9 @@ class Stage:
 
     def key(self, unit):
         """Return the name of a piece in the manifest."""
-        return f"{self.name}:{unit}" if unit else self.name
+        if unit:
+            return f"{self.name}:{unit}"
+        return self.name
 
 
 class Units:
@@ -263,7 +267,10 @@ class Context:
         # available without a declaration: the seed enters every hash, threads change no product
         self.seed = config.run.seed
         self.n_threads = n_threads
-        self._inputs = None if inputs is None else frozenset(inputs)
+        if inputs is None:
+            self._inputs = None
+        else:
+            self._inputs = frozenset(inputs)
 
     def path(self, name):
         """Return the path of a product that an earlier stage wrote."""

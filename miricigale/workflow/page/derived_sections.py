@@ -87,7 +87,10 @@ def write_rivals(page, tables):
             band = bands.setdefault(row["band"], band)
             band[label] = cell
             band[f"pulls, {label}"] = number(row["pull_scatter"], ".1f", NO_SOURCE)
-    shown = SE_BAND if SE_BAND in tables else next(iter(tables))
+    if SE_BAND in tables:
+        shown = SE_BAND
+    else:
+        shown = next(iter(tables))
     page.figure("figure", rival_figure(tables[shown]), band=band_label(shown))
     page.table("groups", groups.values())
     page.table("bands", bands.values())
@@ -148,7 +151,10 @@ def measured_reasons(table, config):
         key = f"limit.{row['band'].removeprefix('miri.')}"
         if key in reasons and row["images"] in _VARIANTS and np.isfinite(row["limit_change"]):
             cost = f"{variant_label(row['images'], changes)} {row['limit_change']:+.2f} mag"
-            reasons[key] = f"{reasons[key]}; {cost}" if reasons[key] else cost
+            if reasons[key]:
+                reasons[key] = f"{reasons[key]}; {cost}"
+            else:
+                reasons[key] = cost
     return reasons
 
 
@@ -174,7 +180,10 @@ def write_variants(page, matched, limits):
         statistic=config.errors.statistic,
         bin_size=config.errors.bin_size,
     )
-    gradient = texts_of("optional")["gradient"] if "gradient" in changes else ""
+    if "gradient" in changes:
+        gradient = texts_of("optional")["gradient"]
+    else:
+        gradient = ""
     page.numbers("variants", table, gradient=gradient)
     labels = {name: variant_label(name, changes) for name in (STUDY, *changes)}
     page.figure("figure", variant_figure(table, labels))
@@ -192,7 +201,10 @@ def write_perturbed(page, truths, tables):
     names = set(costs["perturbation"])
     effects = "; ".join(text for name, text in texts["effects"].items() if name in names)
     effects = sentence(effects, {"size": config.perturb})
-    together = " and together" if ALL in names else ""
+    if ALL in names:
+        together = " and together"
+    else:
+        together = ""
     page.numbers("perturbations", costs, effects=effects, together=together)
     rows = {}
     for row in costs:
@@ -205,15 +217,23 @@ def write_perturbed(page, truths, tables):
 def _header(quantity):
     """Return the head of a column: a quantity whose first word may be a band."""
     band, _, name = quantity.partition(" ")
-    return f"{band_label(band)} {name}" if "." in band else quantity
+    if "." in band:
+        return f"{band_label(band)} {name}"
+    return quantity
 
 
 def _cell(row):
     """Return the text of a value and its change; per cent but for scatter of redshifts and fracAGN."""
     quantity = row["quantity"]
     is_share = "." in quantity or quantity.endswith("outliers")
-    spec = ".1f %" if is_share else ".4f"
-    signed = f"+{spec}" if quantity.endswith("offset") else spec
+    if is_share:
+        spec = ".1f %"
+    else:
+        spec = ".4f"
+    if quantity.endswith("offset"):
+        signed = f"+{spec}"
+    else:
+        signed = spec
     if row["perturbation"] == NONE:
         return number(row["value"], signed, "no source", error=row["value_err"])
     cell = number(row["value"], signed, "no source", error=None)

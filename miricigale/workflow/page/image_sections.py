@@ -75,8 +75,14 @@ def write_detections(page):
             del row["to_proposal"]
         rows.append(row)
     page.section("detections")
-    exposures = "" if metrics["as_paper"] else ", six bands, other exposures"
-    sigma = page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else ""
+    if metrics["as_paper"]:
+        exposures = ""
+    else:
+        exposures = ", six bands, other exposures"
+    if page.config.errors.statistic == "mad":
+        sigma = page.sentence("paper_sigma")
+    else:
+        sigma = ""
     page.table("shares", rows, other_exposures=exposures, paper_sigma=sigma)
     rows = []
     for flag, n in metrics["n_left_out"].items():
@@ -99,7 +105,10 @@ def field_text(config):
     """Return where the telescope looks, in words."""
     centers = study_pointings(config)
     options = config.pointing
-    field = "a MIRI field" if len(centers) == 1 else f"{len(centers)} MIRI pointings"
+    if len(centers) == 1:
+        field = "a MIRI field"
+    else:
+        field = f"{len(centers)} MIRI pointings"
     if options.centers:
         return f"{field}, the first at RA {centers[0].ra.deg:.5f}, Dec {centers[0].dec.deg:.5f}"
     return f"{field} at RA {options.ra:.5f}, Dec {options.dec:.5f}"

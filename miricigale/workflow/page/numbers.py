@@ -250,7 +250,10 @@ def _band_numbers(config, tables, name):
         faint = usable & is_complete(matched, name) & (true < 20 * formal) & np.isfinite(flux)
     pulls = (flux[faint] - true[faint]) / formal[faint]
     time = pointing_time(config, name)
-    median = np.nanmedian(formal[usable]) if usable.any() else np.nan
+    if usable.any():
+        median = np.nanmedian(formal[usable])
+    else:
+        median = np.nan
     entry = {
         "n_measured": int(np.count_nonzero(usable & np.isfinite(flux))),
         "formal_limit": float(ab_magnitude(5 * median * u.uJy)),
@@ -351,7 +354,10 @@ def truth_metrics(truth, tables, numbers, bands, seed):
         fit = {"n": n}
         for key, quantity in _OF_FIT.items():
             fit[key] = float(numbers[truth.name, unit, quantity]["value"])
-        fit["photoz_n_outliers"] = round(n * fit["photoz_outliers"]) if n else 0
+        if n:
+            fit["photoz_n_outliers"] = round(n * fit["photoz_outliers"])
+        else:
+            fit["photoz_n_outliers"] = 0
         fit["photoz_outliers_low"] = float(outliers["low"])
         fit["photoz_outliers_high"] = float(outliers["high"])
         rank = np.empty(0)

@@ -33,7 +33,10 @@ def write_inputs(page):
     for light in page.metrics["light"]:
         row = dict(light)
         row["band"] = f"{band_label(light['band'])}, {light['wavelength']:g} µm"
-        row["faint_limit"] = f"{light['least']:g} µJy" if light["least"] else "none"
+        if light["least"]:
+            row["faint_limit"] = f"{light['least']:g} µJy"
+        else:
+            row["faint_limit"] = "none"
         row["published"] = f"{light['published']:.2f} -{light['down']:.2f} +{light['up']:.2f}"
         rows.append(row)
     page.table("light", rows)

@@ -55,7 +55,10 @@ def write_results(page, numbers):
     _write_redshifts(page, rows)
     _write_fractions(page, rows)
     _write_figure(page, "disk", study_figures.disk_figure(page.study))
-    of_truths = ", of all truths together" if len(page.study.with_agn) > 1 else ""
+    if len(page.study.with_agn) > 1:
+        of_truths = ", of all truths together"
+    else:
+        of_truths = ""
     xrays = study_figures.xray_figure(page.study, page.context.seed)
     _write_figure(page, "xrays", xrays, of_truths=of_truths)
     if len(page.study.truths) > 1:
@@ -144,7 +147,9 @@ def _outliers(truth, rows, **ranges):
         return "none"
     shares = [100 * outlier_share(errors[rows]) for errors in (without_miri, with_miri)]
     text = f"{shares[0]:.1f} and {shares[1]:.1f} % ({np.count_nonzero(rows)})"
-    return browse(truth.name, text, show="outliers", **ranges) if ranges else text
+    if ranges:
+        return browse(truth.name, text, show="outliers", **ranges)
+    return text
 
 
 #: Mass (Msun) below which a source is doubtful.

@@ -179,8 +179,13 @@ def _read_pointings(table, roll, filters):
 
     def cell(row, name):
         """Value of a column of a row; None without one."""
-        value = row[columns[name]] if name in columns else None
-        return None if np.ma.is_masked(value) else value
+        if name in columns:
+            value = row[columns[name]]
+        else:
+            value = None
+        if np.ma.is_masked(value):
+            return None
+        return value
 
     full_names = {name.rpartition(".")[2]: name for name in filters}
     wanted = f"of [exposures] filters {list(filters)}"
@@ -210,7 +215,10 @@ def all_exposures(field, options, patterns, stamp):
     units = {}
     for k, name in enumerate(options.filters):
         pattern = patterns[k]
-        n_dithers = options.n_dithers[k] if options.n_dithers else None
+        if options.n_dithers:
+            n_dithers = options.n_dithers[k]
+        else:
+            n_dithers = None
         if not isinstance(pattern, str):
             # offsets of a file
             n_dithers = n_dithers or len(pattern)

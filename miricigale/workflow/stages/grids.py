@@ -117,7 +117,9 @@ def shown_patch(config):
 
 def of_patch(name, patch):
     """Return the name of a product of a patch."""
-    return f"{name}_{patch}" if patch else name
+    if patch:
+        return f"{name}_{patch}"
+    return name
 
 
 def grid_of(config, pixel_scale, patch=""):

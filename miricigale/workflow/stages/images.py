@@ -130,7 +130,10 @@ def expose_and_reduce(
 
 def expose_image(config, imager, image, exposure, *, seed, n_threads=None, keep=None):
     """Return rate and calibrated image, as of `expose_and_reduce`, of a noiseless image on a detector."""
-    collect = imager.expose if config.exposures.kind == "ramps" else imager.collect
+    if config.exposures.kind == "ramps":
+        collect = imager.expose
+    else:
+        collect = imager.collect
     ramp = collect(image, exposure, seed=seed, n_threads=n_threads)
     if keep is not None:
         keep(ramp)
@@ -266,7 +269,10 @@ def make_highres(context, patch):
     config = context.config
     truth = context.table(f"{context.plan['truth']}/truth.ecsv")
     wcs = grid_of(config, config.highres.pixel_scale, patch)
-    noise = patch_noise(config, patch, context.seed) if patch else None
+    if patch:
+        noise = patch_noise(config, patch, context.seed)
+    else:
+        noise = None
     image, segmentation, detected = prior_image(config, truth, wcs, seed=context.seed, noise=noise)
     context.save_image(f"{of_patch('f160w', patch)}.fits", image)
     segmentation = np.asarray(segmentation.data, np.int32)

@@ -130,7 +130,9 @@ def _groups(table):
 
 
 def _range_name(low, high):
-    return f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}"
+    if np.isfinite(high):
+        return f"{low:g} to {high:g}"
+    return f"above {low:g}"
 
 
 def rival_numbers(tables):

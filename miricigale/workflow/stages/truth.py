@@ -75,7 +75,10 @@ def galaxy_parameters(config, catalog, best, *, seed):
         shown = shows_dust(catalog, config.sed)
     if not shown.all():
         drawn = _drawn_alpha(config.sed, table["id"], seed)
-        table["alpha"] = np.where(shown, table["alpha"], drawn) if shown.any() else drawn
+        if shown.any():
+            table["alpha"] = np.where(shown, table["alpha"], drawn)
+        else:
+            table["alpha"] = drawn
     model = sed.SEDModel.yang2021(agn=False)
     prior = config.highres.filter
     if prior in catalog.colnames:
@@ -131,7 +134,9 @@ def add_agn(table, frac_agn, seed):
 
 def _draw(rng, values):
     """Draw out of a list of values, or from a uniform range (a tuple)."""
-    return rng.uniform(*values) if isinstance(values, tuple) else rng.choice(values)
+    if isinstance(values, tuple):
+        return rng.uniform(*values)
+    return rng.choice(values)
 
 
 def catalog_fractions(catalog):
@@ -255,7 +260,10 @@ def make_truth(context, name):
     if frac_agn == FIELD:
         add_field_agn(parameters, model, bands[0], context.seed)
     elif model.has_agn:
-        shares = catalog_fractions(catalog) if frac_agn == CATALOG else frac_agn
+        if frac_agn == CATALOG:
+            shares = catalog_fractions(catalog)
+        else:
+            shares = frac_agn
         add_agn(parameters, shares, context.seed)
     if perturbed := perturbed_model(effects, agn=model.has_agn):
         models = (model, perturbed)
