@@ -48,8 +48,8 @@ class CatalogFits(Interactive):
             return self.engine
         return repr(self.engine)
 
-    def settings(self, filters=None):
-        """Return the settings of the fit, for the meta of results: a dict of plain values."""
+    def _settings(self, filters):
+        """Return what `~miricigale.fitting.BayesFitter.settings` does."""
         optional = {}
         if self.calibration is not None:
             optional["calibration"] = self.calibration.name
@@ -195,7 +195,7 @@ class CatalogFits(Interactive):
         is_fitted = (flags & int(FitFlags.UNFITTED)) == 0
         too_few = is_fitted & (n_detected < min(n_free, n_wanted))
         flags[too_few] |= int(FitFlags.FEW_FOR_PARAMETERS)
-        settings = self.settings(filters) | {"redshift": kind}
+        settings = self._settings(filters) | {"redshift": kind}
         settings["unused_bands"] = unused_bands(photometry, filters)
         if kind == "fixed":
             # 0 was checked above, where a grid has it

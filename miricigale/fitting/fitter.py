@@ -589,3 +589,7 @@ class BayesFitter(CatalogFits):
         cited = self.backend.provenance()["citations"]
         meta = provenance(citations=cited, fit=settings, seed=seed)
         return samples._changed(model=self.model, meta=meta)
+
+    def settings(self, filters=None):
+        """Return the settings of the fit, for the meta of results: a dict of plain values."""
+        return self._settings(filters)
