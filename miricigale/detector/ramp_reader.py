@@ -120,7 +120,7 @@ def _exposure(path, header, shape):
     pointing = None
     roll = None
     if all(is_stated):
-        pointing = SkyCoord(*pointed[:2], unit="deg")
+        pointing = SkyCoord(pointed[0], pointed[1], unit="deg")
         roll = pointed[2] * u.deg
     exposure = Exposure(
         name,

@@ -179,8 +179,9 @@ def photoz_metrics(z_true, z_fit):
     else:
         bias = np.nan
     scatter = sigma_mad(delta)
-    share = fraction_interval(n_out, delta.size)
-    return PhotozMetrics(delta.size, int(np.sum(~good)), bias, scatter, *share, n_out)
+    share, share_low, share_high = fraction_interval(n_out, delta.size)
+    n_bad = int(np.sum(~good))
+    return PhotozMetrics(delta.size, n_bad, bias, scatter, share, share_low, share_high, n_out)
 
 
 @dataclasses.dataclass(frozen=True)

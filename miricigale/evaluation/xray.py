@@ -60,7 +60,7 @@ class XRayLimit:
 #: paper calls MIRI (50 % at about 1e-16) "slightly more sensitive" than the deepest survey, and Nandra et
 #: al. call theirs a factor 2-3 shallower than the deep fields.
 _XRAY_ROWS = declared("miricigale.evaluation", "population.toml")["xray"]["rows"]
-XRAY_LIMITS = tuple(XRayLimit(survey, flux * _CGS, *source) for survey, flux, *source in _XRAY_ROWS)
+XRAY_LIMITS = tuple(XRayLimit(row[0], row[1] * _CGS, *row[2:]) for row in _XRAY_ROWS)
 
 
 def yang2021_xray_flux(l_6um, redshift):
@@ -159,7 +159,10 @@ def completeness(values, found, edges):
         raise argument_error("edges", "ascending", edges)
     n, _ = np.histogram(values, edges)
     n_found, _ = np.histogram(values[detected], edges)
-    shares = np.array([fraction_interval(*pair) for pair in zip(n_found, n, strict=True)])
+    shares = []
+    for n_bin_found, n_bin in zip(n_found, n, strict=True):
+        shares.append(fraction_interval(n_bin_found, n_bin))
+    shares = np.array(shares)
     columns = {
         "low": edges[:-1],
         "high": edges[1:],

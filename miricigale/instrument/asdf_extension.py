@@ -178,8 +178,8 @@ def imager_gwcs(wcs, shape, header):
     # the first is the middle, from which the polynomials count
     pixel = np.stack([np.append(nodes.mean(), nodes) for nodes in (x, y)])
     matrix = attitude_matrix(ra, dec, roll, v2=v2, v3=v3)
-    sky = np.radians(pixel_to_radec(wcs, *pixel))
-    v2v3 = np.degrees(vector_angles(matrix.T @ unit_vector(*sky))) * 3600
+    sky_lon, sky_lat = np.radians(pixel_to_radec(wcs, pixel[0], pixel[1]))
+    v2v3 = np.degrees(vector_angles(matrix.T @ unit_vector(sky_lon, sky_lat))) * 3600
     distortion = _polynomials(pixel, v2v3, _FORWARD)
     distortion.inverse = _polynomials(v2v3, pixel, _INVERSE)
     to_sky = (

@@ -63,7 +63,9 @@ def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
     # the reference through the polynomial, so that it looks exactly at the pointing
     v2, v3 = pixel_to_v2v3(*part.reference, subarray=subarray)
     matrix = attitude_matrix(ra, dec, roll, v2=float(v2), v3=float(v3))
-    return SkyCoord(*v2v3_to_sky(*pixel_to_v2v3(x, y, subarray=subarray), matrix), unit="deg")
+    v2, v3 = pixel_to_v2v3(x, y, subarray=subarray)
+    ra, dec = v2v3_to_sky(v2, v3, matrix)
+    return SkyCoord(ra, dec, unit="deg")
 
 
 def scaled_fit(x, y, values, order):
@@ -94,7 +96,8 @@ def _sip(subarray):
     gx, gy = np.meshgrid((nx / 2) * (1 + nodes) - 0.5, (ny / 2) * (1 + nodes) - 0.5)
     v2_ref, v3_ref = pixel_to_v2v3(*part.reference, subarray=subarray)
     matrix = attitude_matrix(0.0, 0.0, 0.0, v2=float(v2_ref), v3=float(v3_ref))
-    ra, dec = v2v3_to_sky(*pixel_to_v2v3(gx, gy, subarray=subarray), matrix)
+    v2, v3 = pixel_to_v2v3(gx, gy, subarray=subarray)
+    ra, dec = v2v3_to_sky(v2, v3, matrix)
     # gnomonic coordinates (deg) about (0, 0)
     vector = unit_vector(np.radians(ra), np.radians(dec))
     xi = np.degrees(vector[1] / vector[0])
@@ -220,7 +223,8 @@ def tangent_offset(pointing, x_offset, y_offset, pa):
     to_east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     to_north = np.cross(radial, to_east)
     vector = radial + np.multiply.outer(east, to_east) + np.multiply.outer(north, to_north)
-    return SkyCoord(*vector_angles(np.moveaxis(vector, -1, 0)), unit="rad")
+    lon, lat = vector_angles(np.moveaxis(vector, -1, 0))
+    return SkyCoord(lon, lat, unit="rad")
 
 
 def pixel_area_map(wcs, shape, out=None):
@@ -381,12 +385,15 @@ def mosaic_wcs(exposures, pixel_scale):
     ra = np.concatenate(ra)
     dec = np.concatenate(dec)
     mean = unit_vector(np.radians(ra), np.radians(dec)).mean(axis=1)
-    start = SkyCoord(*vector_angles(mean), unit="rad")
+    lon, lat = vector_angles(mean)
+    start = SkyCoord(lon, lat, unit="rad")
     # twice: the second time about the middle of the box that the first found
     for _ in range(2):
         grid = north_up_wcs(start, pixel_scale, (1, 1))
         x, y = grid.all_world2pix(ra, dec, 0)
-        middle = (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
-        start = SkyCoord(*grid.all_pix2world(*middle, 0), unit="deg")
+        middle_x = (x.min() + x.max()) / 2
+        middle_y = (y.min() + y.max()) / 2
+        ra_middle, dec_middle = grid.all_pix2world(middle_x, middle_y, 0)
+        start = SkyCoord(ra_middle, dec_middle, unit="deg")
     shape = [int(np.ceil(np.ptp(t))) for t in (y, x)]
     return north_up_wcs(start, pixel_scale, shape)

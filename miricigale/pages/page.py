@@ -143,7 +143,8 @@ class Page:
         caption : str, optional
             What the reader sees in it.
         """
-        self._add("figure", *image_of(figure, self.dpi), caption)
+        source, width = image_of(figure, self.dpi)
+        self._add("figure", source, width, caption)
 
     def to_html(self):
         """Return the page as text."""

@@ -236,20 +236,24 @@ def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None):
     xy = np.asarray(xy, float).reshape(-1, 2)
     offset = np.asarray(offset, float).reshape(-1, 2)
     if used is None:
-        used = np.ones(len(xy), bool)
+        is_used = np.ones(len(xy), bool)
     else:
-        used = np.asarray(used, bool)
+        is_used = np.asarray(used, bool)
     ny, nx = field.shape
     step = max(nx, ny) / 12
     x, y = np.meshgrid(np.arange(step / 2, nx, step), np.arange(step / 2, ny, step))
     smooth = field(x, y)
-    sizes = np.hypot(*np.concatenate([offset[used], smooth.reshape(-1, 2)]).T)
+    vectors = np.concatenate([offset[is_used], smooth.reshape(-1, 2)])
+    sizes = np.hypot(vectors[:, 0], vectors[:, 1])
     unit = np.median(sizes) or 1.0
     # arrows of the typical offset are as long as the map's grid is wide
     options = {"angles": "xy", "scale_units": "xy", "scale": unit / step, "width": 0.004}
-    ax.quiver(x, y, *np.moveaxis(smooth, -1, 0), color="0.7", **options)
-    arrows = ax.quiver(*xy[used].T, *offset[used].T, color=_LINES, **options)
-    ax.plot(*xy[~used].T, "x", color=_LINES, ms=4)
+    ax.quiver(x, y, smooth[..., 0], smooth[..., 1], color="0.7", **options)
+    x, y = xy[is_used].T
+    dx, dy = offset[is_used].T
+    arrows = ax.quiver(x, y, dx, dy, color=_LINES, **options)
+    x, y = xy[~is_used].T
+    ax.plot(x, y, "x", color=_LINES, ms=4)
     ax.quiverkey(arrows, 0.9, 1.03, unit, f"{1e3 * unit:.0f} mas", labelpos="W")
     ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal")
     ax.set(xlabel="x (pixels)", ylabel="y (pixels)", title=title)
@@ -352,11 +356,12 @@ def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
     # space for both arrows, wherever they point
     origin = np.array([x_max - 0.05 * width - 1.2 * size, bottom + 0.045 * height + 0.3 * size])
     for direction, letter in ((north, "N"), (east, "E")):
-        step = size * np.asarray(direction, float) / np.hypot(*direction)
+        step = size * np.asarray(direction, float) / np.hypot(direction[0], direction[1])
         arrow = {"arrowstyle": "-|>", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
         note = ax.annotate("", origin + step, origin, arrowprops=arrow)
         note.arrow_patch.set_path_effects(edge)
-        ax.text(*(origin + 1.35 * step), letter, **text)
+        x, y = origin + 1.35 * step
+        ax.text(x, y, letter, **text)
     ax.set(xlim=(x_min, x_max), ylim=(bottom, top), xticks=[], yticks=[], xlabel="", ylabel="")
     return ax
 

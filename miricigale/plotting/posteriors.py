@@ -199,9 +199,9 @@ def plot_sed_fit(
     err = _value(flux_err, u.uJy)
     model = _value(model_flux, u.uJy)
     if used is None:
-        used = np.ones(wave.size, bool)
+        is_used = np.ones(wave.size, bool)
     else:
-        used = np.asarray(used, bool)
+        is_used = np.asarray(used, bool)
     if limit is None:
         limit = np.zeros(wave.size, bool)
     else:
@@ -224,7 +224,7 @@ def plot_sed_fit(
         ax.plot(x[in_range], y[in_range], color=color, ls=line, lw=1.0, zorder=1, label=label)
     boxes = {"color": "tab:orange", "markersize": 7, "fillstyle": "none"}
     ax.plot(wave, model, "s", zorder=3, label="best model in the bands", **boxes)
-    points = _points(groups, used, limit)
+    points = _points(groups, is_used, limit)
     for rows, label, style in points:
         rows = rows & have & (flux > 0)
         ax.errorbar(wave[rows], flux[rows], err[rows], zorder=4, label=label, **style)

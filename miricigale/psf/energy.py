@@ -90,7 +90,8 @@ def radius_of_encircled_energy(psf, fraction):
     """
     psf = instrument_psf(psf)
     cells = np.arange(0.0, psf.half_width / psf.cell, 0.25)
-    sums = _core.radial_sums(psf.data, *psf.origin, cells) / psf.n_cells**2
+    x, y = psf.origin
+    sums = _core.radial_sums(psf.data, x, y, cells) / psf.n_cells**2
     wanted = f"positive and at most the {sums[-1]:.4f} that the PSF's grid holds"
     check_that(0 < fraction <= min(1, sums[-1]), "fraction", wanted, fraction)
     k = int(np.argmax(sums >= fraction))
@@ -136,7 +137,8 @@ def fwhm(psf, *, method="half_maximum"):
     if method == "half_maximum":
         return psf.fwhm
     start = psf.fwhm.value / psf.cell
-    return _gaussian_width(psf.data, *psf.origin, start) * psf.cell * ANGLE
+    x, y = psf.origin
+    return _gaussian_width(psf.data, x, y, start) * psf.cell * ANGLE
 
 
 def _gaussian_width(data, x, y, start):

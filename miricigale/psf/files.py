@@ -252,7 +252,7 @@ def _planes(hdu, path, wanted, plane):
 
 def _shifted(data, offset):
     """An image moved by x, y in cells; 0 comes in at its edges."""
-    if np.hypot(*offset) < 1e-6:
+    if np.hypot(offset[0], offset[1]) < 1e-6:
         return data
     y, x = np.indices(data.shape)
     return _core.interpolate(data, x - offset[0], y - offset[1])

@@ -96,9 +96,9 @@ def _missing(psf):
     if psf.total_known or claimed > 0.01:
         return claimed
     edge = psf.half_width / psf.cell
-    inner, middle, outer = _core.radial_sums(
-        psf.data, *psf.origin, np.array([0.5, 0.75, 1.0]) * edge
-    ) / float(psf.data.sum())  # fmt: skip
+    x, y = psf.origin
+    sums = _core.radial_sums(psf.data, x, y, np.array([0.5, 0.75, 1.0]) * edge)
+    inner, middle, outer = sums / float(psf.data.sum())
     # wings that fall as r**-3 hold half as much in the outer ring as in the inner one, and three
     # times as much beyond it; those of a Gaussian or a steep Moffat fall faster
     ring = outer - middle

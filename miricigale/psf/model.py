@@ -226,7 +226,8 @@ class InstrumentPSF(ImagePSF):
     @functools.cached_property
     def fwhm(self):
         """Full width at half maximum of the azimuthal mean."""
-        return _core.half_maximum_width(self.data, *self.origin) * self.cell * ANGLE
+        x, y = self.origin
+        return _core.half_maximum_width(self.data, x, y) * self.cell * ANGLE
 
 
 class PSFGrid(GriddedPSFModel):
@@ -427,7 +428,8 @@ def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, *
     check_that(psf.enclosed <= 1.04, "data", wanted, f"a sum of {data.sum():.6g}")
     if not psf.total_known:
         limit = _half_width(data, psf.origin)
-        sums = _core.radial_sums(data, *psf.origin, np.array([limit / 2, limit])) / psf.n_cells**2
+        x, y = psf.origin
+        sums = _core.radial_sums(data, x, y, np.array([limit / 2, limit])) / psf.n_cells**2
         # in wings as r**-3 as much light lies beyond a radius as between it and its half
         outer = sums[1] - sums[0]
         wanted = "a PSF whose sum is the fraction of light it holds (or 'enclosed' given)"
@@ -574,7 +576,8 @@ def enclosed_light(psf, data, radius):
         wanted = f"between 0 and the half width of the PSF, {psf.half_width:.4g} arcsec"
         raise argument_error("radius", wanted, radius)
     flat = np.ascontiguousarray(radii.ravel() / psf.cell)
-    sums = _core.radial_sums(data, *psf.origin, flat) / psf.n_cells**2
+    x, y = psf.origin
+    sums = _core.radial_sums(data, x, y, flat) / psf.n_cells**2
     if radii.ndim == 0:
         return float(sums[0])
     return sums.reshape(radii.shape)

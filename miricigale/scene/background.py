@@ -107,7 +107,8 @@ class Background:
             return np.full(shape, level)
         center = self.center
         if center is None:
-            center = SkyCoord(*pixel_to_radec(wcs, (nx - 1) / 2, (ny - 1) / 2), unit="deg")
+            ra, dec = pixel_to_radec(wcs, (nx - 1) / 2, (ny - 1) / 2)
+            center = SkyCoord(ra, dec, unit="deg")
         # smooth, so a coarse grid is enough
         nodes = [np.linspace(-0.5, n - 0.5, 12) for n in (ny, nx)]
         x, y = np.meshgrid(nodes[1], nodes[0])
@@ -119,7 +120,8 @@ class Background:
         north = (np.cos(dec0) * np.sin(dec) - np.sin(dec0) * np.cos(dec) * np.cos(ra - ra0)) / cos
         angle = self.position_angle.to_value(u.rad)
         along = np.degrees(east * np.sin(angle) + north * np.cos(angle)) * 60.0
-        smooth = RectBivariateSpline(*nodes, along)(np.arange(ny), np.arange(nx))
+        spline = RectBivariateSpline(nodes[0], nodes[1], along)
+        smooth = spline(np.arange(ny), np.arange(nx))
         image = level * (1 + gradient * smooth)
         if image.min() < 0:
             msg = f"the background's gradient of {self.gradient} makes it negative within the image"

@@ -120,7 +120,7 @@ class Cutout(Frozen):
         y = (ny - 1) / 2
         # columns: the steps along x and y in (east, north), arcsec
         steps = np.linalg.inv(local_jacobian(image.wcs, x, y))
-        sides = np.hypot(*steps)
+        sides = np.hypot(steps[0], steps[1])
         cosine = float(steps[:, 0] @ steps[:, 1]) / float(np.prod(sides))
         if abs(sides[1] / sides[0] - 1) > 0.01 or abs(cosine) > 0.01:
             wanted = "with square pixels (resample it first)"
@@ -177,7 +177,7 @@ class Cutout(Frozen):
             up to 1.
         """
         steps = np.asarray(jacobian) @ self._steps
-        cells = max(1, math.ceil(float(np.hypot(*steps).max()) / _CELL))
+        cells = max(1, math.ceil(float(np.hypot(steps[0], steps[1]).max()) / _CELL))
         inner = (np.arange(cells) + 0.5) / cells - 0.5
         inner = (inner[:, None] + np.array([-_GAUSS, _GAUSS]) / cells).ravel()
         rows, columns = np.nonzero(self.data)

@@ -208,16 +208,16 @@ class Painter:
             )
             drawn_share[extended] = sersic_enclosed_fraction(cut / radius, index)
         for row, (dx, dy, share) in (images or {}).items():
-            places = node_x[row] + dx * os_, node_y[row] + dy * os_
-            in_image[row] = self._add_image(grid, *places, flux[row] * share, land)
+            place_x = node_x[row] + dx * os_
+            place_y = node_y[row] + dy * os_
+            in_image[row] = self._add_image(grid, place_x, place_y, flux[row] * share, land)
         _core.deposit_nodes(grid, i, j, light)
         options = {"margin": margin, "oversampling": os_, "n_threads": self.n_threads}
-        arrays = grid, self._data, self._order
-        return (
-            convolve(*arrays, *self._axes(), origin=self._origin, **options),
-            in_image,
-            drawn_share,
+        axis_y, axis_x = self._axes()
+        image = convolve(
+            grid, self._data, self._order, axis_y, axis_x, origin=self._origin, **options
         )
+        return image, in_image, drawn_share
 
     @staticmethod
     def _add_image(grid, x, y, light, land):

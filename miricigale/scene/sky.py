@@ -35,8 +35,9 @@ def pixel_positions(wcs, sky, shape):
     ra = sky.icrs.ra.deg
     dec = sky.icrs.dec.deg
     world = np.array(radec_axes(wcs, ra, dec))
-    x, y = np.asarray(wcs.wcs_world2pix(*world, 0), dtype=float)
+    x, y = np.asarray(wcs.wcs_world2pix(world[0], world[1], 0), dtype=float)
     is_near = (x > -0.5 * nx) & (x < 1.5 * nx) & (y > -0.5 * ny) & (y < 1.5 * ny)
     if np.any(is_near):
-        x[is_near], y[is_near] = wcs.all_world2pix(*world[:, is_near], 0, quiet=True)
+        lon, lat = world[:, is_near]
+        x[is_near], y[is_near] = wcs.all_world2pix(lon, lat, 0, quiet=True)
     return x, y, is_near
