@@ -82,7 +82,7 @@ class Samples(FitRows):
     >>> errors = ErrorModel.from_depths(dict.fromkeys(bands, 29.0))
     >>> photometry = errors.perturb(model.fluxes(truth, bands), seed=1)
     >>> axes = {"redshift": [0.4, 0.5, 0.9, 1.0, 1.1], "age": [1.0, 3.0], "ebv": [0.1, 0.3]}
-    >>> fitter = BayesFitter(model, bands, axes=axes)
+    >>> fitter = BayesFitter(model, bands, axes=axes, model_error=0.02)
     >>> samples = fitter.sample(photometry, 100, seed=1)
     >>> samples
     <Samples of 2 objects, 100 draws each>
@@ -531,7 +531,8 @@ model : `~miricigale.sed.SEDModel`, optional
         -------
         wave : `~astropy.units.Quantity`, shape (n_wave,)
             Wavelengths in um; of the observed spectra those that all draws cover, in the steps
-            of the median redshift.
+            of the median redshift, between which straight lines smooth narrow emission lines: the
+            fluxes in bands are those of `fluxes`.
         spectra : `~astropy.units.Quantity`, shape (n_draws, n_wave)
             In W / Hz or uJy.
         """
