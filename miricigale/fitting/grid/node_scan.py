@@ -84,6 +84,11 @@ class NodeScan(Frozen):
     def _uniform(self):
         return np.mod(0.5 + _GOLDEN * np.arange(self.n_draws), 1.0)
 
+    def share(self, other):
+        """Take what follows from the galaxies and their priors from another scan, with the same galaxies."""
+        for name in ("_galaxies", "_sums", "_uniform"):
+            self.__dict__[name] = getattr(other, name)
+
     def fit(self, flux, sigma, log_prior, each, nodes=None):
         """
         Scan the nodes for objects.

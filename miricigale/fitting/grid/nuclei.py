@@ -409,8 +409,13 @@ def _fit_object(fit, data, log_prior, pairs, workspaces):
             if posterior is not None:
                 posteriors.append(posterior)
 
-        workspace = memory("draws", n_draws=N_START)
-        engine.fit(**photometry, n_draws=N_START, each=place, workspace=workspace)
+        if fit.between.scan is not None and node is None and not nuclei.limit.any():
+            scan = replace(fit.between.scan, engine=engine)
+            scan.share(workspaces.setdefault("scan", scan))
+            scan.fit(**photometry, each=place)
+        else:
+            workspace = memory("draws", n_draws=N_START)
+            engine.fit(**photometry, n_draws=N_START, each=place, workspace=workspace)
         if posteriors:
             results = between_results(fit, totals, posteriors, pairs)
     if results is None:
