@@ -2,7 +2,7 @@
 
 import numpy as np
 from drizzle.resample import Drizzle
-from scipy.ndimage import label, map_coordinates
+from scipy.ndimage import gaussian_gradient_magnitude, label, map_coordinates
 
 from miricigale.instrument import DQ, epoch_of
 from miricigale.reduction.images.images import (
@@ -21,6 +21,9 @@ from miricigale.utils.parallel import chunks
 _ROWS = 256
 # steepest differences to its neighbors by which a pixel may differ from the other dithers
 _DERIVATIVE = 1.2
+# pixels by which the dithers may be misplaced, and the smoothing with which slopes of wide sources are found
+_MISPLACED = 0.4
+_GRADIENT_WIDTH = 3.0
 # sigma of a pixel of an earlier exposure that may leave an afterglow
 _BRIGHT = 100.0
 # share of a place that is bright there, at least
@@ -59,8 +62,9 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     differently in each dither.
 
     What is left over is then smoothed on scales of 1.5, 6 and 16 pixels. Where one image is brighter than
-    the others by ``threshold`` sigma of a smoothed map, its pixels are outliers together, down to 2 sigma: the
-    afterglow of a star of an earlier dither, or a shower too faint for any single group or pixel.
+    the others by ``threshold`` sigma of a smoothed map, and by more than an error of position of 0.4 pixels makes,
+    its pixels are outliers together, down to 2 sigma: the afterglow of a star of an earlier dither, or a shower
+    too faint for any single group or pixel.
 
     References
     ----------
@@ -112,6 +116,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     shifts = [(before, inner), (after, inner), (inner, before), (inner, after)]
     steep = np.fmax.reduce([np.abs(median - padded[place]) for place in shifts])
     median = np.where(judged, median, 0.0)
+    gradient = gaussian_gradient_magnitude(median, _GRADIENT_WIDTH)
     ny, nx = median.shape
     # between four pixels of the grid that all can be compared with
     all_judged = judged[:-1, :-1] & judged[:-1, 1:] & judged[1:, :-1] & judged[1:, 1:]
@@ -138,6 +143,8 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
         else:
             noise_slope = 0.0
         allowed = _DERIVATIVE * np.maximum(slope - _NOISE_SLOPES * noise_slope, 0.0)
+        # wide sources have slopes below the noise, over many pixels
+        allowed = np.maximum(allowed, _MISPLACED * map_coordinates(gradient, coords, **options))
         excess = np.sign(difference) * np.maximum(np.abs(difference) - allowed, 0.0)
         with np.errstate(invalid="ignore"):
             extended = extended_outliers(excess / noise, good & ~outlier, threshold)
