@@ -281,13 +281,14 @@ def test_wide_galaxies_of_dithers_that_are_misplaced_are_no_outliers():
     """Dithers a fifth of a pixel from where they say; a galaxy whose slopes are below the noise of a pixel."""
     rng = np.random.default_rng(5)
     y, x = np.indices((150, 160))
+    shifts = ((0, 0), (8.4, 3.3), (-5.7, 6.1), (3.2, -7.6))
+    errors = ((0.2, 0), (-0.2, 0), (0, 0.2), (0, -0.2))
     images = []
-    for shift in ((0, 0), (8.4, 3.3), (-5.7, 6.1), (3.2, -7.6)):
+    for shift, (x_error, y_error) in zip(shifts, errors, strict=True):
         wcs = small_wcs(*shift)
         column, row = wcs.world_to_pixel(small_wcs().pixel_to_world(80, 75))
-        east, north = rng.uniform(-0.2, 0.2, 2)
-        radius = np.hypot(x - column - east, (y - row - north) / 0.7)
-        data = 150 * np.exp(-radius / 20) + rng.normal(size=x.shape)
+        radius = np.hypot(x - column - x_error, (y - row - y_error) / 0.7)
+        data = 200 * np.exp(-radius / 20) + rng.normal(size=x.shape)
         images.append(make(data, wcs, error=np.ones(x.shape)))
     grid = mosaic_wcs([im.wcs for im in images], 0.11 * u.arcsec)
     n_outliers = [im.meta["n_outliers"] for im in reject_outliers(images, grid)]
