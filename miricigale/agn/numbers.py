@@ -18,8 +18,9 @@ FLOOR = CLASS_LIMITS[0]
 _INTERVAL = (15.865, 84.135)
 #: Pseudo-counts of the prior of a rate: Jeffreys's, of a Poisson distribution.
 _JEFFREYS = 0.5
-#: Least share of the injected AGN of a bin whose fraction is above the floor: of fewer the rest is a guess.
-LEAST_ABOVE = 0.5
+#: Smallest share of the injected AGN of a bin that must have a fraction of `FLOOR` or more: with fewer, the
+#: density of the bin is mostly an extrapolation.
+MIN_ABOVE = 0.5
 
 
 def _texts(name):
@@ -140,7 +141,7 @@ class SampleNumbers:
         row["n_selected"] = int(n_selected)
         row["purity"] = self.pure[i, k] / n_selected if n_selected else np.nan
         row |= _summary(self._corrected(i, k, "all"), "n_corrected")
-        row["constrained"] = bool(row["above"] >= LEAST_ABOVE)
+        row["constrained"] = bool(row["above"] >= MIN_ABOVE)
         row |= self._density(number, row["n_shipped"], injected, i, k)
         return row | self._obscured(by_class, i, k)
 
@@ -165,7 +166,7 @@ class SampleNumbers:
         return rng.beta(n_right + _JEFFREYS, n_lost + _JEFFREYS, self.draws.n_draws)
 
     def _density(self, number, n_shipped, injected, i, k):
-        """Luminosity function of all AGN of a bin, also those below the floor, which injected ones tell."""
+        """Calculate the density of all AGN of a bin, corrected for those with a fraction below the floor."""
         width = np.diff(self._luminosity_edges())[k - 1]
         if not injected["all"] or not injected["above"] or np.isinf(width):
             return _summary(np.full(1, np.nan), "density") | {"density_shipped": np.nan}
