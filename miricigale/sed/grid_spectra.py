@@ -7,7 +7,7 @@ from astropy.table import QTable
 
 from miricigale.filters import FilterSet
 from miricigale.sed.chain import GALAXY
-from miricigale.sed.spectrum import distance
+from miricigale.sed.spectrum import cell_means, distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
@@ -195,18 +195,26 @@ def observed_spectra(model, grid, index, scale):
     """
     Observed spectra of models of a grid, with absorption between the galaxies and in the Milky Way.
 
-    As `rest_spectra`, but observed wavelengths that all models cover, and F_nu in uJy.
+    As `rest_spectra`, but observed wavelengths that all models cover, in the steps of the median redshift, and
+    F_nu in uJy. Spectra of other redshifts are means around these wavelengths, so that bands keep the light of
+    lines.
     """
     rest_wave, lnu = rest_spectra(model, grid, index, scale)
     redshift = grid.redshift[index[:, 0]]
-    wave = rest_wave * (1.0 + np.median(redshift))
+    middle = np.median(redshift)
+    wave = rest_wave * (1.0 + middle)
     low = rest_wave[0] * (1.0 + redshift.max())
     high = rest_wave[-1] * (1.0 + redshift.min())
     wave = wave[(wave >= low) & (wave <= high)]
+    centers = 0.5 * (wave[1:] + wave[:-1])
+    edges = np.concatenate([wave[:1], centers, wave[-1:]])
     out = np.empty((redshift.size, wave.size))
     for z in np.unique(redshift):
         sky = model.chain.sky(model.defaults | {"redshift": float(z)})
         factor = sky * float(dilution(z, distance(z, model.cosmology)))
         for row in np.flatnonzero(redshift == z):
-            out[row] = np.interp(wave, rest_wave * (1.0 + z), lnu[row] * factor)
+            if z == middle:
+                out[row] = np.interp(wave, rest_wave * (1.0 + z), lnu[row] * factor)
+            else:
+                out[row] = cell_means(rest_wave * (1.0 + z), lnu[row] * factor, edges)
     return wave, out

@@ -44,6 +44,30 @@ def distance(redshift, cosmology):
     return np.where(z > 0, far, (10.0 * u.pc).to_value(u.m))
 
 
+def cell_means(x, y, edges):
+    """
+    Compute the mean of a function in cells, so that narrow lines keep their light.
+
+    Parameters
+    ----------
+    x, y : `~numpy.ndarray`, shape (n,)
+        Points of the function, x increasing, which straight lines join.
+    edges : `~numpy.ndarray`, shape (m + 1,)
+        Edges of the cells, increasing, within the range of x.
+
+    Returns
+    -------
+    means : `~numpy.ndarray`, shape (m,)
+    """
+    width = np.diff(x)
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * width)])
+    step = np.clip(np.searchsorted(x, edges, side="right") - 1, 0, width.size - 1)
+    slope = (y[step + 1] - y[step]) / width[step]
+    beyond = edges - x[step]
+    at_edges = integral[step] + beyond * (y[step] + 0.5 * slope * beyond)
+    return np.diff(at_edges) / np.diff(edges)
+
+
 class _Flux(u.Quantity):
     """The spectrum by the name ``flux``, whose call says what gives the flux in a band."""
 

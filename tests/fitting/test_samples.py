@@ -156,9 +156,10 @@ def test_spectra_against_single_models(real, model):
     i, j = 1, 4
     sed = model.evaluate(**values_at(real.grid, real.index[i, j]), mass=real.scale[i, j])
     wave, observed = real.spectra("b", rest=False)
-    inside = (wave > 0.2 * u.um) & (wave < 500 * u.um)
-    want = sed.fnu_at(wave[inside]).value
-    assert_allclose(observed[j, inside].value, want, rtol=1e-9)
+    # wavelengths are those of the median redshift of the draws: the light of bands is the same
+    filters = FilterSet.from_names(BANDS)
+    seen = filters.synthetic_fluxes(SED(wave, observed[j])).to_value(u.uJy)
+    assert_allclose(seen, filters.synthetic_fluxes(sed).to_value(u.uJy), rtol=1e-3)
     # in the rest frame the flux at 10 pc is L_nu / (4 pi d^2)
     wave, rest = real.spectra("b")
     near = sed.redshifted(0.0, cosmology=model.cosmology)

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.errors import refuses
 from miricigale.cigale.modules import _MODULES
 from miricigale.filters import Filter, FilterSet
-from miricigale.sed import COSMOLOGY, ModelFlags, Parameter, SEDModel, yang2021_axes
+from miricigale.sed import COSMOLOGY, SED, ModelFlags, Parameter, SEDModel, yang2021_axes
 from miricigale.sed.component import CIGALE_MODULES, COMPONENTS, register
 from miricigale.sed.components import (
     BC03,
@@ -19,7 +19,7 @@ from miricigale.sed.components import (
     DraineLi2007,
     ParametricTorus,
 )
-from miricigale.sed.grid_spectra import model_fluxes, observed_spectra
+from miricigale.sed.grid_spectra import ListedModels, model_fluxes, observed_spectra
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
 
 AXES = {"tau": [0.1, 1.0], "age": [0.5, 5.0], "ebv": [0.1, 0.7], "alpha": [1.0, 2.0]}
@@ -500,3 +500,19 @@ def test_rows_that_share_nothing_are_those_of_single_models(filters):
         assert_allclose([alone[name][0].value for name in filters.names], mine, rtol=1e-13)
         for name, value in sed.derived.items():
             assert_allclose(got[name][i].value, value.value, rtol=1e-9, atol=1e-12)
+
+
+def test_bands_keep_the_lines_of_spectra_at_other_redshifts():
+    """Spectra of draws are on common wavelengths; a band with Halpha and [OIII] has the flux of each draw."""
+    model = SEDModel.survey(agn=False, libraries="bundled")
+    filters = FilterSet.from_names(["nircam.f410m", "nircam.f335m", "nircam.f444w"])
+    redshift = np.array([5.2, 5.203, 5.211, 5.225, 5.237, 5.25, 5.27])
+    n = redshift.size
+    galaxies = QTable({"age": np.full(n, 0.05) * u.Gyr, "tau": np.full(n, 1.0) * u.Gyr})
+    drawn = ListedModels(redshift, np.zeros(n), galaxies, QTable(), 0)
+    wave, light = observed_spectra(model, drawn, drawn.index, np.full(n, 1e10))
+    for row in range(n):
+        values = {"redshift": redshift[row], "age": 0.05, "tau": 1.0, "mass": 1e10}
+        wanted = filters.synthetic_fluxes(model.evaluate(**values)).to_value(u.uJy)
+        seen = filters.synthetic_fluxes(SED(wave * u.um, light[row] * u.uJy)).to_value(u.uJy)
+        assert_allclose(seen, wanted, rtol=5e-3)

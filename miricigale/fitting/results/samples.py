@@ -531,8 +531,8 @@ model : `~miricigale.sed.SEDModel`, optional
         -------
         wave : `~astropy.units.Quantity`, shape (n_wave,)
             Wavelengths in um; of the observed spectra those that all draws cover, in the steps
-            of the median redshift, between which straight lines smooth narrow emission lines: the
-            fluxes in bands are those of `fluxes`.
+            of the median redshift. Spectra of other redshifts are means around these
+            wavelengths: narrow lines may be wider there, and their light is conserved.
         spectra : `~astropy.units.Quantity`, shape (n_draws, n_wave)
             In W / Hz or uJy.
         """

@@ -9,6 +9,7 @@ from miricigale.evaluation import OUTLIER, AssociationFlags
 from miricigale.filters import Filter
 from miricigale.pages.browser import rounded, source_pages
 from miricigale.plotting.cutouts import Cutouts
+from miricigale.sed.spectrum import cell_means
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE, ab_magnitude
 from miricigale.workflow.engine.stage import stage
@@ -241,7 +242,7 @@ class _Sources(StudyTables):
         }
         if unit in self.compared:
             best = result.best_sed(self.model)
-            means = _cell_means(best.wave.to_value(WAVE), best.fnu.to_value(FNU), self.edges)
+            means = cell_means(best.wave.to_value(WAVE), best.fnu.to_value(FNU), self.edges)
             # thousandths of log10
             fit["spectrum"] = [round(1000 * np.log10(x)) if x > 0 else None for x in means]
         return fit
@@ -254,10 +255,3 @@ def _weights(pdf):
     if filled.size == 0:
         return [0, []]
     return [int(filled[0]), weights[filled[0] : filled[-1] + 1].tolist()]
-
-
-def _cell_means(x, y, edges):
-    """Return means of a function, given by points that straight lines join, between edges."""
-    steps = 0.5 * (y[1:] + y[:-1]) * np.diff(x)
-    total = np.concatenate([[0.0], np.cumsum(steps)])
-    return np.diff(np.interp(edges, x, total)) / np.diff(edges)
