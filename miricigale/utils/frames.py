@@ -34,7 +34,7 @@ def frame_columns(data, argument):
         If two columns have one name, or an index and a column have one name and differ.
     """
     if not hasattr(data, "index"):
-        from miricigale.utils.table_files import arrow_table
+        from miricigale.utils.arrow_tables import arrow_table
 
         if hasattr(data, "to_pylist"):
             rows = data

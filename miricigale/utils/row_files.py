@@ -11,23 +11,22 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import QTable, Table
 
+from miricigale.utils.arrow_tables import arrow_table
+from miricigale.utils.column_units import in_units, silent_units
 from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import open_fits, reading, replacing, split_extension, unreadable
-from miricigale.utils.meta import plain_value
-from miricigale.utils.optional_packages import require
-from miricigale.utils.table_files import (
+from miricigale.utils.fits_tables import (
     LDAC_HEADER,
-    arrow_table,
     check_names_differ,
     fits_ready,
-    in_units,
     mask_scaled_nulls,
     names_in_header,
     ragged_columns,
-    read_table,
-    silent_units,
 )
+from miricigale.utils.meta import plain_value
+from miricigale.utils.optional_packages import require
+from miricigale.utils.table_files import read_table
 from miricigale.utils.units import check_count
 
 

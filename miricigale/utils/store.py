@@ -8,8 +8,8 @@ from astropy.io.fits import VerifyError
 
 from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.files import open_fits, replacing, write_fits
+from miricigale.utils.fits_tables import table_hdu
 from miricigale.utils.meta import plain_value, undated
-from miricigale.utils.table_files import table_hdu
 
 _TEXT = "TEXT"
 
