@@ -61,7 +61,7 @@ def band_names(grid, filters):
     """
     Names of the bands asked for (None: those of the grid), and those that the grid has not.
 
-    The latter as a dict of name to `~miricigale.filters.Filter`, None where only a name was given.
+    The latter as a dict of name to `~miricigale.filters.Filter`, or to the name where only that was given.
     """
     if filters is None:
         return list(grid.filters), {}
@@ -75,7 +75,7 @@ def band_names(grid, filters):
     curves = {}
     for name in names:
         if name not in grid.filters:
-            curves[name] = by_name.get(name)
+            curves[name] = by_name.get(name, name)
     return names, curves
 
 
@@ -96,14 +96,8 @@ def draw_fluxes(grid, index, scale, names, extra, model):
         flux = grid.flux(z, g, k, f)[:, columns]
         out[row][:, in_grid] = scale[row][:, None] * flux
     if extra and len(index):
-        bands = []
-        for name, band in extra.items():
-            if band is None:
-                bands.append(name)
-            else:
-                bands.append(band)
         extra_columns = [names.index(name) for name in extra]
-        flux = model_fluxes(model, grid, index, bands)
+        flux = model_fluxes(model, grid, index, list(extra.values()))
         out[:, :, extra_columns] = flux * scale[:, :, None]
     return out
 

@@ -14,6 +14,7 @@ from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
+from miricigale.utils.random import stream
 from miricigale.utils.units import to_array
 
 #: Power of the redshift in `magnitude_prior`.
@@ -100,6 +101,38 @@ class GridAxis:
             low[:2] = 0.0
             high[0] = 0.0
         return low, high
+
+    def values_of_models(self, model, ids, seed):
+        """
+        Look up the value of each model; where a model stands for several values, draw from their prior.
+
+        Parameters
+        ----------
+        model : `~numpy.ndarray` of int, shape (n, n_draws)
+            Galaxy or AGN model of every draw; negative for none.
+        ids : sequence, shape (n,)
+            Ids of the objects, each with random numbers of its own.
+        seed : int
+            Seed of the draws.
+
+        Returns
+        -------
+        values : `~numpy.ndarray`, shape (n, n_draws)
+            NaN without a model.
+        """
+        share = self.share
+        # the value of each model, or the first of several that it stands for
+        out = self.values[np.argmax(share, axis=0)][model]
+        has_several = np.count_nonzero(share > 0, axis=0) > 1
+        is_shared = has_several[model] & (model >= 0)
+        total = np.cumsum(share, axis=0)
+        for i in np.flatnonzero(is_shared.any(axis=1)):
+            rng = stream(seed, "samples", self.name, str(ids[i]))
+            draw = rng.random(model.shape[1])[is_shared[i]]
+            # cumulative prior over the values that the model stands for
+            cdf = total[:, model[i][is_shared[i]]]
+            out[i, is_shared[i]] = self.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
+        return np.where(model >= 0, out, np.nan)
 
     def cell_of(self, values):
         """Find the cells of `cells` in which values lie, the outermost for those beyond: indices."""

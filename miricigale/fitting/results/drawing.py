@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior.posterior import cell_edges
+from miricigale.fitting.results.corner_panels import marked_values
 from miricigale.fitting.results.table_columns import OUTLIER
 from miricigale.sed.spectrum import distance
 from miricigale.utils.exceptions import argument_error
@@ -214,9 +215,7 @@ def plot_corner(results, key=None, names=None, *, truths=None, figure=None):
         for column, earlier in enumerate(names[:row]):
             joints[row, column] = edges[column], edges[row], result.joint_pdf(earlier, later)
     labels = [labeled(name, result.unit(name)) for name in names]
-    marked = {result._named(name): value for name, value in (truths or {}).items()}
-    check_names(marked, "parameter for 'truths'", names)
-    values = [marked.get(name) for name in names]
+    values = marked_values(result, names, truths)
     return plot_corner(labels, marginals, joints, truths=values, figure=figure)
 
 

@@ -5,27 +5,23 @@ from functools import cached_property
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.posterior.posterior import FitRows, bin_edges, cell_edges, check_levels
 from miricigale.fitting.posterior.priors import grid_priors
 from miricigale.fitting.posterior.quantities import FRACTIONS, Quantities
 from miricigale.fitting.results import histories
+from miricigale.fitting.results.corner_panels import draw_panel, marked_values
 from miricigale.fitting.results.drawing import CORNER, labeled
+from miricigale.fitting.results.listed_models import fluxes_between_nodes, models_of_draws
 from miricigale.fitting.results.percentile_columns import LEVELS, suffix
 from miricigale.sed import grid_spectra
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names, check_that
-from miricigale.utils.random import stream
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.units import FNU, WAVE
-
-#: Cells of a derived quantity in a corner plot, and the part of the draws that are beyond them.
-N_BINS = 20
-CUT = 0.01
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -263,23 +259,7 @@ model : `~miricigale.sed.SEDModel`, optional
         if axis.kind in values:
             return values[axis.kind]
         model = {"galaxy": g, "agn": k}[axis.kind]
-        return self._of_axis(axis, model)
-
-    def _of_axis(self, axis, model):
-        """Look up the values of a parameter; where a model stands for several, draw from their prior."""
-        share = axis.share
-        # the value of each model, or the first of several that it stands for
-        out = axis.values[np.argmax(share, axis=0)][model]
-        has_several = np.count_nonzero(share > 0, axis=0) > 1
-        is_shared = has_several[model] & (model >= 0)
-        total = np.cumsum(share, axis=0)
-        for i in np.flatnonzero(is_shared.any(axis=1)):
-            rng = stream(int(self.seed), "samples", axis.name, str(self.ids[i]))
-            draw = rng.random(model.shape[1])[is_shared[i]]
-            # cumulative prior over the values that the model stands for
-            cdf = total[:, model[i][is_shared[i]]]
-            out[i, is_shared[i]] = axis.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
-        return np.where(model >= 0, out, np.nan)
+        return axis.values_of_models(model, self.ids, int(self.seed))
 
     def to_table(self, names=None):
         """
@@ -389,7 +369,6 @@ model : `~miricigale.sed.SEDModel`, optional
         """Return the values in the draws of an object, and edges of the cells."""
         name = self._named(name)
         values = self.loc[key]._fitted_one().values(name).value
-        quantities = self._quantities
         if name in self.axes:
             axis = self.axes[name]
             if not self.on_nodes:
@@ -397,8 +376,12 @@ model : `~miricigale.sed.SEDModel`, optional
                 values = axis.values[axis.cell_of(values)]
             return values, cell_edges(axis.values, axis.bounds)
         check_that(np.isfinite(values).any(), "name", "one with values in the draws", repr(name))
-        extensive = name in quantities.names and name not in quantities.intensive
-        return values, bin_edges(values, log=extensive)
+        return values, bin_edges(values, log=self.extensive(name))
+
+    def extensive(self, name):
+        """Whether it is a derived quantity that scales with mass."""
+        quantities = self._quantities
+        return name in quantities.names and name not in quantities.intensive
 
     # ---------------------------------------------------------- fluxes and spectra
 
@@ -431,52 +414,12 @@ model : `~miricigale.sed.SEDModel`, optional
         fitted = rows.fitted
         if not self.on_nodes:
             for i in np.flatnonzero(fitted):
-                out[i] = rows[int(i)]._fluxes_between(names, extra, model)
+                out[i] = fluxes_between_nodes(rows[int(i)], names, extra, model)
             return out.reshape(*self.scale.shape, len(names)) * FNU
         out[fitted] = grid_spectra.draw_fluxes(
             self.grid, rows.index[fitted], rows.scale[fitted], names, extra, model
         )
         return out.reshape(*self.scale.shape, len(names)) * FNU
-
-    def _fluxes_between(self, names, extra, model):
-        """Fluxes of the draws between nodes of a single object, uJy, shape (n_draws, n_filters)."""
-        out = np.empty((self.n_draws, len(names)))
-        for j, name in enumerate(names):
-            if name not in extra:
-                out[:, j] = self.flux[:, self.grid.filters.index(name)]
-        if extra:
-            bands = []
-            for name, band in extra.items():
-                bands.append(name if band is None else band)
-            models, index = self._models()
-            flux = grid_spectra.model_fluxes(model, models, index, bands)
-            out[:, [names.index(name) for name in extra]] = flux * self.scale[:, None]
-        return out
-
-    def _models(self):
-        """Return the models of the draws of a single object, and their indices, (n_draws, 4)."""
-        if self.on_nodes:
-            return self.grid, self.index
-        grid = self.grid
-        models = grid_spectra.ListedModels(
-            redshift=self.drawn["redshift"],
-            frac_agn=self.drawn["frac_agn"],
-            galaxy_parameters=self._table_of(grid.galaxy_parameters, self.index[:, 1]),
-            agn_parameters=self._table_of(grid.agn_parameters, self.index[:, 2]),
-            n_agn=grid.n_agn,
-        )
-        return models, models.index
-
-    def _table_of(self, table, model):
-        """Parameters of draws between nodes, of which ``model``, (n_draws,), are the nearest rows of a table."""
-        out = QTable()
-        for name in table.colnames:
-            # draws without AGN have any AGN model
-            column = table[name][np.maximum(model, 0)]
-            if name in self.axes:
-                column = self.drawn[name] * (getattr(column, "unit", None) or 1.0)
-            out[name] = column
-        return out
 
     def _model(self):
         check_that(self.model is not None, "model", "an SEDModel (these samples know none)", "None")
@@ -542,7 +485,7 @@ model : `~miricigale.sed.SEDModel`, optional
         if rest:
             function = grid_spectra.rest_spectra
             unit = u.W / u.Hz
-        models, index = draws._models()
+        models, index = models_of_draws(draws)
         wave, values = function(self._model(), models, index, draws.scale)
         return wave * WAVE, values * unit
 
@@ -625,42 +568,20 @@ model : `~miricigale.sed.SEDModel`, optional
         names = [self._named(name) for name in names]
         check_names(names, "parameter", self.parameters)
         draws = self.loc[key]._fitted_one()
-        panels = [draws._panel(name) for name in names]
-        marginals = [(edges, np.histogram(x, edges)[0] / self.n_draws) for x, edges, _ in panels]
+        panels = [draw_panel(draws, name) for name in names]
+        marginals = [(panel.edges, panel.shares()) for panel in panels]
         joints = {}
-        for row, (y, y_edges, _) in enumerate(panels):
-            for column, (x, x_edges, _) in enumerate(panels[:row]):
-                weights = np.histogram2d(x, y, (x_edges, y_edges))[0] / self.n_draws
-                joints[row, column] = x_edges, y_edges, weights
+        for row, later in enumerate(panels):
+            for column, earlier in enumerate(panels[:row]):
+                shares = earlier.joint_shares(later)
+                joints[row, column] = earlier.edges, later.edges, shares
+        values = marked_values(self, names, truths)
         labels = []
-        for name, (_, _, log) in zip(names, panels, strict=True):
+        for i, name in enumerate(names):
             label = labeled(name, self.unit(name))
-            if log:
+            if panels[i].is_log:
                 label = f"log {label}"
+                if values[i] is not None:
+                    values[i] = np.log10(values[i])
             labels.append(label)
-        marked = {self._named(name): value for name, value in (truths or {}).items()}
-        check_names(marked, "parameter for 'truths'", names)
-        values = [marked.get(name) for name in names]
-        for i, (_, _, log) in enumerate(panels):
-            if log and values[i] is not None:
-                values[i] = np.log10(values[i])
         return plot_corner(labels, marginals, joints, truths=values, figure=figure)
-
-    def _panel(self, name):
-        """Return values of a single object, edges of their cells, and whether both are logarithms."""
-        values = self.values(name).value
-        if name in self.axes and (self.on_nodes or self.axes[name].label):
-            axis = self.axes[name]
-            return values, cell_edges(axis.values, axis.bounds), False
-        good = values[np.isfinite(values)]
-        check_that(good.size, "names", "of parameters with values in the draws", repr(name))
-        extensive = name in self._quantities.names and name not in self._quantities.intensive
-        log = bool(extensive and np.all(good > 0))
-        if log:
-            values = np.log10(values)
-            good = np.log10(good)
-        # the outermost draws would squeeze the panel
-        low, high = np.quantile(good, [0.5 * CUT, 1.0 - 0.5 * CUT])
-        # equal values get a narrow bin
-        high = max(high, low + 1e-6 * max(abs(low), 1e-30))
-        return values, np.linspace(low, high, N_BINS + 1), log
