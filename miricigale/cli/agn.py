@@ -1,7 +1,7 @@
 """The command that counts AGN."""
 
-from miricigale.cli.catalogs import _workers
-from miricigale.cli.options import chosen
+from miricigale.cli.catalogs import fit_options, fit_workers
+from miricigale.cli.options import filled
 
 #: CPU-seconds of a fit of an object as a galaxy, and as each other class.
 _SECONDS = 0.15
@@ -14,32 +14,19 @@ def agn(args):
     from miricigale.agn import AGNSurvey
     from miricigale.utils.exceptions import OtherResultsError
 
-    survey = AGNSurvey(
-        args.area * u.arcmin**2,
-        redshift=tuple(args.redshift_bins),
-        log_luminosity=tuple(args.luminosity_bins),
-        **chosen(args, "limit n_injections seed"),
-    )
-    if (args.hdu or "").isdigit():
-        hdu = int(args.hdu)
-    else:
-        hdu = args.hdu
+    settings = filled(args, AGNSurvey)
+    settings["area"] = args.area * u.arcmin**2
+    # --redshift names a column of the catalog
+    settings.pop("redshift", None)
+    if args.redshift_bins is not None:
+        settings["redshift"] = args.redshift_bins
+    survey = AGNSurvey(**settings)
     if args.plan:
-        print(_plan(args, hdu))
+        print(_plan(args, survey))
         return 0
     try:
-        with _workers(args) as executor:
-            result = survey.run(
-                args.photometry,
-                args.output,
-                **chosen(args, "classes quasars red_dots stars axes redshift model_error outliers"),
-                **chosen(args, "calibrate interpolate agn_error"),
-                **({} if args.calibration is None else {"calibration": args.calibration}),
-                **chosen(args, "flux_unit catalog_map ebv chunk_rows resume"),
-                hdu=hdu,
-                executor=executor,
-                progress_bar=not args.no_progress,
-            )
+        with fit_workers(args) as executor:
+            result = survey.run(**fit_options(args), executor=executor)
     except OtherResultsError as err:
         # name the option of this command instead of the argument
         raise OtherResultsError(err.reason, "--no-resume to replace them") from err
@@ -51,16 +38,15 @@ def agn(args):
     return 0
 
 
-def _plan(args, hdu):
+def _plan(args, survey):
     """What a run would fit, and the processor time that it takes, as text."""
     from miricigale.fitting.catalogs.catalog_rows import open_catalog
     from miricigale.fitting.catalogs.class_names import chosen_classes
 
-    options = chosen(args, "catalog_map flux_unit")
-    rows = open_catalog(args.photometry, args.chunk_rows, hdu=hdu, **options)
-    names = chosen_classes(args.classes, **chosen(args, "quasars red_dots stars"))
+    rows = open_catalog(**filled(args, open_catalog))
+    names = chosen_classes(**filled(args, chosen_classes))
     n_classes = 1 + len(names)
-    n_fits = (rows.n_rows + args.n_injections) * n_classes
+    n_fits = (rows.n_rows + survey.n_injections) * n_classes
     minutes = n_fits * _SECONDS / 60
-    objects = f"{rows.n_rows} objects and {args.n_injections} injected AGN"
+    objects = f"{rows.n_rows} objects and {survey.n_injections} injected AGN"
     return f"{objects} in {n_classes} classes: {n_fits} fits, about {minutes:.0f} CPU-minutes"

@@ -1,16 +1,11 @@
 """Commands that make catalogs: fit, photometry, errors."""
 
 import contextlib
+import inspect
 import sys
 
-from miricigale.cli.options import chosen, read_input, workers
+from miricigale.cli.options import filled, read_input, refuse, workers
 from miricigale.utils.exceptions import argument_error
-
-#: Options of an image, as `~miricigale.photometry.MosaicFile` has them.
-_OF_IMAGE = (
-    "error", "variance", "inverse_variance", "weight", "filter", "unit", "zero_point", "background_box", "psf",
-    "psf_scale", "psf_angle", "pa_aper",
-)  # fmt: skip
 
 
 def fit(args):
@@ -18,33 +13,18 @@ def fit(args):
     from miricigale.fitting.catalogs.classes import fit_classes, write_table
     from miricigale.utils.exceptions import OtherResultsError
 
-    hdu = args.hdu
-    if hdu is not None and hdu.isdigit():
-        hdu = int(hdu)
-    if str(args.photometry) == "-":
-        args.photometry = read_input(args.output)
-    options = chosen(args, "classes quasars red_dots stars axes redshift model_error outliers")
-    options |= chosen(args, "calibrate interpolate agn_error pairs nuclei nuclear_stars")
-    options |= chosen(args, "flux_unit catalog_map ebv chunk_rows resume")
-    if args.calibration is not None:
-        options["calibration"] = args.calibration
+    if str(args.path) == "-":
+        args.path = read_input(args.output)
     try:
-        with _workers(args) as executor:
-            results = fit_classes(
-                args.photometry,
-                args.output,
-                **options,
-                hdu=hdu,
-                executor=executor,
-                progress_bar=not args.no_progress,
-            )
+        with fit_workers(args) as executor:
+            results = fit_classes(**fit_options(args), executor=executor)
         # kernels are loaded after the files were checked
         from miricigale.fitting.catalogs.page import fit_page
 
-        is_parquet = args.photometry.suffix.lower() == ".parquet"
+        is_parquet = args.path.suffix.lower() == ".parquet"
         table = args.output / ("table.parquet" if is_parquet else "table.fits")
         write_table(results, table, overwrite=True)
-        page = fit_page(results, args.photometry, **chosen(args, "catalog_map z_spec"), hdu=hdu)
+        page = fit_page(results, **filled(args, fit_page))
         page = page.write(args.output / "page.html", overwrite=True)
         if args.plots:
             from miricigale.fitting.results.object_plots import write_plots
@@ -53,7 +33,7 @@ def fit(args):
                 ids = None
             else:
                 ids = args.plots
-            options = {"overwrite": True, "progress_bar": not args.no_progress}
+            options = {"overwrite": True, "progress_bar": args.progress_bar}
             write_plots(results["galaxy"], args.output / "plots", ids, **options)
     except KeyboardInterrupt:
         n_parts = len(list(args.output.glob("part-*.fits")))
@@ -95,13 +75,24 @@ def _outcome(results):
     return f"{text} (not: {', '.join(reasons)})"
 
 
+def fit_options(args):
+    """Return the options of fits of a catalog, as `~miricigale.fitting.catalogs.classes.fit_classes` has them."""
+    from miricigale.fitting import fit_catalog, fit_file
+    from miricigale.fitting.catalogs.classes import fit_classes
+
+    options = filled(args, fit_classes, fit_catalog, fit_file)
+    # that of agn is of its injections
+    options.pop("seed", None)
+    return options
+
+
 @contextlib.contextmanager
-def _workers(args):
+def fit_workers(args):
     """Return an executor of the threads of this machine, or of the workers of a scheduler."""
     from miricigale.utils.parallel import threads
 
     if args.scheduler is None:
-        with threads(args.threads or None) as executor:
+        with threads(args.n_threads or None) as executor:
             yield executor
     else:
         from miricigale.workflow.engine.cluster import cluster_executor
@@ -115,50 +106,58 @@ def images_of(args, paths, prefix=""):
     from miricigale.photometry import MosaicFile
 
     options = [{} for _ in paths]
-    for name in _OF_IMAGE:
-        values = getattr(args, prefix + name)
+    for name in inspect.signature(MosaicFile).parameters:
+        values = getattr(args, prefix + name, None)
         if not values:
             continue
         if len(values) != len(paths):
             wanted = f"given for each of {len(paths)} images, in their order (- for none)"
-            raise argument_error(f"--{prefix}{name}".replace("_", "-"), wanted, len(values))
+            raise argument_error(prefix + name, wanted, len(values))
         for entries, value in zip(options, values, strict=True):
             if value != "-":
                 entries[name] = value
     return [MosaicFile(path, **entries) for path, entries in zip(paths, options, strict=True)]
 
 
+def photometer_options(args):
+    """Return the options of the photometer; those of files count where none is given."""
+    names = ("max_shift", "background_order", "offset_order", "second_pass", "components")
+    options = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    if args.no_background:
+        options["background_order"] = None
+    return options
+
+
 def photometry(args):
     """Measure images."""
-    from miricigale.photometry.commands.from_files import measure_files
+    from miricigale.photometry import measure_files
+    from miricigale.workflow import measure_patches
 
     paths, prior = _image_paths(args)
     images = images_of(args, paths)
     (highres,) = images_of(args, [prior], "highres_")
-    options = chosen(args, "detection segmentation catalog confidence")
-    options |= chosen(args, "max_shift background_order offset_order second_pass")
-    options |= chosen(args, "components psf_stars overwrite seed")
-    options["kernel"] = args.kernel
     if args.kernel:
-        options["kernel"] = [None if name == "-" else name for name in args.kernel]
-    if str(args.output) == "-":
-        options["output"] = None
-    else:
-        options["output"] = args.output
-    options["n_threads"] = args.threads
-    options["progress_bar"] = not args.no_progress
+        args.kernel = [None if name == "-" else name for name in args.kernel]
+    to_screen = str(args.output) == "-"
+    if to_screen:
+        args.output = None
     if args.patches is None:
-        _refuse(args, ("patch_size", "overlap", "scheduler", "redo"), "left out without --patches")
+        refuse(args, ("patch_size", "overlap", "scheduler", "redo"), "left out without --patches")
+        if args.page is None and not to_screen:
+            args.page = args.output.with_suffix(".html")
         page = args.page
-        if page is None and options["output"] is not None:
-            page = args.output.with_suffix(".html")
-        options |= chosen(args, "model residual")
-        table = measure_files(images, highres, page=page, **options)
+        options = filled(args, measure_files) | photometer_options(args)
+        options |= {"image": images, "highres": highres}
+        table = measure_files(**options)
     else:
-        _refuse(args, ("page", "model", "residual"), "left out with --patches")
+        refuse(args, ("page", "model", "residual"), "left out with --patches")
         page = args.patches / "index.html"
-        table = _in_patches(args, images, highres, options)
-    if options["output"] is None:
+        options = filled(args, measure_files, measure_patches) | photometer_options(args)
+        options |= {"image": images, "highres": highres, "folder": args.patches}
+        args.stopped = f"stopped; the same command resumes what is in {args.patches}/"
+        with workers(args.scheduler, args.n_threads) as executor:
+            table = measure_patches(**options, executor=executor)
+    if to_screen:
         table.write(sys.stdout, format="ascii.ecsv")
     else:
         print(f"{len(table)} sources in {args.output}; page: {page}")
@@ -177,26 +176,6 @@ def _image_paths(args):
     raise ValueError(msg)
 
 
-def _refuse(args, names, wanted):
-    """Refuse options that mean nothing with others."""
-    for name in names:
-        value = getattr(args, name)
-        if value is not None and value is not False:
-            raise argument_error("--" + name.replace("_", "-"), wanted, value)
-
-
-def _in_patches(args, images, prior, options):
-    """Measure images in patches, on the processors of this machine or of others."""
-    from miricigale.workflow import measure_patches
-
-    for name, value in chosen(args, "patch_size overlap redo").items():
-        if value is not None:
-            options[name] = value
-    args.stopped = f"stopped; the same command resumes what is in {args.patches}/"
-    with workers(args.scheduler, args.threads) as executor:
-        return measure_patches(images, prior, args.patches, executor=executor, **options)
-
-
 def errors(args):
     """Measure the errors of an image."""
     import astropy.units as u
@@ -212,12 +191,12 @@ def errors(args):
     )
     for path in (image_path, table_path, page_path):
         check_output(path, "output", overwrite=args.overwrite, inputs=[args.image])
-    file = MosaicFile(args.image, **{name: getattr(args, name) for name in _OF_IMAGE})
-    psf = image_psf(file)
-    options = {}
-    if args.apertures:
-        options["diameters"] = u.Quantity(args.apertures)
-    result = image_errors(file.read(), psf=psf, n_sigma=args.sigma, seed=args.seed, **options)
+    file = MosaicFile(args.image, **filled(args, MosaicFile))
+    options = filled(args, image_errors)
+    if args.diameters is not None:
+        options["diameters"] = u.Quantity(args.diameters)
+    options |= {"image": file.read(), "psf": image_psf(file)}
+    result = image_errors(**options)
     result.write(image_path, overwrite=args.overwrite)
     write_table(result.table, table_path, overwrite=args.overwrite)
     write_errors_page(page_path, result, overwrite=args.overwrite)

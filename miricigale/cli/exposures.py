@@ -1,8 +1,6 @@
 """The command that reduces exposures."""
 
-from miricigale.cli.options import chosen, filled
-
-_FILES = "mask saturation bias reset linearity dark gain read_noise flat photom"
+from miricigale.cli.options import filled
 
 
 def reduce(args):
@@ -10,25 +8,15 @@ def reduce(args):
     from miricigale.reduction.commands.from_files import reduce_files
     from miricigale.utils.options import check_data
 
-    for path in args.files:
+    for path in args.paths:
         check_data(path.is_file(), "no file", path)
-    table = reduce_files(
-        args.files,
-        args.output,
-        reducer=reducer_of(args),
-        integrations=args.rateints,
-        **filled(args, reduce_files),
-        progress_bar=not args.no_progress,
-    )
+    table = reduce_files(**filled(args, reduce_files), reducer=reducer_of(args))
     failed = table[table["status"] == "failed"]
     for row in failed:
         print(f"{row['file']}: {row['reason']}")
-    print(
-        f"{len(table) - len(failed)} of {len(table)} products; page: {args.output / 'index.html'}"
-    )
-    if len(failed):
-        return 1
-    return 0
+    n_good = len(table) - len(failed)
+    print(f"{n_good} of {len(table)} products; page: {args.folder / 'index.html'}")
+    return int(bool(len(failed)))
 
 
 def reducer_of(args):
@@ -40,14 +28,13 @@ def reducer_of(args):
         Reducer,
     )
 
-    # options go where they are parameters; the others are put in place here
     settings = filled(args, Reducer)
-    settings["background"] = BackgroundSettings(args.background, **filled(args, BackgroundSettings))
+    settings["background"] = BackgroundSettings(**filled(args, BackgroundSettings))
     settings["ramps"] = RampSettings(**filled(args, RampSettings))
     settings["mosaics"] = MosaicSettings(**filled(args, MosaicSettings))
     settings["references"] = _references(args)
-    settings["n_threads"] = args.threads
-    settings["jump_threshold"] = args.jump_threshold or None
+    if args.jump_threshold == 0:
+        settings["jump_threshold"] = None
     return Reducer(**settings)
 
 
@@ -55,24 +42,14 @@ def _references(args):
     """Return references of the options: files, a cache of CRDS, or what ``--references`` names."""
     from miricigale.reduction import ReferenceCache, ReferenceFiles
 
-    files = {}
-    for name, value in chosen(args, _FILES).items():
-        if value is not None:
-            files[name] = _number(value)
+    files = filled(args, ReferenceFiles)
+    incomplete = files.pop("incomplete")
     n_ways = bool(files) + (args.crds is not None) + (args.references is not None)
     if n_ways > 1 or (args.context and args.crds is None):
         msg = "wanted are files of references, --crds (with --context) or --references, only one of these"
         raise ValueError(msg)
     if args.crds is not None:
-        return ReferenceCache(args.crds, args.context, incomplete=args.incomplete)
+        return ReferenceCache(args.crds, args.context, incomplete=incomplete)
     if files:
-        return ReferenceFiles(**files, incomplete=args.incomplete)
+        return ReferenceFiles(**files, incomplete=incomplete)
     return args.references
-
-
-def _number(text):
-    """Return a text as a number where it is one."""
-    try:
-        return float(text)
-    except ValueError:
-        return text

@@ -2,14 +2,11 @@
 
 import math
 
-from miricigale.cli.catalogs import images_of
+from miricigale.cli.catalogs import images_of, photometer_options
 from miricigale.cli.exposures import reducer_of
-from miricigale.cli.options import TYPES, chosen, declarations, workers
+from miricigale.cli.options import declarations, destination, filled, refuse, workers
 
-#: Options of photometry that are left to its defaults where they are not given.
-_PHOTOMETRY = "max_shift background_order offset_order second_pass components"
-
-#: Options that need a prior, beside those of the prior itself.
+#: Options that need a prior, besides those of the prior itself.
 _OF_PRIOR = ("segmentation", "catalog", "kernel", "psf_stars")
 
 
@@ -27,65 +24,48 @@ def inject(args):
     if len(priors) > 1:
         msg = f"wanted are an image, or ramps, and at most one prior, got {len(priors)} priors"
         raise ValueError(msg)
-    options = chosen(args, _PHOTOMETRY)
+    options = photometer_options(args)
     if priors:
         (highres,) = images_of(args, priors, "highres_")
-        options |= chosen(args, "segmentation catalog psf_stars kernel")
+        for name in _OF_PRIOR:
+            if getattr(args, name) is not None:
+                options[name] = getattr(args, name)
     else:
         highres = None
         of_prior = [name for name in vars(args) if name.startswith("highres_")]
-        _refuse(args, (*of_prior, *_OF_PRIOR), "given with a prior")
-    injection = Injection(
-        args.sources, **chosen(args, "n_trials n_sources stars threshold preset seed")
-    )
-    options["redo"] = args.redo
-    options["folder"] = args.output
-    options["n_threads"] = args.threads
-    options["progress_bar"] = not args.no_progress
-    with workers(None, args.threads) as executor:
+        refuse(args, (*of_prior, *_OF_PRIOR), "given with a prior")
+    # --catalog is that of the prior
+    injection = Injection(**filled(args, Injection) | {"catalog": args.sources})
+    with workers(None, args.n_threads) as executor:
         options["executor"] = executor
         if ramps:
             # an option of image and prior has both names
             of_image = sorted(name for name in vars(args) if f"highres_{name}" in vars(args))
-            _refuse(args, of_image, "left out for ramps, whose mosaic states it")
-            options |= chosen(args, "pixel_scale align")
+            refuse(args, of_image, "left out for ramps, whose mosaic states it")
+            options |= filled(args, injection.run_exposures)
             options["reducer"] = reducer_of(args)
             result = injection.run_exposures(ramps, highres, **options)
         else:
-            _refuse_reduction(args)
+            refuse(args, _options_of_reduction(), "given for ramps (level 1b)")
             (image,) = images_of(args, images[:1])
+            options |= filled(args, injection.run)
             result = injection.run(image, highres, **options)
     if len(result.sources) == 0:
-        print(f"0 sources; photometry: photometry.fits in {args.output}/")
+        print(f"0 sources; photometry: photometry.fits in {args.folder}/")
         return 0
     for question in ("detection", "forced"):
         curve = result.curve(question)
         if curve is not None and math.isfinite(curve.limit):
             print(f"50 % limit, {question}: {curve.limit:.2f} ± {curve.limit_err:.2f} AB")
-    print(f"{len(result.sources)} sources; page: index.html in {args.output}/")
+    print(f"{len(result.sources)} sources; page: index.html in {args.folder}/")
     return 0
 
 
-def _refuse(args, names, wanted):
-    """Refuse options that mean nothing for what is given."""
-    from miricigale.utils.exceptions import argument_error
-
-    for name in names:
-        value = getattr(args, name)
-        if value is not None:
-            raise argument_error(name, wanted, value)
-
-
-def _refuse_reduction(args):
-    """Refuse options of the reduction for an image that is one already."""
-    from miricigale.utils.exceptions import argument_error
-
+def _options_of_reduction():
+    """Return the names of the options that are those of ``reduce``."""
     declared = declarations()
+    names = []
     for flag in declared["inject"]["as_in"]["reduce"]:
         option = declared["reduce"]["options"][flag]
-        name = flag.lstrip("-").replace("-", "_")
-        default = option.get("default", False if option.get("action") else None)
-        if isinstance(default, str) and "type" in option:
-            default = TYPES[option["type"]](default)
-        if getattr(args, name) != default:
-            raise argument_error(name, "given for ramps (level 1b)", getattr(args, name))
+        names.append(destination(flag, option))
+    return names

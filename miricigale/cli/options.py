@@ -57,26 +57,74 @@ def pair(text):
     return names
 
 
+def extension(text):
+    """Return the number or name of an extension of a FITS file."""
+    if text.isdigit():
+        return int(text)
+    return text
+
+
+def number_or_file(text):
+    """Return a text as a number where it is one; others name files."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
 #: Types of options by their names in the declarations.
 TYPES = {
     "int": int,
     "float": float,
     "path": Path,
     "pair": pair,
+    "extension": extension,
+    "number or file": number_or_file,
     "arcsec": quantity_in("arcsec"),
     "deg": quantity_in("deg"),
 }
 
 
-def chosen(args, names):
-    """Return options by the names of the arguments that they become."""
-    return {name: getattr(args, name) for name in names.split()}
+def destination(flags, option):
+    """Return the name of the argument that a declared option becomes."""
+    longest = max(flags.split(), key=len)
+    return option.get("dest", longest.lstrip("-").replace("-", "_"))
 
 
-def filled(args, function):
-    """Return the options that are named like parameters of a function, or like fields of settings."""
-    names = inspect.signature(function).parameters
-    return {name: value for name, value in vars(args).items() if name in names}
+def filled(args, *functions):
+    """
+    Return the options that are named like parameters of functions, or like fields of settings.
+
+    Parameters
+    ----------
+    args : `argparse.Namespace`
+        The options of a command.
+    *functions : callable
+        What they are passed to; these declare the defaults.
+
+    Returns
+    -------
+    options : dict of str to object
+        Without those that were not given (None).
+    """
+    names = set()
+    for function in functions:
+        names.update(inspect.signature(function).parameters)
+    options = {}
+    for name, value in vars(args).items():
+        if name in names and value is not None:
+            options[name] = value
+    return options
+
+
+def refuse(args, names, wanted):
+    """Refuse options that mean nothing with others: none of ``names`` may be given."""
+    from miricigale.utils.exceptions import argument_error
+
+    for name in names:
+        value = getattr(args, name)
+        if value is not None and value is not False:
+            raise argument_error(name, wanted, value)
 
 
 def declarations():

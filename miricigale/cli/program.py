@@ -37,7 +37,7 @@ def main(argv=None):
     args = parser.parse_args(argv)
     verbose = getattr(args, "verbose", False)
     quiet = getattr(args, "quiet", False)
-    args.no_progress = quiet or getattr(args, "no_progress", False)
+    args.progress_bar = not quiet and getattr(args, "progress_bar", True)
     _log_to_screen(verbose, quiet)
     if args.version:
         from miricigale import __version__

@@ -4,7 +4,21 @@ import sys
 import time
 from pathlib import Path
 
-from miricigale.cli.options import chosen, declarations, workers
+from miricigale.cli.options import declarations, destination, filled, workers
+
+
+def _key_values(args, command):
+    """Return values of the keys of the configuration for which options stand, where they are given."""
+    values = {}
+    if args.seed is not None:
+        values[f"{command}.seed"] = args.seed
+    if args.n_threads is not None:
+        values[f"{command}.threads"] = args.n_threads
+    for flags, option in declarations()[command]["options"].items():
+        value = getattr(args, destination(flags, option))
+        if "key" in option and value is not None and value is not False:
+            values[option["key"]] = value
+    return values
 
 
 def _settings(args, values):
@@ -22,31 +36,20 @@ def _settings(args, values):
 
 def run(args):
     """Run a study."""
-    from miricigale.workflow import load_config, run_study
+    from miricigale.workflow import StudyRunner, load_config, run_study
 
-    values = {}
-    if args.threads is not None:
-        values["run.threads"] = args.threads
-    if args.seed is not None:
-        values["run.seed"] = args.seed
-    if args.keep_level1b:
-        values["run.keep_level1b"] = True
-    config = load_config(args.config, quick=args.quick, overrides=_settings(args, values))
+    overrides = _settings(args, _key_values(args, "run"))
+    config = load_config(args.config, quick=args.quick, overrides=overrides)
     if args.print_config:
         print(config.to_toml(), end="")
         return 0
     folder = args.output or Path(config.run.name)
     if args.plan:
-        return _show_cost(config, folder, **chosen(args, "until again"))
+        return _show_cost(config, folder, args.until, args.again)
     begin = time.monotonic()
     with workers(args.scheduler, config.run.threads, config.run.memory) as executor:
-        report = run_study(
-            config,
-            folder,
-            executor=executor,
-            **chosen(args, "redo until again"),
-            progress_bar=not args.no_progress,
-        )
+        options = filled(args, StudyRunner) | {"config": config, "folder": folder}
+        report = run_study(**options, executor=executor)
     if args.until is None:
         products = f"report: {report}"
     else:
@@ -77,15 +80,7 @@ def _show_cost(config, folder, until, again):
 
 def plan(args):
     """Tabulate exposures, or compare plans."""
-    values = {}
-    if args.seed is not None:
-        values["plan.seed"] = args.seed
-    if args.threads is not None:
-        values["plan.threads"] = args.threads
-    for flag, option in declarations()["plan"]["options"].items():
-        value = getattr(args, flag.lstrip("-"), None)
-        if "key" in option and value is not None and value is not False:
-            values[option["key"]] = value
+    values = _key_values(args, "plan")
     has_files = args.config is not None or args.output is not None
     has_options = args.bands is not None or args.position is not None or args.settings
     if not (values or has_files or has_options or args.print_config):
@@ -129,10 +124,11 @@ def plan(args):
             folder,
             executor=executor,
             overwrite=args.overwrite,
-            progress_bar=not args.no_progress,
+            progress_bar=args.progress_bar,
         )
-    names = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter", "completeness", "purity"]
-    table = comparison[[*names, "n_agn", "merit"]]
+    names = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter"]
+    names += ["completeness", "purity", "n_agn", "merit"]
+    table = comparison[names]
     for name in table.colnames[1:]:
         table[name].info.format = ".3g"
     table.pprint_all()

@@ -1,26 +1,32 @@
+import inspect
 import io
 import re
 import shlex
 from pathlib import Path
 
 import astropy.units as u
+import numpy as np
 import pytest
 from astropy.table import Table
 from numpy.testing import assert_array_equal
 
 from helpers.commands import command
 from helpers.errors import refuses
+from miricigale.agn import AGNSurvey
 from miricigale.cli import main
 from miricigale.cli.exposures import reducer_of
-from miricigale.cli.options import declarations, make_parser
+from miricigale.cli.options import declarations, destination, make_parser
 from miricigale.detector import Detector
 from miricigale.filters.surveys import SURVEYS
+from miricigale.fitting import fit_catalog
+from miricigale.injection import Injection
 from miricigale.instrument import Exposure
+from miricigale.photometry import image_errors, measure_files
 from miricigale.psf import InstrumentPSF
-from miricigale.reduction import Reducer
+from miricigale.reduction import Reducer, reduce_files
 from miricigale.scene import Scene
 from miricigale.sed import SEDModel
-from miricigale.workflow import load_config
+from miricigale.workflow import load_config, measure_patches
 from miricigale.workflow.config import preset_names
 
 SETTINGS = ("--filter", "miri.f770w", "--pa-aper", "0")
@@ -127,6 +133,32 @@ def test_help_has_options_in_groups(capsys):
     assert len(titles) == len(set(titles)) >= 8
     # each option is in the group that its heading begins
     assert text.index("PSFs and kernel:") < text.index("--kernel FITS  ") < text.index("the fit:")
+
+
+def test_help_states_the_defaults_of_what_options_fill():
+    """Defaults are declared once, by functions; the numbers in the help texts are these."""
+    filled = {
+        "fit": (fit_catalog,),
+        "agn": (AGNSurvey,),
+        "photometry": (measure_files, measure_patches),
+        "errors": (image_errors,),
+        "reduce": (Reducer, reduce_files),
+        "inject": (Injection,),
+    }
+    n_stated = 0
+    for command_name, functions in filled.items():
+        defaults = {}
+        for function in functions:
+            for name, parameter in inspect.signature(function).parameters.items():
+                defaults[name] = getattr(parameter.default, "value", parameter.default)
+        defaults |= {"redshift_bins": defaults.get("redshift")}
+        for flags, option in declarations()[command_name]["options"].items():
+            stated = re.search(r"\(([\d.]+(?: [\d.]+)*)\)", option["help"])
+            if stated and "default" not in option:
+                default = np.ravel(defaults[destination(flags, option)])
+                assert_array_equal(np.array(stated[1].split(), float), default)
+                n_stated += 1
+    assert n_stated >= 14
 
 
 def test_help_names_presets_and_surveys(capsys):

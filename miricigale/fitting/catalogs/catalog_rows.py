@@ -10,7 +10,7 @@ from miricigale.filters.photometry_table import band_columns, unit_of_fluxes
 from miricigale.utils.row_files import open_rows
 
 
-def open_catalog(path, chunk_rows, *, hdu=None, catalog_map=None, flux_unit=None):
+def open_catalog(path, chunk_rows=10000, *, hdu=None, catalog_map=None, flux_unit=None):
     """Open a catalog by rows (`~miricigale.utils.row_files.RowFile`), under our names or those of a map."""
     column_map = None
     id_names = ()

@@ -10,13 +10,13 @@ log = logging.getLogger(__name__)
 CLASSES = ("quasars", "red_dots", "stars")
 
 
-def chosen_classes(classes, *, quasars=False, red_dots=False, stars=None):
+def chosen_classes(classes=(), *, quasars=False, red_dots=False, stars=None):
     """
     Collect the classes that a caller asks for, by one argument or by one for each.
 
     Parameters
     ----------
-    classes : iterable of str or str
+    classes : iterable of str or str, optional
         Of `CLASSES`; as text with commas between them, or ``"all"``, which has stars only where there are spectra.
     quasars, red_dots : bool, optional
         Whether these are asked for.
