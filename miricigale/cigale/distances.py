@@ -38,9 +38,8 @@ def at_their_distances(results, redshift, distances, cosmology):
     node = np.where(results.fitted, node, np.nan)
     has_distance = np.isfinite(redshift) & (redshift > 0) & np.isfinite(node)
     z = np.where(has_distance, redshift, node)
-    distance_of, distance_of_node = (
-        distance(np.where(np.isfinite(x), x, 0.0), cosmology) for x in (z, node)
-    )
+    distance_of = distance(np.where(np.isfinite(z), z, 0.0), cosmology)
+    distance_of_node = distance(np.where(np.isfinite(node), node, 0.0), cosmology)
     stated_distance = None
     if distances is not None:
         stated_distance = to_array(distances, u.Mpc, "distance")

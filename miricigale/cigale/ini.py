@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.utils.exceptions import config_error, data_error
+from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 
@@ -123,7 +124,7 @@ def _round(values, decimals=0):
 
 
 #: What an expression may call, after ``np.``.
-FUNCTIONS = {name: getattr(np, name) for name in ("append", "concatenate", "exp", "log", "log10")}
+FUNCTIONS = attributes(np, ("append", "concatenate", "exp", "log", "log10"))
 FUNCTIONS |= {name: _spaced(getattr(np, name)) for name in ("geomspace", "linspace", "logspace")}
 FUNCTIONS |= {"arange": _arange, "array": np.atleast_1d, "sqrt": np.sqrt}
 FUNCTIONS |= {"round": _round, "around": _round}

@@ -11,6 +11,7 @@ from miricigale.cigale.setup import CigaleSetup
 from miricigale.filters.band_names import band_filters, xray_energies
 from miricigale.filters.filter_arguments import given_filters
 from miricigale.utils.exceptions import CatalogWarning, ConfigError, config_error, warn
+from miricigale.utils.named_values import without
 from miricigale.utils.options import check_choice
 from miricigale.utils.outputs import check_output
 from miricigale.utils.tables import error_column
@@ -82,7 +83,8 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         dark = set()
     else:
         dark = hard
-    bands, predicted = ({k: v for k, v in x.items() if k not in dark} for x in (bands, predicted))
+    bands = without(bands, dark)
+    predicted = without(predicted, dark)
     if not bands:
         raise config_error(path, f"has no band that is known here, of {', '.join(lost) or 'none'}")
     for band in bands.values():
@@ -117,7 +119,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         path=path,
         data_file=path.parent / config["data_file"] if config["data_file"] else None,
         bands=bands,
-        predicted={name: band for name, band in predicted.items() if name not in bands},
+        predicted=without(predicted, bands),
         columns=tuple(c for c in columns if c.removesuffix("_err") in bands.values()),
         variables=tuple(name for name in variables if name in computed),
         additional_error=config["additionalerror"],

@@ -186,9 +186,9 @@ def errors(args):
     from miricigale.utils.outputs import check_output
     from miricigale.utils.table_files import write_table
 
-    image_path, table_path, page_path = (
-        args.output.with_suffix(suffix) for suffix in (".fits", ".ecsv", ".html")
-    )
+    image_path = args.output.with_suffix(".fits")
+    table_path = args.output.with_suffix(".ecsv")
+    page_path = args.output.with_suffix(".html")
     for path in (image_path, table_path, page_path):
         check_output(path, "output", overwrite=args.overwrite, inputs=[args.image])
     file = MosaicFile(args.image, **filled(args, MosaicFile))

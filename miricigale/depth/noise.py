@@ -17,6 +17,7 @@ from miricigale.instrument import (
 )
 from miricigale.psf import MIRI_PIXEL_SCALE
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
@@ -119,7 +120,7 @@ class ExposureNoise:
             (Electrons per second) squared.
         """
         names = ("n_groups", "group_time", "n_frames")
-        ramp = {name: getattr(self, name) for name in names}
+        ramp = attributes(self, names)
         noise = self.detector.read_noise * self.detector.gain
         return ramp_variance(self.rate + further, **ramp, read_noise=noise) / self.n_ramps
 

@@ -227,11 +227,13 @@ def _sources(sources, rate, group, limit, exposure):
         sources = QTable({"id": np.zeros(0, int), "x": np.zeros(0), "y": np.zeros(0)})
     require_columns(sources, ("id", "x", "y"), "sources")
     ny, nx = rate.shape
-    x, y = (floats(sources[name]) for name in ("x", "y"))
+    x = floats(sources["x"])
+    y = floats(sources["y"])
     with np.errstate(invalid="ignore"):
         on = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
     table = QTable({name: sources[name][on] for name in ("id", "x", "y")})
-    column, row = (np.rint(v[on]).astype(int) for v in (x, y))
+    column = np.rint(x[on]).astype(int)
+    row = np.rint(y[on]).astype(int)
     brightest = maximum_filter(np.nan_to_num(rate), _SIDE, mode="nearest")
     peak = np.maximum(brightest[row, column], 0.0)
     first = minimum_filter(group, _SIDE, mode="nearest")[row, column]

@@ -70,7 +70,8 @@ def _check_place(image, exposure):
     ny, nx = exposure.shape
     x = np.array([0.0, nx - 1.0, (nx - 1) / 2])
     y = np.array([0.0, ny - 1.0, (ny - 1) / 2])
-    wanted, have = (w.pixel_to_world(x, y) for w in (exposure.wcs, wcs))
+    wanted = exposure.wcs.pixel_to_world(x, y)
+    have = wcs.pixel_to_world(x, y)
     side = np.sqrt(proj_plane_pixel_area(exposure.wcs.celestial))
     off = float(np.max(wanted.separation(have).deg)) / side
     wanted = "where the exposure points (each dither needs a scene on its own wcs)"

@@ -13,6 +13,7 @@ from miricigale.detector.effects.order import checked_effects
 from miricigale.instrument import DQ, STEPS, DetectorProperties, ExposureHistory
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.units import DN
 
@@ -136,7 +137,7 @@ class Ramp(Interactive, NDData):
     def _values(self):
         """Arguments by which the ramp can be made again, but for data and exposure."""
         names = ("pixel_dq", "group_dq", "effects", "properties", "steps")
-        values = {name: getattr(self, name) for name in names}
+        values = attributes(self, names)
         return values | {"header": self._header, "meta": dict(self.meta)}
 
     def __reduce__(self):

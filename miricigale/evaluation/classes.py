@@ -171,9 +171,8 @@ def sky_quality(galaxies, wanted, selected, weight):
     number = np.unique(galaxies, return_inverse=True)[1]
     shares = []
     for of in (wanted, selected):
-        weight_right, weight_all = (
-            np.bincount(number, weight * chosen) for chosen in (wanted & selected, of)
-        )
+        weight_right = np.bincount(number, weight * (wanted & selected))
+        weight_all = np.bincount(number, weight * of)
         share = weighted_share(weight_right, weight_all)
         shares.append(dataclasses.replace(share, n=np.count_nonzero(of)))
     return SelectionQuality(*shares)

@@ -52,7 +52,8 @@ def posterior_ranks(true, values, levels, *, seed=None):
     true = floats(true)
     try:
         shape = np.broadcast_shapes(np.shape(values), np.shape(levels), (true.size, 1))
-        values, levels = (np.broadcast_to(floats(a), shape) for a in (values, levels))
+        values = np.broadcast_to(floats(values), shape)
+        levels = np.broadcast_to(floats(levels), shape)
     except ValueError:
         got = f"{np.shape(values)}, {np.shape(levels)} and {true.shape}"
         raise argument_error(

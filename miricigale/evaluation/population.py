@@ -392,7 +392,8 @@ def _smf(log_mass, z):
     place = np.interp(z, middles, np.arange(middles.size))
     low = np.minimum(place.astype(int), middles.size - 2)
     part = place - low
-    low_density, high_density = (_log_schechter(log_mass, row) for row in (low, low + 1))
+    low_density = _log_schechter(log_mass, low)
+    high_density = _log_schechter(log_mass, low + 1)
     return np.exp((1.0 - part) * low_density + part * high_density)
 
 

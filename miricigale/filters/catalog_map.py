@@ -31,6 +31,7 @@ from miricigale.utils.missing_values import (
     plain_floats,
     without_codes,
 )
+from miricigale.utils.named_values import field_names, field_values
 from miricigale.utils.options import check_choice, check_data, check_names, check_that
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, flux_unit
@@ -141,7 +142,7 @@ class CatalogMap:
             if path.suffix.lower() in TRANSLATE_SUFFIXES:
                 return cls(**_translated(_translate_rows(text), path))
             values = tomllib.loads(text)
-        fields = [field.name for field in dataclasses.fields(cls)]
+        fields = field_names(cls)
         unknown = sorted(set(values) - set(fields))
         check_data(not unknown, path, f"is no map of columns: it has {unknown}; known: {fields}")
         with file_errors(path, "is no map of columns"):
@@ -187,7 +188,7 @@ class CatalogMap:
 
     def settings(self):
         """What the map says, in plain values."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        values = field_values(self)
         if not self.limits:
             # as before limits were known, so that results of such maps can be resumed
             del values["limits"]

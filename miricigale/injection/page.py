@@ -8,6 +8,7 @@ from miricigale.injection.results import BINNED_BY, QUESTIONS
 from miricigale.injection.trials import APART
 from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import new_figure
+from miricigale.utils.named_values import subset
 from miricigale.utils.package_tables import declared
 from miricigale.utils.units import FNU
 
@@ -48,7 +49,7 @@ def write_page(path, result, name, *, in_ramps=False):
     report = Page("Injected sources", subtitle=f"{name}, {meta['band']}")
     page = SectionWriter(report, declared("miricigale.injection"))
     is_star = np.asarray(result.sources["kind"]) == "star"
-    facts = {key: meta[key] for key in ("n_trials", "preset", "threshold")}
+    facts = subset(meta, ("n_trials", "preset", "threshold"))
     if meta.get("prior_band"):
         positions = "the prior"
     else:
@@ -137,9 +138,9 @@ def _fluxes(result):
     figure, [[bias_axes, right]] = new_figure(1, 2, size=(5.0, 3.4))
     sources = result.sources
     magnitude = np.asarray(sources["magnitude"])
-    true, flux, error = (
-        np.asarray(sources[name].to_value(FNU)) for name in ("flux_true", "flux", "flux_err")
-    )
+    true = np.asarray(sources["flux_true"].to_value(FNU))
+    flux = np.asarray(sources["flux"].to_value(FNU))
+    error = np.asarray(sources["flux_err"].to_value(FNU))
     good = np.isfinite(flux) & (error > 0)
     bias_axes.plot(magnitude[good], (flux / true)[good], ".", ms=3, color="0.5")
     bias_axes.axhline(1.0, color="0.7", lw=0.8, ls=":")

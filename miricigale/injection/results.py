@@ -364,9 +364,9 @@ def _share(values):
 
 def _errors(sources):
     """Bias and calibration of errors of some sources."""
-    true, flux, error = (
-        np.asarray(sources[name].to_value(FNU)) for name in ("flux_true", "flux", "flux_err")
-    )
+    true = np.asarray(sources["flux_true"].to_value(FNU))
+    flux = np.asarray(sources["flux"].to_value(FNU))
+    error = np.asarray(sources["flux_err"].to_value(FNU))
     measured = np.isfinite(flux) & (error > 0)
     pull = (flux[measured] - true[measured]) / error[measured]
     bright = measured & (true > _BRIGHT * error)

@@ -8,6 +8,7 @@ from miricigale.injection.settings import InjectionSettings
 from miricigale.injection.stages import run_injection
 from miricigale.reduction import Reducer
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.named_values import field_values
 from miricigale.utils.units import ANGLE
 
 
@@ -67,7 +68,7 @@ class Injection(Interactive, InjectionSettings):
         return f"<Injection {self.n_trials} trials, seed {self.seed}>"
 
     def _facts(self):
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return field_values(self)
 
     def run(
         self,

@@ -29,6 +29,7 @@ from miricigale.psf import read_psf
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import file_place
 from miricigale.utils.meta import provenance
+from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table
@@ -369,7 +370,7 @@ def run_injection(
         "options": as_text(options),
         "exposures": None if exposures is None else as_text(_plain_exposures(exposures)),
     }
-    settings = {item.name: getattr(injection, item.name) for item in dataclasses.fields(injection)}
+    settings = field_values(injection)
     del settings["n_trials"], settings["seed"]
     settings["catalog"] = _catalog_text(injection.catalog)
     if isinstance(injection.preset, DetectionPreset):
@@ -399,7 +400,7 @@ def run_injection(
 
 def _plain_exposures(exposures):
     """Ramps and settings as `as_text` takes them."""
-    values = {item.name: getattr(exposures, item.name) for item in dataclasses.fields(exposures)}
+    values = field_values(exposures)
     values["paths"] = [absolute(path) for path in exposures.paths]
     values["reducer"] = exposures.reducer.replace(n_threads=None)
     return values

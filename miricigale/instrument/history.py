@@ -8,6 +8,7 @@ from astropy.time import Time
 
 from miricigale.instrument.keywords import steps_done
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import attributes
 from miricigale.utils.package_tables import declared
 
 _STEPS = declared("miricigale.instrument", "keywords.toml")["references"].items()
@@ -142,7 +143,7 @@ class ExposureHistory:
             "simulated": self.simulated,
             "origin": self.origin if self.origin == "unrecorded" else None,
             "steps": sorted(self.steps) or None,
-            **{name: getattr(self, name) for name in ("day", "gain")},
+            **attributes(self, ("day", "gain")),
             **{f"reference_{name}": text for name, text in self.references.items()},
         }
         recorded = {}

@@ -4,6 +4,7 @@ import dataclasses
 import numbers
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import field_names
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,7 +84,7 @@ class ImageFacts:
         facts : `ImageFacts`
         """
         meta = getattr(image, "meta", None) or {}
-        names = [field.name for field in dataclasses.fields(cls)]
+        names = field_names(cls)
         return cls(**{name: meta[name] for name in names if meta.get(name) is not None})
 
     @property

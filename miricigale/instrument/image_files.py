@@ -36,7 +36,8 @@ def _packed(values, name, header=None, *, step=None):
     options = {}
     if values.dtype.kind == "f" and step is not None:
         # integers of 32 bits hold the steps
-        largest, smallest = (f.reduce(values, axis=None) for f in (np.fmax, np.fmin))
+        largest = np.fmax.reduce(values, axis=None)
+        smallest = np.fmin.reduce(values, axis=None)
         packs = largest - smallest < 1e9 * step
         # a negative level is the step itself
         options = {"quantize_level": -step, "quantize_method": 2 if name == "SCI" else -1}

@@ -179,9 +179,9 @@ def exposure_keywords(header):
     >>> exposure_keywords(header)
     ('miri.f770w', 'FASTR1', 'FULL', 1)
     """
-    name, pattern, part = (
-        str(header.get(key, "")).strip() for key in ("FILTER", "READPATT", "SUBARRAY")
-    )
+    name = str(header.get("FILTER", "")).strip()
+    pattern = str(header.get("READPATT", "")).strip()
+    part = str(header.get("SUBARRAY", "")).strip()
     return (
         None if name in _NO_FILTER else f"miri.{name.lower()}",
         READOUT_NAMES.get(pattern, pattern) or None,

@@ -101,9 +101,9 @@ def grid_angle(wcs, shape):
     """
     x = (shape[1] - 1) / 2
     y = (shape[0] - 1) / 2
-    middle, up, right = (
-        wcs.pixel_to_world(x + dx, y + dy).icrs for dx, dy in ((0, 0), (0, 1), (1, 0))
-    )
+    middle = wcs.pixel_to_world(x, y).icrs
+    up = wcs.pixel_to_world(x, y + 1).icrs
+    right = wcs.pixel_to_world(x + 1, y).icrs
     angle = middle.position_angle(up).to(u.deg)
     turn = (angle - middle.position_angle(right)).to_value(u.deg) % 360
     if turn > 180:

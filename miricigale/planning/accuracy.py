@@ -32,7 +32,8 @@ NUMBERS = {
 
 def columns_of(sources, agn_limit):
     """What the numbers are made of, by source."""
-    z, f = (np.asarray(sources[name], float) for name in ("redshift", "frac_agn"))
+    z = np.asarray(sources["redshift"], float)
+    f = np.asarray(sources["frac_agn"], float)
     dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
     weight = sky_weights(sources, agn_limit)
     agn = f >= agn_limit

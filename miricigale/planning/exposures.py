@@ -21,6 +21,7 @@ from miricigale.photometry import ErrorModel
 from miricigale.reduction import imager_response
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.named_values import attributes
 from miricigale.workflow.background import band_background
 from miricigale.workflow.options import of_option
 
@@ -87,7 +88,7 @@ class BandPlan:
     def limit(self):
         """5-sigma AB limit of point sources, by `~miricigale.depth.sensitivity`."""
         names = ("n_groups", "readout", "subarray")
-        options = {name: getattr(self.exposure, name) for name in names} | self._noise
+        options = attributes(self.exposure, names) | self._noise
         limit = sensitivity(self.filter, self.time, n_sigma=5, excess=self.noise.excess, **options)
         return limit.to(u.ABmag)
 

@@ -189,7 +189,8 @@ def _fraction_figure(fits, limit):
     ax = axes[0, 0]
     colors = (SECOND, "0.45", MEASURED)
     for k, ((name, rows), color) in enumerate(zip(fits.items(), colors, strict=False)):
-        true, mean = (np.array(rows[key], float) for key in ("frac_agn", "frac_agn_mean"))
+        true = np.array(rows["frac_agn"], float)
+        mean = np.array(rows["frac_agn_mean"], float)
         if len(np.unique(true)) > 12:
             # of a continuous mix, the median of each tenth
             for tenth in np.array_split(np.argsort(true, kind="stable"), 10):

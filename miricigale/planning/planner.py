@@ -13,6 +13,7 @@ from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import band_plans, wall_clock
 from miricigale.planning.sample import make_sample
 from miricigale.utils.exceptions import config_error
+from miricigale.utils.named_values import subset
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.tables import error_column, require_columns
@@ -331,7 +332,7 @@ class Planner:
         wanted = f"some of {list(config.exposures.bands)}"
         check_that(set(bands) <= set(config.exposures.bands), "bands", wanted, list(bands))
         planned = self.band_plans(share, bands)
-        plans = {band: planned[band] for band in bands}
+        plans = subset(planned, bands)
         photometry = self.photometry(plans.values(), measured)
         all_bands = [*config.fit.bands, *bands]
         fitter = study_fitter(config.fit, all_bands, axes=fit_plan(config, name))

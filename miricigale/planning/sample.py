@@ -201,7 +201,8 @@ def _by_luminosity(sources, options, rng):
     low = np.maximum(options.redshift[0], steps[0]), np.maximum(options.luminosity[0], levels[0])
     high = np.minimum(options.redshift[1], steps[-1]), np.minimum(options.luminosity[1], levels[-1])
     z, logs = (np.linspace(a, b, 201) for a, b in zip(low, high, strict=True))
-    z, logs = (0.5 * (v[1:] + v[:-1]) for v in (z, logs))
+    z = 0.5 * (z[1:] + z[:-1])
+    logs = 0.5 * (logs[1:] + logs[:-1])
     levels_of_rows = []
     for row in values:
         levels_of_rows.append(np.interp(logs, levels, row))

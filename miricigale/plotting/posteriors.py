@@ -391,7 +391,9 @@ def plot_recovery(true, mean, std, *, ax=None, name=None, unit="", log=False, **
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    true, mean, std = (np.asarray(x, dtype=float) for x in (true, mean, std))
+    true = np.asarray(true, dtype=float)
+    mean = np.asarray(mean, dtype=float)
+    std = np.asarray(std, dtype=float)
     good = np.isfinite(true) & np.isfinite(mean)
     if log:
         good &= (true > 0) & (mean > 0)

@@ -167,7 +167,8 @@ def checked_psf(
     place["offset"] = (x - (nx - 1) / 2, y - (ny - 1) / 2)
     stamp = psf_image(model, **place)
     # both as these cells show them, which may be coarse
-    width, usual = (_core.half_maximum_width(data, x, y) * psf.cell for data in (psf.data, stamp))
+    width = _core.half_maximum_width(psf.data, x, y) * psf.cell
+    usual = _core.half_maximum_width(stamp, x, y) * psf.cell
     ratio = width / usual
     if smoothed and ratio > _OTHER_WIDTH:
         msg = (
@@ -215,9 +216,8 @@ def _check_turn(psf, center, stamps, model_facts, argument):
 
     measured, sky_spikes, detector_spikes = (spikes(stamp) for stamp in (psf.data, *stamps))
     measured = measured * (stamps[0].sum() / psf.data.sum())
-    on_sky, on_detector = (
-        float(measured @ stamp) / float(stamp @ stamp) for stamp in (sky_spikes, detector_spikes)
-    )
+    on_sky = float(measured @ sky_spikes) / float(sky_spikes @ sky_spikes)
+    on_detector = float(measured @ detector_spikes) / float(detector_spikes @ detector_spikes)
     noise = np.std(measured - on_detector * detector_spikes) / math.sqrt(
         detector_spikes @ detector_spikes
     )

@@ -172,7 +172,8 @@ def cruciform(image, filter_name, *, oversampling, calibration="flight", shift=(
         return image
     distance = np.arange(math.ceil(math.sqrt(2) * max(image.shape)) + 1) / oversampling
     kernel = _profile(distance, filter_name, calibration) / oversampling
-    columns, rows = (_core.line_scatter(image, kernel, axis) for axis in (0, 1))
+    columns = _core.line_scatter(image, kernel, 0)
+    rows = _core.line_scatter(image, kernel, 1)
     if any(shift):
         columns = _shifted(columns, shift[0] * oversampling, 1)
         rows = _shifted(rows, shift[1] * oversampling, 0)

@@ -7,6 +7,7 @@ from miricigale.psf.miri import miri_psf
 from miricigale.psf.model import SHARED, InstrumentPSF, PSFGrid
 from miricigale.psf.resample import alike
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import without
 from miricigale.utils.options import check_that
 
 
@@ -46,7 +47,8 @@ def psf_grid(psfs, positions):
     positions = np.asarray(positions, dtype=float)
     if positions.ndim != 2 or positions.shape != (len(psfs), 2):
         raise argument_error("positions", f"of shape ({len(psfs)}, 2)", positions.shape)
-    columns, rows = (np.unique(positions[:, k]) for k in (0, 1))
+    columns = np.unique(positions[:, 0])
+    rows = np.unique(positions[:, 1])
     points = np.unique(positions, axis=0)
     n = columns.size * rows.size
     if min(columns.size, rows.size) < 2 or not len(psfs) == len(points) == n:
@@ -200,6 +202,6 @@ def psf_at(grid, x, y):
         pixel_scale=weights @ grid.pixel_scales,
         oversampling=int(grid.oversampling[0]),
         position=(x, y),
-        meta={key: value for key, value in grid.meta.items() if key not in grid_keys},
+        meta=without(grid.meta, grid_keys),
         **meta,
     )

@@ -196,7 +196,8 @@ class MatchingKernel(Interactive):
         >>> round(float(kernel.array.sum()), 4)
         1.0
         """
-        hi, lo = (named_psf(psf) for psf in (hi, lo))
+        hi = named_psf(hi)
+        lo = named_psf(lo)
         if pixel_scale is None:
             pixel_scale = getattr(hi, "pixel_scale", None)
         if pixel_scale is None:

@@ -13,6 +13,7 @@ from miricigale.psf import _core
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.files import write_fits
+from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
 
@@ -200,7 +201,7 @@ class InstrumentPSF(ImagePSF):
     @property
     def facts(self):
         """The parameters with which it was made, without data and meta (dict)."""
-        facts = {name: getattr(self, name) for name in _FACTS}
+        facts = attributes(self, _FACTS)
         return {**facts, "oversampling": self.n_cells, "origin": tuple(map(float, self.origin))}
 
     @property

@@ -60,7 +60,8 @@ class Star:
 
 def derivatives(psf, fwhm):
     """How a PSF, (n, n), changes with each of `TERMS` at constant light, shape (k, n, n); ``fwhm`` in cells."""
-    xx, yy = (np.gradient(np.gradient(psf, axis=axis), axis=axis) for axis in (1, 0))
+    xx = np.gradient(np.gradient(psf, axis=1), axis=1)
+    yy = np.gradient(np.gradient(psf, axis=0), axis=0)
     variance = (fwhm / 2.3548) ** 2
     axis = np.arange(len(psf)) - len(psf) // 2
     place = np.log(np.maximum(np.hypot(axis, axis[:, None]), 0.1) / fwhm)

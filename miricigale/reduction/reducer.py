@@ -37,6 +37,7 @@ from miricigale.reduction.sky.sky_flat import flattened
 from miricigale.reduction.sky.stripes import remove_stripes
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.named_values import field_values
 from miricigale.utils.options import (
     check_choice,
     check_kind,
@@ -150,7 +151,7 @@ class Reducer(Interactive):
         return f"{', '.join(parts)}>"
 
     def _facts(self):
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return field_values(self)
 
     @property
     def detector(self):

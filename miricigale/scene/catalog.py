@@ -10,6 +10,7 @@ from miricigale.profiles import SERSIC_INDEX_RANGE
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.ids import id_column, likely_ids
 from miricigale.utils.missing_values import plain_floats, without_codes
+from miricigale.utils.named_values import without, without_none
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import as_positions
@@ -178,7 +179,7 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
         catalog.rename_column(ids, "id")
     catalog["sky"] = as_positions(catalog, argument, wcs)
     points = list(_fill_columns(catalog, argument))
-    units = {name: unit for name, unit in CATALOG_COLUMNS.items() if unit is not None}
+    units = without_none(CATALOG_COLUMNS)
     require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
     fluxes = [*filters, *(name for name in catalog.colnames if is_band(name))]
     require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
@@ -194,7 +195,7 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     unknown = sorted(set(profile.tolist()) - set(PROFILES))
     check_that(not unknown, argument, f"a table with 'profile' among {PROFILES}", unknown)
     catalog["profile"] = profile
-    numbers = {n: unit for n, unit in CATALOG_COLUMNS.items() if n not in ("id", "sky", "profile")}
+    numbers = without(CATALOG_COLUMNS, ("id", "sky", "profile"))
     for name in catalog.colnames:
         unit = getattr(catalog[name], "unit", None)
         linear = isinstance(unit, u.UnitBase)  # a magnitude is none

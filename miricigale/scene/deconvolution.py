@@ -48,7 +48,8 @@ def deconvolve(image, psf, *, max_gain=3.0):
     >>> print(f"width {np.sqrt(sharp.sum() / (2 * np.pi * sharp.max())):.2f} pixels")
     width 4.58 pixels
     """
-    image, psf = (floats(array) for array in (image, psf))
+    image = floats(image)
+    psf = floats(psf)
     for name, array in (("image", image), ("psf", psf)):
         if array.ndim != 2 or not np.all(np.isfinite(array)):
             raise argument_error(name, "a finite 2D array", f"shape {array.shape}")

@@ -8,6 +8,7 @@ from miricigale.filters import FilterSet
 from miricigale.sed import _core
 from miricigale.sed.component import ROLES
 from miricigale.utils.caching import cached
+from miricigale.utils.named_values import subset
 from miricigale.utils.package_tables import declared
 
 #: Version of the numbers that follow from the components: raised when the chain, the derived
@@ -343,7 +344,7 @@ class Chain:
         igm, foreground = (self.by_role[role] for role in SKY)
         out = np.ones(observed.size)
         if igm is not None:
-            igm_values = {name: values[name] for name in self.names("igm")}
+            igm_values = subset(values, self.names("igm"))
             out = igm.transmission(observed, redshift, **igm_values)
         if foreground is not None:
             out = out * foreground.transmission(observed, values)

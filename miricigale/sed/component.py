@@ -10,6 +10,7 @@ from miricigale.refdata.lookup import fingerprint_of
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ConfigError, config_error
+from miricigale.utils.named_values import subset, without
 from miricigale.utils.options import check_that
 
 #: What a component does, in the order in which light meets it.
@@ -187,7 +188,7 @@ class Component:
     @property
     def settings(self):
         """Options as chosen, and whatever else than parameters shapes the spectra: dict."""
-        return {name: self.__dict__[name] for name in type(self).all_options()}
+        return subset(self.__dict__, type(self).all_options())
 
     @property
     def parameters(self):
@@ -291,4 +292,4 @@ def read_config(config):
             parts.append(named_component(defaults.pop("name", "(none)"), **defaults))
         except (KeyError, TypeError, ValueError, u.UnitsError) as err:
             raise config_error("[sed]", f"component {entry}: {err.args[0]}") from err
-    return parts, {name: value for name, value in config.items() if name != "components"}
+    return parts, without(config, ["components"])

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.sed.chain import COLOR_BANDS, COLORS, UV_WINDOWS
+from miricigale.utils.named_values import subset
 from miricigale.utils.package_tables import declared
 
 
@@ -113,6 +114,6 @@ def scaled_quantities(model, values, mass, redshift, far, parameters):
                 out[name] = values[name]
     xray = model.component("xray")
     if xray is not None:
-        xray_values = {name: parameters[name] for name in xray.parameters}
+        xray_values = subset(parameters, xray.parameters)
         out |= xray.derived(out["l_6um"], redshift, far, xray_values)
     return out

@@ -10,6 +10,7 @@ from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write, register
+from miricigale.utils.named_values import attributes, subset
 from miricigale.utils.options import check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import Frozen, frozen_array
@@ -275,8 +276,8 @@ class ModelGrid(Frozen):
 
 
 def _write(grid, path, *, overwrite=False):
-    tables = {name: getattr(grid, name) for name in _TABLES}
-    text = {name: getattr(grid, name) for name in ("filters", "meta", *_FACTS)}
+    tables = attributes(grid, _TABLES)
+    text = attributes(grid, ("filters", "meta", *_FACTS))
     text["descriptions"] = {
         name: {column: table[column].info.description for column in table.colnames}
         for name, table in tables.items()
@@ -302,7 +303,7 @@ def _read(path):
                 # pure numbers are quantities again, too
                 table[column] = u.Quantity(table[column], dtype=float)
                 table[column].info.description = description
-        facts = {name: text[name] for name in ("meta", *_FACTS)}
+        facts = subset(text, ("meta", *_FACTS))
         return ModelGrid(tuple(text["filters"]), **arrays, **tables, **facts)
 
 

@@ -12,6 +12,7 @@ from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import BLOCK, dilution, seen_agn
 from miricigale.utils.exceptions import ModelWarning, argument_error, unknown_name, warn
+from miricigale.utils.named_values import subset, without
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import WAVE
@@ -169,7 +170,7 @@ def model_grid(model, axes, filters):
         frac_agn = axes.get("frac_agn", np.array([of_agn["frac_agn"].default]))
     with_agn = bool(np.any(frac_agn > 0.0))
     names = _names(model, GALAXY_ROLES) + ["dust_excess"] * ("dust_excess" in axes)
-    of_galaxy = {n: model.parameters[n] for n in names}
+    of_galaxy = subset(model.parameters, names)
     rows = _products(of_galaxy, axes)
     defaults = model.defaults
     _refuse_invalid(model, [defaults | row for row in rows], GALAXY_ROLES)
@@ -179,7 +180,7 @@ def model_grid(model, axes, filters):
 
     nuclei = {}
     agn_spectra = np.zeros((0, chain.wave.size))
-    agn_parameters = {n: p for n, p in of_agn.items() if n != "frac_agn"}
+    agn_parameters = without(of_agn, ["frac_agn"])
     if with_agn:
         models = [r | {"frac_agn": 0.0} for r in _products(agn_parameters, axes)]
         _refuse_invalid(model, [defaults | row for row in models], ("agn",))

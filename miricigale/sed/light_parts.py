@@ -16,6 +16,7 @@ from miricigale.sed.derived import galaxy_quantities
 from miricigale.sed.gridding import Galaxies, agn_table
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import dilution
+from miricigale.utils.named_values import without
 
 #: Time spans in Gyr over which star-formation rates are averaged, by quantity.
 RATE_SPANS = {"sfr_10myr": 0.01, "sfr_100myr": 0.1}
@@ -162,7 +163,7 @@ class LightParts:
 
     def _galaxies(self, values):
         # the dust's excess over energy balance is a factor of its light, not of what it takes
-        without_excess = [{k: v for k, v in row.items() if k != "dust_excess"} for row in values]
+        without_excess = [without(row, ["dust_excess"]) for row in values]
         return Galaxies(self.model, without_excess)
 
     def dust(self, rows):

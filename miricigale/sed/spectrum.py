@@ -14,6 +14,7 @@ from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import full_meta
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import without
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table, write_table
@@ -284,7 +285,7 @@ class SED(Frozen, Interactive):
             table.meta |= {
                 name: float(u.Quantity(quantity).value) for name, quantity in values.items()
             }
-        table.meta |= {k: v for k, v in self.meta.items() if k not in ("parameters", "derived")}
+        table.meta |= without(self.meta, ("parameters", "derived"))
         return table
 
     def write(self, path, *, overwrite=False):

@@ -7,6 +7,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
+from miricigale.utils.named_values import attributes, subset
+
 
 def file_sha256(path):
     """The sha256 of a file as hexadecimal text."""
@@ -49,7 +51,7 @@ def _feed(digest, value):
     elif isinstance(value, np.ndarray):
         _feed_array(digest, value)
     elif isinstance(value, Table):
-        _feed(digest, {name: value[name] for name in value.colnames})
+        _feed(digest, subset(value, value.colnames))
     elif isinstance(value, dict):
         _tag(digest, "dict", str(len(value)))
         for key in sorted(value, key=str):
@@ -62,7 +64,7 @@ def _feed(digest, value):
     elif is_dataclass(value) and not isinstance(value, type):
         _tag(digest, "dataclass", type(value).__qualname__)
         names = [item.name for item in fields(value) if item.name != "meta"]
-        _feed(digest, {name: getattr(value, name) for name in names})
+        _feed(digest, attributes(value, names))
     else:
         if hasattr(value, "__qualname__"):
             named = value

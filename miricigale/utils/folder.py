@@ -10,6 +10,7 @@ from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import PARTIAL, replacing, writing
 from miricigale.utils.lock import FolderLock
+from miricigale.utils.named_values import without
 
 log = logging.getLogger(__name__)
 
@@ -206,7 +207,7 @@ class RecordFolder(FileFolder):
 
         A subclass that reads manifests of earlier layouts brings them to the present one here.
         """
-        facts = {k: v for k, v in values.items() if k not in ("sha256", self.records_name)}
+        facts = without(values, ("sha256", self.records_name))
         return facts, values[self.records_name]
 
     def check_record(self, record):
@@ -357,5 +358,5 @@ class RecordFolder(FileFolder):
 
 def _checksum(values):
     """Checksum of what a manifest says."""
-    said = {key: value for key, value in values.items() if key != "sha256"}
+    said = without(values, ["sha256"])
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()

@@ -3,6 +3,7 @@
 import numpy as np
 
 from miricigale.utils.ids import is_id_name
+from miricigale.utils.named_values import subset
 from miricigale.utils.options import check_that
 
 
@@ -41,7 +42,7 @@ def frame_columns(data, argument):
         else:
             rows = data.to_arrow()
         table = arrow_table(rows, where=argument)
-        return {name: table[name] for name in table.colnames}
+        return subset(table, table.colnames)
     names = [str(name) for name in data.columns]
     repeated = sorted({name for name in names if names.count(name) > 1})
     check_that(not repeated, argument, "a frame whose columns have different names", repeated)

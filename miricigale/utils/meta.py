@@ -9,6 +9,7 @@ import re
 import numpy as np
 
 from miricigale.utils.caching import cached
+from miricigale.utils.named_values import without_none
 
 
 @cached
@@ -39,7 +40,7 @@ def provenance(*, citations=(), **values):
     meta = {"package": "miricigale", "version": _version(), "created": date}
     if citations:
         meta["citations"] = sorted(set(citations))
-    meta.update({key: value for key, value in values.items() if value is not None})
+    meta.update(without_none(values))
     return meta
 
 

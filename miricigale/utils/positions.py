@@ -117,9 +117,8 @@ def at_epoch(sky, epoch, argument):
         angles = sky.icrs.represent_as(UnitSphericalRepresentation)
         return SkyCoord(angles.lon, angles.lat)
     icrs = sky.icrs
-    east, north = (
-        floats(motion.to_value(u.rad / u.yr)) for motion in (icrs.pm_ra_cosdec, icrs.pm_dec)
-    )
+    east = floats(icrs.pm_ra_cosdec.to_value(u.rad / u.yr))
+    north = floats(icrs.pm_dec.to_value(u.rad / u.yr))
     unknown = ~(np.isfinite(east) & np.isfinite(north))
     moving = np.where(unknown, 0.0, np.hypot(east, north)) > 0
     positions = SkyCoord(icrs.ra, icrs.dec)

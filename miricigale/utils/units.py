@@ -1,6 +1,5 @@
 """The units of arrays inside the package, and conversions to them at the public methods."""
 
-import dataclasses
 import functools
 import re
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.missing_values import without_mask
+from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_that
 
 #: Units declared once; every array inside the package is in one of these.
@@ -189,7 +189,7 @@ class Frozen:
     """Base of frozen dataclasses: copies and pickles go through the constructor and stay read-only."""
 
     def __reduce__(self):
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        values = field_values(self)
         return functools.partial(type(self), **values), ()
 
 

@@ -18,6 +18,7 @@ from miricigale.profiles import sersic_radius
 from miricigale.psf import psf_image, rotate_psf
 from miricigale.scene import CatalogFlags, Cutout, check_catalog, deconvolve
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.named_values import without_none
 from miricigale.utils.random import stream
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import ANGLE
@@ -334,7 +335,7 @@ def stamps_of_sources(catalog, galaxies, *, of, seed):
     else:
         for row in rows:
             stamps[ids[row]] = _drawn(checked[row], galaxies, seed)
-    stamps = {key: stamp for key, stamp in stamps.items() if stamp is not None}
+    stamps = without_none(stamps)
     if not stamps:
         msg = (
             f"none of the {len(rows)} Sersic profiles of the catalog has a galaxy on the image of [perturb] "

@@ -12,6 +12,7 @@ import typing
 from pathlib import Path
 
 from miricigale.utils.exceptions import ConfigError, config_error
+from miricigale.utils.named_values import field_names
 from miricigale.utils.outputs import FILE_NAME, is_file_name
 from miricigale.workflow.earlier import keys_of_today
 
@@ -208,7 +209,7 @@ class Configuration:
         """
         base = base or cls()
         values = keys_of_today(values, cls.earlier)
-        names = [field.name for field in dataclasses.fields(base)]
+        names = field_names(base)
         if unknown := sorted(set(values).difference(names)):
             raise config_error("unknown section", f"{unknown}; known: {sorted(names)}")
         sections = {}

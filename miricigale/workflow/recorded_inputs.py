@@ -1,6 +1,5 @@
 """Files and settings as plain text in the record of a run, and the states of files that it depends on."""
 
-import dataclasses
 import json
 import os
 from pathlib import Path
@@ -19,6 +18,7 @@ from miricigale.reduction import (
     ReferenceFiles,
 )
 from miricigale.utils.files import file_place
+from miricigale.utils.named_values import field_values
 from miricigale.utils.store import plain_value
 
 #: Fields of an image that name files.
@@ -46,11 +46,6 @@ def absolute(path):
     return os.path.abspath(path)
 
 
-def _field_values(instance):
-    """Return the fields of a dataclass by name, not copied."""
-    return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
-
-
 def _with_tuples(values):
     """Return values with tuples in place of lists, as fields of settings are."""
     restored = dict(values)
@@ -65,7 +60,7 @@ def _plain(value):
     if isinstance(value, u.Quantity):
         return {"value": float(value.value), "unit": value.unit.to_string()}
     if type(value) in _CLASSES:
-        entries = _field_values(value)
+        entries = field_values(value)
         for name, entry in entries.items():
             is_path = isinstance(entry, Path)
             if is_path or (isinstance(value, MosaicFile) and name in PATHS):
@@ -111,7 +106,7 @@ def from_text(text):
 
 def inputs_text(inputs):
     """Write what is measured (`~miricigale.photometry.commands.file_inputs.Inputs`) as text."""
-    return as_text(_field_values(inputs))
+    return as_text(field_values(inputs))
 
 
 def inputs_from_text(text):

@@ -19,6 +19,7 @@ from miricigale.fitting.results.object_plots import draw_objects
 from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure, plain_text
 from miricigale.plotting.comparison import plot_redshifts
+from miricigale.utils.named_values import without
 from miricigale.utils.package_tables import declared
 
 #: Largest number of examples on the page.
@@ -385,7 +386,7 @@ def _left_out(page, rows, numbers):
 def _settings(page, results):
     page.section("settings")
     first = next(iter(results.parts()))
-    settings = {name: v for name, v in first.meta.get("fit", {}).items() if name != "filters"}
+    settings = without(first.meta.get("fit", {}), ["filters"])
     if results.model is not None:
         settings |= results.model.recipe
     rows = {name: _setting_text(value) for name, value in settings.items()}

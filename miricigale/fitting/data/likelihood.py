@@ -9,6 +9,7 @@ from miricigale.filters import Filter
 from miricigale.filters.library import SEDPY
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.missing_values import first_word
+from miricigale.utils.named_values import attributes
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
@@ -209,7 +210,7 @@ class FitData(ObjectRows):
     def columns(self):
         """Keywords of `~miricigale.fitting.FitResults` that are taken from the photometry."""
         fields = ("ids", "flux", "flux_err", "sigma", "limit")
-        return {name: getattr(self, name) for name in fields} | {"n_bands": self.used.sum(axis=1)}
+        return attributes(self, fields) | {"n_bands": self.used.sum(axis=1)}
 
     def of_engine(self, log_prior):
         """

@@ -18,6 +18,7 @@ from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.file_formats import register
 from miricigale.utils.files import open_fits, replacing
 from miricigale.utils.folder import RecordFolder
+from miricigale.utils.named_values import attributes, subset
 from miricigale.utils.object_rows import ByID
 from miricigale.utils.options import check_data, check_names
 from miricigale.utils.row_files import write_rows
@@ -47,7 +48,7 @@ def write_results(results, path, *, overwrite=False):
         parts = getattr(results, name).items()
         table |= {f"{name}:{key}": getattr(value, "value", value) for key, value in parts}
     table |= {f"pair:{i}": weights for i, weights in enumerate(results.pairs.values())}
-    text = {name: getattr(results, name) for name in (*_TUPLES, *_FACTS)}
+    text = attributes(results, (*_TUPLES, *_FACTS))
     text |= {
         "pairs": [list(names) for names in results.pairs],
         "units": [u.Unit(unit).to_string() for unit in results.units],
@@ -75,7 +76,7 @@ def read_results(path, *, rows=None):
                 full = np.zeros(0)
             columns[name] = full.reshape(len(table), *shape)
         values = {name: tuple(text[name]) for name in _TUPLES}
-        values |= {name: text[name] for name in _FACTS} | {name: {} for name in _DICTS}
+        values |= subset(text, _FACTS) | {name: {} for name in _DICTS}
         for key, array in columns.items():
             name, _, part = key.partition(":")
             if not part:
@@ -158,7 +159,7 @@ def _axes_to_plain(axes):
     """Turn axes without their shares into what JSON knows."""
     out = {}
     for name, axis in axes.items():
-        out[name] = {key: getattr(axis, key) for key in _AXIS}
+        out[name] = attributes(axis, _AXIS)
         out[name]["unit"] = u.Unit(axis.unit).to_string()
     return out
 

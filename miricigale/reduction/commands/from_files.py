@@ -21,6 +21,7 @@ from miricigale.reduction.sky.background import known_background
 from miricigale.utils.content_hash import content_sha256, file_sha256
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import open_fits
+from miricigale.utils.named_values import subset
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.progress import progress
@@ -242,7 +243,8 @@ class _Reduction:
     def _exposure(self, path, key):
         """Reduce one file: its calibrated product (None without), what was done, and why not more."""
         stem = _stem(path)
-        cal, rate = (f"{stem}_{kind}.fits" for kind in ("cal", "rate"))
+        cal = f"{stem}_cal.fits"
+        rate = f"{stem}_rate.fits"
         if self._is_kept(cal, key):
             return self.products.path(cal), "kept", ""
         slopes_only = "no photometry without references"
@@ -296,7 +298,7 @@ class _Reduction:
             return path, "kept", meta.get("notes", [])
         files = [read_images(cal)[0] for cal, _ in members]
         images = [file.image for file in files]
-        mesh = {name: self.reducer.background.mesh[name] for name in ("box", "filter_size")}
+        mesh = subset(self.reducer.background.mesh, ("box", "filter_size"))
         levels = [known_background(file.planes["BKG"]) for file in files]
         backgrounds = [dataclasses.replace(level, **mesh) for level in levels]
         planes = [file.planes for file in files]

@@ -32,6 +32,7 @@ from miricigale.instrument.image_planes import noise_kind, plane_data, plane_sha
 from miricigale.reduction.images.images import flagged_image, sigma
 from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import open_fits
+from miricigale.utils.named_values import without, without_none
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
@@ -282,7 +283,7 @@ def scaled_planes(planes, before, after):
 
 def shared_meta(entry):
     """The meta dictionary of an exposure, of an image of one of its integrations."""
-    return {key: value for key, value in entry.meta.items() if key != "integration"}
+    return without(entry.meta, ["integration"])
 
 
 def _unit(header, path):
@@ -371,7 +372,7 @@ def _meta(header, path):
     if part not in subarrays():
         part = None
     mode = {"filter": name, "subarray": part, "readout": readout}
-    meta |= {key: value for key, value in mode.items() if value is not None}
+    meta |= without_none(mode)
     meta |= ExposureHistory.from_header(header).meta()
     meta["source"] = path.name
     return meta

@@ -27,6 +27,7 @@ from miricigale.reduction.images.images import flagged_image, plain_flags, plain
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing, write_fits
+from miricigale.utils.named_values import without_none
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
 #: Products of JWST that are images, or cubes of them.
@@ -89,7 +90,7 @@ def write_image(image, path, *, planes=None, overwrite=False):
     }  # fmt: skip
     steps = ExposureHistory.of(image).steps
     keywords |= {word: "COMPLETE" for word, step in STEPS.items() if step in steps}
-    primary.update({key: value for key, value in keywords.items() if value is not None})
+    primary.update(without_none(keywords))
     # as the pipeline writes them; astropy takes DN/s for another unit than adu/s
     names = {RATE: "DN/s", SURFACE_BRIGHTNESS: "MJy/sr"}
     unit = next(

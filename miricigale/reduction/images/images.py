@@ -7,6 +7,7 @@ from astropy.wcs import WCS
 from miricigale.instrument import DQ, ImageFacts, mosaic_wcs
 from miricigale.instrument.image import Image
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import attributes, without_none
 from miricigale.utils.options import check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
@@ -82,7 +83,7 @@ def flag_pixels(source, selected, flag):
 def exposure_values(exposure):
     """Fields of an exposure in values that fit a header."""
     names = ("filter", "readout", "subarray", "n_groups", "n_integrations", "dither")
-    values = {name: getattr(exposure, name) for name in names}
+    values = attributes(exposure, names)
     for name in ("group_time", "exposure_time"):
         values[name] = float(getattr(exposure, name).to_value("s"))
     if exposure.pointing is not None:
@@ -92,13 +93,14 @@ def exposure_values(exposure):
             "roll": float(exposure.roll.to_value("deg")),
             "pa_aper": float(exposure.pa_aper.to_value("deg")),
         }
-    return {key: value for key, value in values.items() if value is not None}
+    return without_none(values)
 
 
 def seen_wcs(im):
     """WCS of the part of an image that holds its unmasked pixels, with its shape."""
     good = ~plain_mask(im)
-    rows, columns = (np.flatnonzero(good.any(axis=axis)) for axis in (1, 0))
+    rows = np.flatnonzero(good.any(axis=1))
+    columns = np.flatnonzero(good.any(axis=0))
     if rows.size == 0:
         rows, columns = (np.arange(n) for n in im.shape)
     part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))

@@ -142,7 +142,8 @@ def pixel_map(wcs_in, wcs_out, shape):
         for name in ("cpdis1", "cpdis2", "det2im1", "det2im2")
     )
     if smooth and min(ny, nx) > _NODES:
-        nodes_y, nodes_x = (np.linspace(0, n - 1, _NODES) for n in (ny, nx))
+        nodes_y = np.linspace(0, ny - 1, _NODES)
+        nodes_x = np.linspace(0, nx - 1, _NODES)
     else:
         nodes_y = np.arange(ny, dtype=float)
         nodes_x = np.arange(nx, dtype=float)
@@ -352,7 +353,8 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
         if nowhere.all():
             continue
         if nowhere.any():
-            x, y = (_filled(values, nowhere) for values in (x, y))
+            x = _filled(x, nowhere)
+            y = _filled(y, nowhere)
         # an image of many may reach a small part of the grid
         part = extent_of((x, y), shape)
         weight = np.where(plain_mask(im) | nowhere, 0.0, np.asarray(weight) / unit_weight)

@@ -122,7 +122,8 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     all_judged = judged[:-1, :-1] & judged[:-1, 1:] & judged[1:, :-1] & judged[1:, 1:]
     out = []
     for im, (x, y) in zip(images, pixel_maps, strict=True):
-        column, row = (np.floor(np.nan_to_num(v, nan=-1)).astype(int) for v in (x, y))
+        column = np.floor(np.nan_to_num(x, nan=-1)).astype(int)
+        row = np.floor(np.nan_to_num(y, nan=-1)).astype(int)
         inside = (column >= 0) & (column < nx - 1) & (row >= 0) & (row < ny - 1)
         column[~inside] = row[~inside] = 0
         coords = np.array([y, x])

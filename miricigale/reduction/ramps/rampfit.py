@@ -101,7 +101,8 @@ class RampFit:
         good = np.isfinite(self.rate)
         if not good.any():
             return 1.0
-        photon, read = (float(np.median(v[good])) for v in (self.var_poisson, self.var_read))
+        photon = float(np.median(self.var_poisson[good]))
+        read = float(np.median(self.var_read[good]))
         shared = float(np.sum(kernel**2))
         return float(np.sqrt((photon / shared + read) / (photon + read)))
 

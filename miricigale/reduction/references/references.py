@@ -17,6 +17,7 @@ from miricigale.instrument import (
 from miricigale.reduction.references.measured_noise import measure_noise
 from miricigale.reduction.references.reference_maps import READERS
 from miricigale.utils.exceptions import ReferenceWarning, argument_error, data_error, warn
+from miricigale.utils.named_values import without
 
 #: What slopes need, and what surface brightness needs beside them.
 SLOPES = ("mask", "saturation", "linearity", "dark", "gain", "read_noise")
@@ -134,7 +135,7 @@ def own_maps(properties, ramp):
         masks = (bad_pixel_mask, DQ.DO_NOT_USE), (reference_pixel_mask, DQ.REFERENCE_PIXEL)
         values["pixel_dq"] = sum(mask(**part) * np.int64(flag) for mask, flag in masks)
     sources |= dict.fromkeys(done, "done before")
-    values = {name: value for name, value in values.items() if name not in done}
+    values = without(values, done)
     return DetectorMaps(
         gain=properties.gain, read_noise=properties.read_noise, **values, used=sources
     )

@@ -4,6 +4,7 @@ import dataclasses
 
 from miricigale.detector.effects.reset import ResetAnomaly
 from miricigale.instrument import DetectorProperties
+from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 
 #: Known backends.
@@ -121,13 +122,13 @@ class BackgroundSettings:
         else:
             method = self.method
         names = ("box", "filter_size", "plane")
-        return {"method": method, **{name: getattr(self, name) for name in names}}
+        return {"method": method, **attributes(self, names)}
 
     @property
     def negative(self):
         """Options of `remove_background`."""
         names = ("negative_threshold", "negative_noise")
-        return {name: getattr(self, name) for name in names}
+        return attributes(self, names)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

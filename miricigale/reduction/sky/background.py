@@ -271,9 +271,8 @@ def _masked(data, mask, noise_map, mesh, correlation):
         mean, small, coarse_noise = _averaged(data, mask, noise_map, step, correlation)
         mesh = SkyMesh(mean, small, box // step, filter_size, True)
         mesh, sources_mask, flags = _search(mesh, coarse_noise)
-        sources_mask, sources = (
-            pixels_of(part, data.shape, step) & ~mask for part in (sources_mask, mesh.sources)
-        )
+        sources_mask = pixels_of(sources_mask, data.shape, step) & ~mask
+        sources = pixels_of(mesh.sources, data.shape, step) & ~mask
     if step > 1 or not plane:
         if flags and not sources.any():
             sources = None
@@ -380,7 +379,9 @@ def _sep_background(data, mask, box, filter_size, correlation):
     else:
         flags = BackgroundFlags.FEW_SKY
     error = rms * (2.14 * correlation * min(1.0, 1.2533 / filter_size) / box)
-    level, rms, error = (a.astype(np.float32, copy=False) for a in (level, rms, error))
+    level = level.astype(np.float32, copy=False)
+    rms = rms.astype(np.float32, copy=False)
+    error = error.astype(np.float32, copy=False)
     return Background(level, rms, error, np.zeros(mask.shape, bool), box, filter_size, flags)
 
 

@@ -111,7 +111,8 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
         wanted = "ones that leave some sky to each other"
         check_that(finite.any(), "images", wanted, "none in common")
         boxes = sky_boxes(np.where(finite, template, 0), ~finite, _BOX)
-        smooth, error = (boxes.smooth(v, shape, filter_size=1) for v in (boxes.level, boxes.error))
+        smooth = boxes.smooth(boxes.level, shape, filter_size=1)
+        error = boxes.smooth(boxes.error, shape, filter_size=1)
         sky = ~(mask | source)
         remainder = with_data(im, im.data - smooth)
         if sky.any():

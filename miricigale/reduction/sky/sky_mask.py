@@ -49,9 +49,8 @@ def detect(residual, rms, mask, sources):
     sky = cells_of(sky) >= 0.5
     wide = np.zeros(share.shape, bool)
     for width, area, threshold in _WIDE_TIERS if sky.any() else ():
-        smooth, weight = (
-            gaussian_filter(a, width, mode="constant") for a in (cells * share, share)
-        )
+        smooth = gaussian_filter(cells * share, width, mode="constant")
+        weight = gaussian_filter(share, width, mode="constant")
         # of one noise also where few cells count, as at the edge
         smooth /= np.sqrt(np.maximum(weight, 1e-3))
         covered = (share >= 0.5) & (weight >= 0.3)

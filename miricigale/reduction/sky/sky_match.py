@@ -4,6 +4,7 @@ import numpy as np
 
 from miricigale.reduction.images.images import check_images, plain_mask, with_data
 from miricigale.reduction.mosaic.mosaic import pixel_map
+from miricigale.utils.named_values import without_none
 
 # pixels of the grid that are averaged before images are compared
 _CELL = 8
@@ -78,9 +79,7 @@ def sky_offsets(images, wcs, *, pixel_maps=None):
         means.append(_means(im, pixels, wcs.pixel_shape[::-1]))
     n = len(images)
     pairs = {(i, j): _difference(means[i], means[j]) for i in range(n) for j in range(i)}
-    pairs = {
-        pair: offset_of_pair for pair, offset_of_pair in pairs.items() if offset_of_pair is not None
-    }
+    pairs = without_none(pairs)
     if not pairs:
         return np.zeros(n)
     # images that are one and the same have no scatter: others would count for nothing beside them
@@ -104,7 +103,8 @@ def _means(im, pixels, shape):
     x, y = pixels
     ny, nx = (-(-n // _CELL) for n in shape)
     good = ~plain_mask(im) & np.isfinite(x) & np.isfinite(y)
-    column, row = (np.floor((v[good] + 0.5) / _CELL).astype(int) for v in (x, y))
+    column = np.floor((x[good] + 0.5) / _CELL).astype(int)
+    row = np.floor((y[good] + 0.5) / _CELL).astype(int)
     inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
     cell = (row * nx + column)[inside]
     if not cell.size:

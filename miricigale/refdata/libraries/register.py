@@ -87,7 +87,8 @@ def _listed(values):
     """The values of an axis, or their number and ends where there are more than twelve."""
     if values.size <= 12:
         return f"{values.size}: {' '.join(f'{v:g}' for v in values)}"
-    first, last = (" ".join(f"{v:g}" for v in part) for part in (values[:3], values[-2:]))
+    first = " ".join(f"{v:g}" for v in values[:3])
+    last = " ".join(f"{v:g}" for v in values[-2:])
     return f"{values.size}: {first} ... {last}"
 
 

@@ -11,6 +11,7 @@ from astropy.table import Table
 from miricigale.utils.caching import cached_property
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import cached_by_file, open_fits
+from miricigale.utils.named_values import subset
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
@@ -306,7 +307,7 @@ def _open(path, name):
         kinds = ("axes", "values")
         columns = {kind: {n: np.asarray(rows[n]) for n in text[kind]} for kind in kinds}
         spectra = {n: parts.mapped(_extension(n)) for n in text["spectra"]}
-        facts = {key: text[key] for key in ("name", "units", "meta", "summary")}
+        facts = subset(text, ("name", "units", "meta", "summary"))
         return LibraryTable(wave=parts.array("WAVE"), spectra=spectra, **columns, **facts)
 
 

@@ -8,6 +8,7 @@ from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.caching import cached
+from miricigale.utils.named_values import subset
 from miricigale.utils.options import check_that
 from miricigale.utils.units import frozen_array
 
@@ -216,7 +217,7 @@ class BC03Library(StellarPopulations):
 
     @property
     def settings(self):
-        return {name: self._library().meta[name] for name in ("imf", "models", "version")}
+        return subset(self._library().meta, ("imf", "models", "version"))
 
     @property
     def library(self):

@@ -6,6 +6,7 @@ import numpy as np
 
 from miricigale.evaluation import Estimate, StudyResults, TruthResults, compare_with_paper
 from miricigale.pages import number, sentence
+from miricigale.utils.named_values import subset
 from miricigale.workflow.labels import texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags, has_flag
 from miricigale.workflow.stages.sample import matched_errors
@@ -151,7 +152,7 @@ def write_comparison(page, reasons, sentences):
         page.report.bullets(sentences)
     rows = []
     for numbers in table:
-        row = {name: numbers[name] for name in table.colnames}
+        row = subset(numbers, table.colnames)
         row["paper"] = f"{_relation(row['relation'])}{row['paper']:.3g}"
         form = ".3g"
         low = row["low"]

@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.pages import number
+from miricigale.utils.named_values import subset
 from miricigale.workflow.labels import band_label, end_bands
 from miricigale.workflow.page import band_figures, pictures, study_figures
 from miricigale.workflow.page.numbers import FEWEST
@@ -61,7 +62,7 @@ def write_photometry(page):
     if points:
         inside = {name: table[np.asarray(table["in_field"])] for name, table in points.items()}
         page.figure("points", band_figures.point_figure(inside, page.bands))
-        _write_energy(page, {name: inside[name] for name in end_bands(page.bands)})
+        _write_energy(page, subset(inside, end_bands(page.bands)))
     else:
         page.text("no_points")
     _write_conditions(page, page.metrics["detections"])

@@ -12,6 +12,7 @@ from miricigale import sed
 from miricigale.evaluation import study_numbers
 from miricigale.pages import Page
 from miricigale.psf import MatchingKernel
+from miricigale.utils.named_values import subset
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.page import paper
 from miricigale.workflow.page.derived_sections import (
@@ -79,7 +80,7 @@ def make_report(context, _):
     tables = {name: StudyTables(context, name) for name in truths}
     # truths of whose sky the analysis knows all
     unperturbed = {name: truth for name, truth in truths.items() if not truth.perturbations}
-    study_tables = {name: tables[name] for name in unperturbed}
+    study_tables = subset(tables, unperturbed)
     area = _field_area(context, shown)
     metrics = study_metrics(config, tables[shown], area)
     study = paper.study_results(config, unperturbed, study_tables, metrics)

@@ -9,6 +9,7 @@ from miricigale import evaluation, fitting, photometry, sed
 from miricigale.evaluation import posterior_ranks
 from miricigale.photometry.detection.catalogs import joined_sky
 from miricigale.photometry.errors.error_model import add_noise, fractional_error
+from miricigale.utils.named_values import without_none
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.perturbation import Perturbation
@@ -179,7 +180,7 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     effect = "zero_point_existing"
     light = Perturbation({effect: zero_point}, seed).fluxes(effect, truth[["id", *bands]], bands)
     table = light[sample]
-    depths = {band: depth for band, depth in limits.items() if depth is not None}
+    depths = without_none(limits)
     if depths:
         table = existing_errors(depths).perturb(table, seed=seed)
     for band in bands:

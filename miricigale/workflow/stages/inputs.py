@@ -16,6 +16,7 @@ from miricigale.scene import read_catalog
 from miricigale.utils.caching import cached
 from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import subset
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.engine.stage import LONG, stage
@@ -36,7 +37,7 @@ def input_axes(kind, *, dust=False):
     do not constrain it, and a fit would run to the edge of the grid (see `make_truth`).
     """
     preset = sed.SEDModel.yang2021_axes(kind)
-    axes = {name: preset[name] for name in ("tau", "age", "ebv", "alpha")}
+    axes = subset(preset, ("tau", "age", "ebv", "alpha"))
     if not dust:
         axes["alpha"] = np.array([2.0])
     return axes
