@@ -95,7 +95,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         bands = list(bands)
     table = read_table(path, wanted="a catalog of CIGALE", cls=Table)
     chosen = _choose(path, table, bands)
-    with_error = {error_column(name) for name in chosen}.intersection(bands or table.colnames)
+    with_error = set(map(error_column, chosen)).intersection(bands or table.colnames)
     lines = [name for name in chosen if _is_flux_of_line(table[name])]
     names = given_filters(names)
     try:

@@ -74,7 +74,7 @@ def parse_values(value, name):
             with np.errstate(all="raise"):
                 numbers = _value(ast.parse(text[5:].strip(), mode="eval").body)
         elif text.startswith("range "):
-            start, stop, step = (float(x) for x in text[6:].split())
+            start, stop, step = map(float, text[6:].split())
             # both ends are included
             numbers = _arange(start, stop + step, step)
         else:
@@ -167,4 +167,4 @@ def _value(node):
         msg = f"{ast.unparse(node)!r} is not read; known: {', '.join(FUNCTIONS)}"
         raise ValueError(msg)
     options = {x.arg: _value(x.value) for x in node.keywords}
-    return function(*(_value(x) for x in node.args), **options)
+    return function(*map(_value, node.args), **options)

@@ -169,7 +169,7 @@ def read_cigale_results(path):
     >>> table["id", "bayes.stellar.m_star", "best.reduced_chi_square"]  # doctest: +SKIP
     """
     table = read_table(path, wanted="results of CIGALE", cls=Table)
-    missing = [name for name in ("id", *_CHI2) if name not in table.colnames]
+    missing = [name for name in ("id",) + _CHI2 if name not in table.colnames]
     if missing:
         raise data_error(path, f"is no table of CIGALE's results: no column {', '.join(missing)}")
     for name in table.colnames:

@@ -298,7 +298,7 @@ def forecast_table(forecasts):
     rows = [f.saturated for f in forecasts]
     columns["n_sources"] = [len(r) for r in rows]
     columns["first_group"] = [int(r["group"].min()) if len(r) else 0 for r in rows]
-    columns["ids"] = [" ".join(str(i) for i in r["id"]) for r in rows]
+    columns["ids"] = [" ".join(map(str, r["id"])) for r in rows]
     table = QTable(columns)
     table["sky_fraction"].info.description = "of the full well by the last group"
     return table

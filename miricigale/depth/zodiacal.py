@@ -35,7 +35,7 @@ def zodiacal_levels():
     >>> zodiacal_levels()
     ('low', 'medium', 'high')
     """
-    return tuple(dict.fromkeys(str(level) for level in _table()["level"]))
+    return tuple(dict.fromkeys(map(str, _table()["level"])))
 
 
 def zodiacal_factor(filter, level="medium", *, position=None, date=None):

@@ -99,7 +99,7 @@ class Ramp(Interactive, NDData):
         meta=None,
     ):
         data = np.asarray(data)
-        shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
+        shape = (exposure.n_integrations, exposure.n_groups) + exposure.shape
         check_that(data.shape == shape, "data", f"of the exposure's shape {shape}", data.shape)
         if data.dtype not in (np.uint16, np.float32):
             raise argument_error("data", "of dtype uint16 or float32", data.dtype)
@@ -246,7 +246,7 @@ class Ramp(Interactive, NDData):
             gathered = np.diff(self.data[0, groups].astype(float), axis=0).min(axis=0)
             gathered[(self.pixel_dq & int(DQ.DO_NOT_USE)) != 0] = -np.inf
             pixel = np.unravel_index(np.argmax(gathered), gathered.shape)[::-1]
-        x, y = (operator.index(number) for number in pixel)
+        x, y = map(operator.index, pixel)
         check_that(0 <= x < nx and 0 <= y < ny, "pixel", f"(x, y) below ({nx}, {ny})", pixel)
         time = (np.arange(self.shape[1]) + 1) * self.group_time
         if self.group_dq is None:

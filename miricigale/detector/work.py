@@ -59,7 +59,7 @@ class Work:
     @property
     def shape(self):
         e = self.exposure
-        return (e.n_integrations, e.n_groups, *e.shape)
+        return (e.n_integrations, e.n_groups) + e.shape
 
     @functools.cached_property
     def frames(self):
@@ -157,7 +157,7 @@ class Work:
             self.properties,
             wide,
             pixel_dq,
-            np.zeros((1, 1, *shape), np.uint8),
+            np.zeros((1, 1) + shape, np.uint8),
         )
         mean, ramp, later_effects = self._lit(WholeBlock, context, chain)
         for effect, key in later_effects:
@@ -165,7 +165,7 @@ class Work:
             mean = effect.expected(mean, block)
             ramp = effect.apply(ramp, block)
         hits = (np.empty((3, 0), np.int32), np.empty(0))
-        flags = np.broadcast_to(np.uint8(0), (*self.shape[:2], rows.stop - rows.start, shape[1]))
+        flags = np.broadcast_to(np.uint8(0), self.shape[:2] + (rows.stop - rows.start, shape[1]))
         for effect, key in self.keyed:
             if isinstance(effect, CosmicRays):
                 # the shape alone is used of its flags
@@ -179,8 +179,8 @@ def _averaged(counts, flags, n_frames):
 
     A group has the flags of its frames. The sum is rounded down.
     """
-    n_int, n_all, *shape = counts.shape
-    parts = (n_int, n_all // n_frames, n_frames, *shape)
+    n_int, n_all = counts.shape[:2]
+    parts = (n_int, n_all // n_frames, n_frames) + counts.shape[2:]
     total = counts.reshape(parts).sum(axis=2, dtype=np.uint32)
     shift = n_frames.bit_length() - 1
     return (total >> shift).astype(counts.dtype), np.bitwise_or.reduce(flags.reshape(parts), axis=2)

@@ -82,7 +82,7 @@ def confusion(true, found):
     true, found = one_by_one(str, true=true, found=found)
     is_class = np.array(CLASS_NAMES)[:, None] == true
     columns = {"class": np.array(CLASS_NAMES), "n": is_class.sum(axis=1)}
-    for name in (*CLASS_NAMES, "unknown"):
+    for name in CLASS_NAMES + ("unknown",):
         columns[name] = np.sum(is_class & (found == name), axis=1)
     columns |= quality_columns(selection_quality(true == n, found == n) for n in CLASS_NAMES)
     texts = declared("miricigale.evaluation", "columns.toml")["confusion"]

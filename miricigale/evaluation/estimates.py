@@ -149,7 +149,7 @@ def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):
     0.01
     """
     columns = [floats(column) for column in columns]
-    if not columns or len({len(column) for column in columns}) != 1:
+    if not columns or len(set(map(len, columns))) != 1:
         raise argument_error("columns", "of one length", [column.shape for column in columns])
     is_finite = [np.atleast_2d(np.isfinite(column).T).any(axis=0) for column in columns]
     columns = [column[np.all(is_finite, axis=0)] for column in columns]

@@ -259,7 +259,7 @@ def _xray_luminosity(study, sky, band_set, redshift, draws):
     half = _xray_half(study, sky, band_set, None, draws)
     flux = 10.0 ** np.array([half.value, half.low, half.high]) * u.erg / u.s / u.cm**2
     values = np.log10(xray_luminosity_at(flux, redshift).value)
-    return Estimate(*(float(value) for value in values), half.n, half.n_all)
+    return Estimate(*map(float, values), half.n, half.n_all)
 
 
 def _feature(study, sky, band_set, option, draws):

@@ -96,7 +96,7 @@ def as_catalog_map(catalog_map, options=None):
 
 def _is_file_name(text):
     """Whether a text is the name of a file rather than of a survey."""
-    return text.lower().endswith((".toml", *TRANSLATE_SUFFIXES)) or os.sep in text
+    return text.lower().endswith((".toml",) + TRANSLATE_SUFFIXES) or os.sep in text
 
 
 def catalog_messages(lost, pieces, treatment="taken as missing, by the number that stands there"):

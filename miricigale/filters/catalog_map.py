@@ -121,7 +121,7 @@ class CatalogMap:
             good = np.isfinite(factor) and factor > 0
             check_that(good, "error_factors", f"positive for {name!r}", factor)
         object.__setattr__(self, "left_out", tuple(map(str, self.left_out)))
-        object.__setattr__(self, "missing", tuple(float(value) for value in self.missing))
+        object.__setattr__(self, "missing", tuple(map(float, self.missing)))
 
     @classmethod
     def read(cls, path):
@@ -230,7 +230,7 @@ class CatalogMap:
         lost = []
         if self.survey is not None:
             columns, lost = SURVEYS[self.survey].columns(colnames)
-            if not any(is_band(name) for name in {**columns, **self.columns}):
+            if not any(map(is_band, {**columns, **self.columns})):
                 wanted = f"a table with columns of {self.survey!r}"
                 raise argument_error(argument, wanted, f"columns {colnames}")
         mapped = set(self.columns.values())
@@ -285,7 +285,7 @@ class CatalogMap:
             unit = name_and_unit(theirs)[1]
             if is_band(ours) and unit is not None and getattr(out[ours], "unit", None) is None:
                 out[ours].unit = unit
-        check_names(self.units, f"column of {argument}", [*out.colnames, "flux"])
+        check_names(self.units, f"column of {argument}", out.colnames + ["flux"])
         _plain_ids(out, argument)
         coded = {}
         factor = self._factor(table, argument, coded)

@@ -83,9 +83,9 @@ class DetectorProperties:
             check_positive(getattr(self, name), name)
         for name in ("read_noise", "dark_current", "bias", "cosmic_ray_flux", "reference_columns"):
             check_least(getattr(self, name), name, 0)
-        coefficients = tuple(float(c) for c in self.nonlinearity)
+        coefficients = tuple(map(float, self.nonlinearity))
         object.__setattr__(self, "nonlinearity", coefficients)
-        object.__setattr__(self, "ipc", tuple(float(c) for c in self.ipc))
+        object.__setattr__(self, "ipc", tuple(map(float, self.ipc)))
         response = []
         for filter, array, ratio in self.response:
             response.append((str(filter), str(array), float(ratio)))

@@ -331,7 +331,7 @@ def _read_pointings(path, observation, exposure):
             apertures.add(words[4])
             if not words[4].startswith("MIRIM") or words[18] not in _USED:
                 continue
-            target, tile, number, dither = (int(word) for word in words[:4])
+            target, tile, number, dither = map(int, words[:4])
             places = pointings.setdefault(current, {}).setdefault(number, {})
             offset = float(words[11]), float(words[12])
             places.setdefault((target, tile), {}).setdefault(dither, offset)

@@ -397,12 +397,12 @@ class Exposure(Interactive):
         part = self.aperture
         ra = self.pointing.ra.deg
         dec = self.pointing.dec.deg
-        v2, v3 = (float(v) for v in pixel_to_v2v3(*part.reference, subarray=self.subarray))
+        v2, v3 = map(float, pixel_to_v2v3(*part.reference, subarray=self.subarray))
         matrix = attitude_matrix(ra, dec, self.roll.value, v2=v2, v3=v3)
         ra_v1, dec_v1 = v2v3_to_sky(0.0, 0.0, matrix)
         boresight = SkyCoord(float(ra_v1), float(dec_v1), unit="deg")
         # a point on the +V3 axis
-        north = SkyCoord(*(float(t) for t in v2v3_to_sky(0.0, 3600.0, matrix)), unit="deg")
+        north = SkyCoord(*map(float, v2v3_to_sky(0.0, 3600.0, matrix)), unit="deg")
         return {
             "RA_REF": float(ra),
             "DEC_REF": float(dec),

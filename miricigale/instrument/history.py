@@ -211,7 +211,7 @@ def epoch_of(image):
         else:
             header[name] = card
     days = [header.get(name) for name in _MIDDLES[:3]]
-    days += [meta.get("day"), *(header.get(name) for name in _MIDDLES[3:])]
+    days += [meta.get("day"), *map(header.get, _MIDDLES[3:])]
     wcs = getattr(getattr(image, "wcs", None), "wcs", None)
     days += [getattr(wcs, name, None) for name in ("mjdavg", "mjdobs", "mjdbeg")]
     for day in days:

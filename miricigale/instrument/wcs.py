@@ -213,7 +213,7 @@ def tangent_offset(pointing, x_offset, y_offset, pa):
     >>> moved.to_string(precision=3)
     '53.110 0.000'
     """
-    ra, dec = (np.radians(angle) for angle in _radec(pointing, "pointing"))
+    ra, dec = map(np.radians, _radec(pointing, "pointing"))
     x = to_array(x_offset, u.rad, "x_offset")
     y = to_array(y_offset, u.rad, "y_offset")
     pa = float(to_array(pa, u.rad, "pa", ndim=0))
@@ -319,7 +319,7 @@ def north_up_wcs(center, pixel_scale, shape):
     """
     ra, dec = _radec(center, "center")
     scale = positive(pixel_scale, u.deg, "pixel_scale")
-    ny, nx = (int(n) for n in shape)
+    ny, nx = map(int, shape)
     check_that(ny >= 1 and nx >= 1, "shape", "two positive integers", shape)
     wcs = _gnomonic((ra, dec), [(nx + 1) / 2, (ny + 1) / 2], (ny, nx))
     wcs.wcs.cdelt = [-scale, scale]

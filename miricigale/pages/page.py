@@ -115,7 +115,7 @@ class Page:
             ``empty``.
         """
         rows = [tuple(row) for row in rows]
-        lengths = {len(row) for row in rows}
+        lengths = set(map(len, rows))
         check_that(lengths <= {len(header)}, "rows", f"{len(header)} cells in each row", lengths)
         if not rows:
             check_that(empty, "rows", "at least one, or 'empty' for the sentence", "none")

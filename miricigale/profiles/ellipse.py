@@ -40,7 +40,7 @@ def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     cos = np.cos(direction)
     sin = np.sin(direction)
     # columns: the images of the two semi-axes; their outer products add up to the shape matrix
-    axes = np.stack([cos, -axis_ratio * sin, sin, axis_ratio * cos], -1).reshape(*cos.shape, 2, 2)
+    axes = np.stack([cos, -axis_ratio * sin, sin, axis_ratio * cos], -1).reshape(cos.shape + (2, 2))
     axes = jacobian @ (axes * radius[..., None, None])
     shape = axes @ np.swapaxes(axes, -1, -2)
     a = shape[..., 0, 0]

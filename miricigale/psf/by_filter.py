@@ -20,7 +20,7 @@ from miricigale.utils.units import ANGLE
 _log = logging.getLogger(__name__)
 
 #: Filters that `filter_psf` knows.
-MODEL_FILTERS = (*MIRI_FILTERS, *NIRCAM_FILTERS, *WFC3_FILTERS)
+MODEL_FILTERS = MIRI_FILTERS + NIRCAM_FILTERS + WFC3_FILTERS
 
 #: Factor in FWHM beyond which a PSF is not that of the filter; parts from which on a narrower and a
 #: wider one gets a warning (real mosaics are some percent wider than the models).
@@ -214,7 +214,7 @@ def _check_turn(psf, center, stamps, model_facts, argument):
         # wings fall steeply: each ring has the same weight
         return (image[in_ring] - mean[ring[in_ring]]) * radius[in_ring]
 
-    measured, sky_spikes, detector_spikes = (spikes(stamp) for stamp in (psf.data, *stamps))
+    measured, sky_spikes, detector_spikes = map(spikes, (psf.data, *stamps))
     measured = measured * (stamps[0].sum() / psf.data.sum())
     on_sky = float(measured @ sky_spikes) / float(sky_spikes @ sky_spikes)
     on_detector = float(measured @ detector_spikes) / float(detector_spikes @ detector_spikes)

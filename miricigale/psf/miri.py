@@ -205,7 +205,7 @@ def miri_psf(
     if position is None:
         place = None
     else:
-        place = (*(float(v) for v in position), subarray)
+        place = (*map(float, position), subarray)
     data, scale = _miri_data(telescope, oversampling, width, effects, calibration, place)
     if "cruciform" in effects:
         scattered = cruciform_fraction(name, calibration=calibration)

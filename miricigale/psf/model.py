@@ -122,7 +122,7 @@ class InstrumentPSF(ImagePSF):
         if position is None:
             self.position = None
         else:
-            self.position = tuple(float(v) for v in position)
+            self.position = tuple(map(float, position))
         self.subarray = subarray
 
     def __repr__(self):
@@ -267,7 +267,7 @@ class PSFGrid(GriddedPSFModel):
         order = np.lexsort(np.transpose(positions))
         first = psfs[0]
         meta = {**first.meta, "oversampling": first.n_cells}
-        meta["grid_xypos"] = [tuple(float(v) for v in positions[k]) for k in order]
+        meta["grid_xypos"] = [tuple(map(float, positions[k])) for k in order]
         super().__init__(NDData(np.stack([psfs[k].data for k in order]), meta=meta))
         for name in SHARED:
             setattr(self, name, getattr(first, name))
@@ -545,7 +545,7 @@ def from_photutils(model, *, x=None, y=None, **options):
 
 def _half_width(data, origin):
     """Cells from the center to the nearest edge."""
-    x, y = (float(v) for v in origin)
+    x, y = map(float, origin)
     return min(x, data.shape[1] - 1 - x, y, data.shape[0] - 1 - y) + 0.5
 
 

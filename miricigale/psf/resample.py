@@ -323,7 +323,7 @@ def centered_psf(psf, tolerance, argument="psf"):
     """
     psf = instrument_psf(psf, argument)
     x, y, _ = _core.core_moments(psf.data)
-    offset = tuple(float(v) for v in ([x, y] - psf.origin) * psf.cell)
+    offset = tuple(map(float, ([x, y] - psf.origin) * psf.cell))
     if not np.hypot(*offset) < 0.5 * psf.half_width:
         wanted = "a PSF whose core stands near its center"
         raise argument_error(argument, wanted, f"a core at x, y = {x:.4g}, {y:.4g}")

@@ -358,7 +358,7 @@ class StarPSF:
                 values = fit.residual[inside] / (fit.flux * fit.star.area)
                 pair[0] += np.bincount(cell, weight * values, image.size)
                 pair[1] += np.bincount(cell, weight, image.size)
-            sums.append(pair.reshape(2, *shape))
+            sums.append(pair.reshape((2,) + shape))
         # a PSF that ends within its grid is 0 beyond
         light = np.maximum(gaussian_filter(image, self._fwhm / 2.3548), 1e-9 * image.max())
         prior = (_CELLS * light) ** -2.0

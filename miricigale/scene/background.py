@@ -112,7 +112,7 @@ class Background:
         # smooth, so a coarse grid is enough
         nodes = [np.linspace(-0.5, n - 0.5, 12) for n in (ny, nx)]
         x, y = np.meshgrid(nodes[1], nodes[0])
-        ra, dec = np.radians(pixel_to_radec(wcs, x.ravel(), y.ravel())).reshape(2, *x.shape)
+        ra, dec = np.radians(pixel_to_radec(wcs, x.ravel(), y.ravel())).reshape((2,) + x.shape)
         ra0 = center.icrs.ra.rad
         dec0 = center.icrs.dec.rad
         cos = np.sin(dec0) * np.sin(dec) + np.cos(dec0) * np.cos(dec) * np.cos(ra - ra0)

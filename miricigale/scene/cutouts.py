@@ -127,7 +127,7 @@ class Cutout(Frozen):
             got = f"sides of {sides[0]:.4g} and {sides[1]:.4g} arcsec, cosine {cosine:.3g}"
             raise argument_error("image", wanted, got)
         if position is not None:
-            x, y = (float(v) for v in image.wcs.world_to_pixel(position))
+            x, y = map(float, image.wcs.world_to_pixel(position))
         # east of north is counter-clockwise where +x is west of +y
         if np.linalg.det(steps) > 0:
             data = data[:, ::-1]

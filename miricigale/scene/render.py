@@ -124,7 +124,7 @@ class Painter:
     def _landing(self):
         """Which part of the light on each node lands on the image."""
         shape = self._phases.shape
-        sums = np.zeros((*shape[:3], shape[3] + 1, shape[4] + 1))
+        sums = np.zeros(shape[:3] + (shape[3] + 1, shape[4] + 1))
         sums[..., 1:, 1:] = self._phases.cumsum(axis=3).cumsum(axis=4)
         n_y, n_x = self.shape
         axis_y, axis_x = self._axes()

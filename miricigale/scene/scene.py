@@ -170,7 +170,7 @@ class Scene(Interactive):
             psf = miri_psf(self._filter)
         else:
             psf = as_psf(psf)
-        self._shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
+        self._shape = tuple(map(int, wcs.pixel_shape[::-1]))
         self._background = self._check_background(background)
         scale = float(np.abs(np.linalg.det(self._center_jacobian())) ** -0.5)
         self._check_psf(psf, scale)

@@ -277,7 +277,7 @@ class ModelGrid(Frozen):
 
 def _write(grid, path, *, overwrite=False):
     tables = attributes(grid, _TABLES)
-    text = attributes(grid, ("filters", "meta", *_FACTS))
+    text = attributes(grid, ("filters", "meta") + _FACTS)
     text["descriptions"] = {
         name: {column: table[column].info.description for column in table.colnames}
         for name, table in tables.items()
@@ -303,7 +303,7 @@ def _read(path):
                 # pure numbers are quantities again, too
                 table[column] = u.Quantity(table[column], dtype=float)
                 table[column].info.description = description
-        facts = subset(text, ("meta", *_FACTS))
+        facts = subset(text, ("meta",) + _FACTS)
         return ModelGrid(tuple(text["filters"]), **arrays, **tables, **facts)
 
 

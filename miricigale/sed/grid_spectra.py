@@ -88,7 +88,7 @@ def draw_fluxes(grid, index, scale, names, extra, model):
     formed; ``names`` and ``extra`` come from `band_names`; ``model`` is that of the grid, for bands
     that this has not, or None.
     """
-    out = np.full((*scale.shape, len(names)), np.nan)
+    out = np.full(scale.shape + (len(names),), np.nan)
     in_grid = [i for i, name in enumerate(names) if name in grid.filters]
     columns = [grid.filters.index(names[i]) for i in in_grid]
     for row in range(len(index)) if in_grid else ():

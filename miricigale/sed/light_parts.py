@@ -83,11 +83,11 @@ class BandSums:
 
     def __call__(self, spectra):
         """Fluxes in uJy, shape (n, nz, nb), of spectra L_lambda in W/um, shape (n, n_wave)."""
-        flux = np.empty((len(spectra), *self.shape))
+        flux = np.empty((len(spectra),) + self.shape)
         for first in range(0, len(spectra), _BLOCK):
             part = slice(first, first + _BLOCK)
             sums = self.weights @ np.ascontiguousarray(spectra[part].T)
-            flux[part] = sums.T.reshape(-1, *self.shape)
+            flux[part] = sums.T.reshape((-1,) + self.shape)
         return flux
 
 

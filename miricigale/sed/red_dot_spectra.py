@@ -52,7 +52,7 @@ _PARAMETERS = {
 def _wavelengths():
     """Rest wavelengths in um: finely where bands of surveys are, and over the lines."""
     across = np.linspace(-0.02, 0.02, 61)
-    lines = [line * (1.0 + across) for line in (_H_ALPHA, _H_BETA, *_OIII)]
+    lines = [line * (1.0 + across) for line in (_H_ALPHA, _H_BETA) + _OIII]
     optical = np.geomspace(_LYMAN, 1.5, 1200)
     jumps = np.array([_LYMAN, _BALMER])
     both_sides = np.concatenate([jumps * (1.0 - 1e-5), jumps * (1.0 + 1e-5)])

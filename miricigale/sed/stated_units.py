@@ -93,7 +93,7 @@ def _flux_unit(texts, path):
     for text in texts:
         if _TIMES.search(text):
             raise data_error(path, f"has fluxes times frequencies or wavelengths: {text!r}")
-    if any(_BARE_FNU.search(text) for text in texts):
+    if any(map(_BARE_FNU.search, texts)):
         raise data_error(
             path, "has fluxes per frequency without a unit: write it behind, as fnu(uJy)"
         )

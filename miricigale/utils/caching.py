@@ -80,7 +80,7 @@ def frozen(value):
     if isinstance(value, dict):
         return FrozenDict({key: frozen(entry) for key, entry in value.items()})
     if isinstance(value, list):
-        return FrozenList(frozen(entry) for entry in value)
+        return FrozenList(map(frozen, value))
     if isinstance(value, tuple):
         entries = [frozen(entry) for entry in value]
         if hasattr(value, "_fields"):

@@ -30,7 +30,7 @@ def _plain_name(name):
 
 def is_id_name(name):
     """Whether a column of this name holds ids by its name alone."""
-    return _plain_name(name) in (*_NAMES, _LABEL)
+    return _plain_name(name) in _NAMES + (_LABEL,)
 
 
 def id_column(colnames, argument, *, labels=True):

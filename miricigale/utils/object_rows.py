@@ -87,7 +87,7 @@ class ObjectRows(Interactive):
         return self.isscalar or len(self) > 0
 
     def __iter__(self):
-        return (self._take(row) for row in range(len(self)))
+        return map(self._take, range(len(self)))
 
     def __getitem__(self, key):
         if self.isscalar:

@@ -63,7 +63,7 @@ def check_data(good, path, problem):
 
 def check_choice(value, name, choices):
     """Refuse a value that is none of those known (a `ValueError`)."""
-    check_that(value in choices, name, " or ".join(repr(choice) for choice in choices), repr(value))
+    check_that(value in choices, name, " or ".join(map(repr, choices)), repr(value))
 
 
 def check_names(names, kind, available):

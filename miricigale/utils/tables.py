@@ -94,7 +94,7 @@ def as_table(data, argument):
         data = frame_columns(data, argument)
     try:
         if isinstance(data, Mapping):
-            shape = np.broadcast_shapes((1,), *(np.shape(column) for column in data.values()))
+            shape = np.broadcast_shapes((1,), *map(np.shape, data.values()))
             columns = {name: _filled(column, shape[0]) for name, column in data.items()}
             return QTable(columns, copy=False)
         if isinstance(data, np.ndarray) and data.dtype.names:

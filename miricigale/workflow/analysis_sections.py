@@ -143,7 +143,7 @@ class PerturbSection(Section):
     effects: tuple[str, ...] = option(
         (),
         "Effects; 'all' are those that the skies allow.",
-        choices=(*EFFECTS, ALL),
+        choices=EFFECTS + (ALL,),
         single=True,
         unique=True,
     )

@@ -146,7 +146,7 @@ class Persistence(Effect):
         check_share("deficit", self.deficit)
         check_amounts(above_zero=True, deficit_time=self.deficit_time)
         for name in ("amplitudes", "times"):
-            values = tuple(float(v) for v in np.atleast_1d(getattr(self, name)))
+            values = tuple(map(float, np.atleast_1d(getattr(self, name))))
             object.__setattr__(self, name, values)
         if not self.amplitudes or len(self.amplitudes) != len(self.times):
             got = f"{len(self.amplitudes)} and {len(self.times)}"

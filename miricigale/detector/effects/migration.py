@@ -59,7 +59,7 @@ class BrighterFatter(Effect):
         scale = np.float32(0.5 / block.properties.full_well)
         pairs = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])
         for integration in ramp:
-            moved, before = np.zeros((2, *ramp.shape[2:]), np.float32)
+            moved, before = np.zeros((2,) + ramp.shape[2:], np.float32)
             for group in integration:
                 charge = group - before
                 level = (group + before) * scale

@@ -57,7 +57,7 @@ class ResetAnomaly(Effect):
     groups: float = 4.0
 
     def __post_init__(self):
-        amplitudes = tuple(float(a) for a in np.atleast_1d(self.amplitudes))
+        amplitudes = tuple(map(float, np.atleast_1d(self.amplitudes)))
         object.__setattr__(self, "amplitudes", amplitudes)
         check_that(amplitudes, "amplitudes", "at least one amplitude", "none")
         check_finite(amplitudes=amplitudes)

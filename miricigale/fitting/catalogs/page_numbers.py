@@ -105,6 +105,6 @@ def known_redshifts(rows, name, step=1):
     if name is None:
         return None, np.full(len(range(0, rows.n_rows, step)), np.nan)
     check_that(name in names, "z_spec", f"one of the columns {list(names)}", repr(name))
-    chunks = thinned((rows.chunk(i) for i in range(rows.n_chunks)), step)
+    chunks = thinned(map(rows.chunk, range(rows.n_chunks)), step)
     z = np.concatenate([plain_floats(chunk[name], name, "photometry") for chunk in chunks])
     return name, np.where(z > 0, z, np.nan)

@@ -190,7 +190,7 @@ def fit_file(
 def _chi2_limit(folder, n_parts):
     """Compute the reduced chi2 above which a fit is poor, from all parts."""
     parts = [part_chi2(folder.path(part_name(i))) for i in range(n_parts)]
-    step = chi2_step(sum(len(chi2) for chi2 in parts))
+    step = chi2_step(sum(map(len, parts)))
     return chi2_limit(np.concatenate(parts)[::step])
 
 

@@ -429,7 +429,7 @@ def limits(table, name):
         is_readable = is_true = np.zeros(len(table), dtype=bool)
     if data_values.shape != (len(table),) or not np.all(is_readable | mask):
         wanted = f"a table whose column {column!r} is boolean"
-        first_values = ", ".join(str(value) for value in values[:3])
+        first_values = ", ".join(map(str, values[:3]))
         raise argument_error("photometry", wanted, f"{first_values}, ...")
     return is_true & ~mask
 

@@ -213,7 +213,7 @@ def joint_tables(out, pairs, axes):
 
 def _fold(table, share):
     """Sum the last axis, of models, up to the values of a parameter: (..., m) to (..., n)."""
-    out = np.empty((*table.shape[:-1], len(share)))
+    out = np.empty(table.shape[:-1] + (len(share),))
     for value, part in enumerate(share):
         models = np.flatnonzero(part)
         # in memory order: the last digits must not depend on how many rows there are

@@ -161,8 +161,8 @@ class ShapeQuantities:
         cell. Rows of NaN give NaN.
         """
         shape = len(weights), len(self.names)
-        out = np.full((*shape, 3), np.nan)
-        quantiles = np.full((*shape, len(levels)), np.nan)
+        out = np.full(shape + (3,), np.nan)
+        quantiles = np.full(shape + (len(levels),), np.nan)
         for i, (order, start, nodes) in enumerate(self._nodes):
             if nodes.size == 0:
                 continue

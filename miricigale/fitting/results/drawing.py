@@ -221,7 +221,7 @@ def plot_corner(results, key=None, names=None, *, truths=None, figure=None):
 
 def _with_joint_posteriors(result):
     """List parameters all of whose pairs have a joint posterior, beginning with redshift and AGN fraction."""
-    pairs = {frozenset(pair) for pair in result.pairs}
+    pairs = set(map(frozenset, result.pairs))
     if "frac_agn" in result.axes:
         pairs.add(frozenset(("redshift", "frac_agn")))
     names = []

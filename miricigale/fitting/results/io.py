@@ -48,7 +48,7 @@ def write_results(results, path, *, overwrite=False):
         parts = getattr(results, name).items()
         table |= {f"{name}:{key}": getattr(value, "value", value) for key, value in parts}
     table |= {f"pair:{i}": weights for i, weights in enumerate(results.pairs.values())}
-    text = attributes(results, (*_TUPLES, *_FACTS))
+    text = attributes(results, _TUPLES + _FACTS)
     text |= {
         "pairs": [list(names) for names in results.pairs],
         "units": [u.Unit(unit).to_string() for unit in results.units],
@@ -85,7 +85,7 @@ def read_results(path, *, rows=None):
                 values[name][part] = array
         pairs = enumerate(text["pairs"])
         values["pairs"] = {tuple(names): columns[f"pair:{i}"] for i, names in pairs}
-        values["units"] = tuple(u.Unit(unit) for unit in text["units"])
+        values["units"] = tuple(map(u.Unit, text["units"]))
         values["axes"] = _axes_from_plain(text["axes"], {})
         results = FitResults(**values)
         if text.get("single"):
@@ -129,7 +129,7 @@ def read_samples(path, grid, *, model=None):
         table = parts.table("SAMPLES")
         shape = len(table), int(text["n_draws"])
         columns = {name: native(table[name]) for name in ("ids", "flags", "index", "scale")}
-        columns["index"] = columns["index"].reshape(*shape, 4)
+        columns["index"] = columns["index"].reshape(shape + (4,))
         columns["scale"] = columns["scale"].reshape(shape)
         columns["drawn"] = {}
         for name in table.colnames:
@@ -137,7 +137,7 @@ def read_samples(path, grid, *, model=None):
                 array = native(table[name]).reshape(shape)
                 columns["drawn"][name.removeprefix(_DRAWN)] = array
         if "flux" in table.colnames:
-            columns["flux"] = native(table["flux"]).reshape(*shape, len(grid.filters))
+            columns["flux"] = native(table["flux"]).reshape(shape + (len(grid.filters),))
         shares = {}
         for i, name in enumerate(text["axes"]):
             if f"SHARE{i}" in parts:

@@ -86,7 +86,7 @@ def write_plots(results, folder, ids=None, *, overwrite=False, progress_bar=Fals
     folder = Path(folder)
     missing_ids = None
     if ids is not None:
-        missing_ids = {str(key) for key in ids}
+        missing_ids = set(map(str, ids))
     filters = None
     paths = []
     with progress(show=progress_bar, total=len(results), desc="plots", unit="objects") as bar:

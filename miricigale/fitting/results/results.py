@@ -407,7 +407,7 @@ class FitResults(FitRows):
         """
         name = self._named(name)
         edges, weights = self.distribution(name)
-        first = np.zeros((*weights.shape[:-1], 1))
+        first = np.zeros(weights.shape[:-1] + (1,))
         if name not in self.axes:
             first[:] = DERIVED_LEVELS[0]
         # rounding may lift a sum above 1

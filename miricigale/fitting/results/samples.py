@@ -125,7 +125,7 @@ model : `~miricigale.sed.SEDModel`, optional
         shape = np.shape(self.scale)
         if len(shape) != 2 or shape[0] != n or shape[1] < 1:
             raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
-        for name, wanted in (("index", (*shape, 4)), ("flags", (n,))):
+        for name, wanted in (("index", shape + (4,)), ("flags", (n,))):
             got = np.shape(getattr(self, name))
             check_that(got == wanted, name, f"of shape {wanted}", got)
         sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
@@ -150,7 +150,7 @@ model : `~miricigale.sed.SEDModel`, optional
                 array.shape == shape, "drawn", f"of shape {shape}", f"{array.shape} ({name})"
             )
         object.__setattr__(self, "drawn", drawn)
-        shape = (*shape, len(self.grid.filters))
+        shape = shape + (len(self.grid.filters),)
         got = np.shape(self.flux)
         check_that(got == shape, "flux", f"of shape {shape} with 'drawn'", got)
         object.__setattr__(self, "flux", np.asarray(self.flux, float))
@@ -410,16 +410,16 @@ model : `~miricigale.sed.SEDModel`, optional
         if extra:
             model = self._model()
         rows = self._several()
-        out = np.full((*rows.scale.shape, len(names)), np.nan)
+        out = np.full(rows.scale.shape + (len(names),), np.nan)
         fitted = rows.fitted
         if not self.on_nodes:
             for i in np.flatnonzero(fitted):
                 out[i] = fluxes_between_nodes(rows[int(i)], names, extra, model)
-            return out.reshape(*self.scale.shape, len(names)) * FNU
+            return out.reshape(self.scale.shape + (len(names),)) * FNU
         out[fitted] = grid_spectra.draw_fluxes(
             self.grid, rows.index[fitted], rows.scale[fitted], names, extra, model
         )
-        return out.reshape(*self.scale.shape, len(names)) * FNU
+        return out.reshape(self.scale.shape + (len(names),)) * FNU
 
     def _model(self):
         check_that(self.model is not None, "model", "an SEDModel (these samples know none)", "None")

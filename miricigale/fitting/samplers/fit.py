@@ -241,7 +241,7 @@ class SamplerFit:
             **dict.fromkeys(("model_flux", "model_flux_std", "best_flux"), (len(self.filters),)),
             **dict.fromkeys(("chi2", "log_evidence", "log_evidence_err", "n_effective"), ()),
         }
-        out = {name: np.full((n, *shape), np.nan) for name, shape in shapes.items()}
+        out = {name: np.full((n,) + shape, np.nan) for name, shape in shapes.items()}
         out |= {
             "n_calls": np.zeros(n, np.int64),
             "converged": np.zeros(n, bool),

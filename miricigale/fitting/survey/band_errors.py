@@ -151,7 +151,7 @@ def long_instruments(bands):
     for group in by_instrument.values():
         if min(wave[band] for band in group) > _LONG_PIVOT:
             groups.append(group)
-    n_long = sum(len(group) for group in groups)
+    n_long = sum(map(len, groups))
     if len(bands) - n_long >= MIN_PREDICTING_BANDS:
         return groups
     return []

@@ -131,7 +131,7 @@ def measure_band_errors(left, template_error, *, longest=LONGEST_REST * u.um, pr
     """
     longest = to_array(longest, WAVE, "longest", ndim=0)
     if prior is None:
-        priors = {prior_of_band(band) for band in left.bands}
+        priors = set(map(prior_of_band, left.bands))
         check_that(len(priors) == 1, "left", "of bands of MIRI, or of others", list(left.bands))
         prior = priors.pop()
     samples = []

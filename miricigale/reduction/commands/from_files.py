@@ -150,7 +150,7 @@ _TABLE = "files.ecsv"
 _PAGE = "index.html"
 #: Stages of files that are calibrated.
 _CALIBRATED = ("cal", "calints", "i2d", "crf")
-_STAGES = ("uncal", "ramp", "rate", "rateints", *_CALIBRATED)
+_STAGES = ("uncal", "ramp", "rate", "rateints") + _CALIBRATED
 
 
 def _name_parts(path):

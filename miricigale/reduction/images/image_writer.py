@@ -156,7 +156,7 @@ def write_image(image, path, *, planes=None, overwrite=False):
 def _nominal_area():
     """Solid angle of the pixel at the reference point of the full frame, sr."""
     part = aperture("FULL")
-    x, y = (round(place) for place in part.reference)
+    x, y = map(round, part.reference)
     return float(pixel_area_map(imager_wcs("0 0", 0 * u.deg), part.shape)[y, x])
 
 

@@ -102,7 +102,7 @@ def seen_wcs(im):
     rows = np.flatnonzero(good.any(axis=1))
     columns = np.flatnonzero(good.any(axis=0))
     if rows.size == 0:
-        rows, columns = (np.arange(n) for n in im.shape)
+        rows, columns = map(np.arange, im.shape)
     part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     wcs = im.wcs.slice(part)
     wcs.pixel_shape = tuple(int(np.ptp(index)) + 1 for index in (columns, rows))

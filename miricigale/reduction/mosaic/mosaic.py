@@ -322,7 +322,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     images = list(images)
     check_images(images, wcs)
     check_that(0 < pixfrac <= 1, "pixfrac", "above 0 and at most 1", pixfrac)
-    shape = tuple(int(n) for n in wcs.pixel_shape[::-1])
+    shape = tuple(map(int, wcs.pixel_shape[::-1]))
     if pixel_maps is None:
         pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     check_overlap(pixel_maps, shape)

@@ -329,7 +329,7 @@ def _drift(values, shape):
         values = np.broadcast_to(values, shape[:2])[:, :, None, None]
     fits = values.ndim == 4 and values.shape[:2] == shape[:2] and values.shape[2] in (1, shape[2])
     if not fits or values.shape[3] not in (1, 4) or not np.isfinite(values).all():
-        wanted = f"finite, of shape {shape[:2]} or {(*shape[:2], '1 or ' + str(shape[2]), 4)}"
+        wanted = f"finite, of shape {shape[:2]} or {shape[:2] + ('1 or ' + str(shape[2]), 4)}"
         raise argument_error("drift", wanted, f"shape {values.shape}")
     return np.array(values, order="C")
 

@@ -53,14 +53,14 @@ def settling_groups(data, maps, usable):
     >>> int(settling_groups(data, maps, np.ones((32, 32), bool))[0][0])
     7
     """
-    n_int, n_group, *shape = data.shape
+    n_int, n_group = data.shape[:2]
     if n_group < _FEWEST or not usable.any():
         return np.zeros(n_int, int), np.zeros((n_int, n_group))
     pixels = np.flatnonzero(usable)
     pixels = pixels[:: 1 + pixels.size // _SAMPLE]
 
     def sampled(values):
-        return np.broadcast_to(values, shape).ravel()[pixels]
+        return np.broadcast_to(values, data.shape[2:]).ravel()[pixels]
 
     raw = data.reshape(n_int, n_group, -1)[:, :, pixels]
     levels = polyval(raw - sampled(maps.bias), [sampled(c) for c in maps.linearity], tensor=False)

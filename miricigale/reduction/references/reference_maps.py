@@ -49,7 +49,7 @@ def _header(hdus, path, name, extension, exposure=None):
     if exposure is not None:
         wanted["READPATT"] = exposure.readout
         # references of single frames serve groups that are their means
-        patterns = (frame_pattern(exposure.readout), *_ANY)
+        patterns = (frame_pattern(exposure.readout),) + _ANY
     if name == "flat" and exposure.filter is not None:
         wanted["FILTER"] = exposure.filter.rpartition(".")[2].upper()
     for key, value in wanted.items():
@@ -104,7 +104,7 @@ def _flags(path, name, hdus, header, exposure):
         return np.zeros(shape, np.int64)
     stored = hdus["DQ"].data
     # those of groups and integrations together
-    stored = np.bitwise_or.reduce(stored.reshape(-1, *stored.shape[-2:]), axis=0)
+    stored = np.bitwise_or.reduce(stored.reshape((-1,) + stored.shape[-2:]), axis=0)
     stored = _cut(path, name, stored, header, exposure).astype(np.int64)
     if "DQ_DEF" in hdus:
         table = hdus["DQ_DEF"].data
@@ -200,12 +200,13 @@ def _averaged_groups(array, n_frames, *, complete):
     A ``complete`` reference has no value beyond its frames, so that a last part of a group is left out; else
     there is no signal in the frames beyond.
     """
-    n_int, n_all, *shape = array.shape
+    n_int, n_all = array.shape[:2]
     if not complete:
         array = np.pad(array, ((0, 0), (0, -n_all % n_frames), (0, 0), (0, 0)))
     n_groups = array.shape[1] // n_frames
     frames = array[:, : n_groups * n_frames]
-    return frames.reshape(n_int, n_groups, n_frames, *shape).mean(axis=2, dtype=np.float32)
+    groups = frames.reshape((n_int, n_groups, n_frames) + array.shape[2:])
+    return groups.mean(axis=2, dtype=np.float32)
 
 
 #: Readers of the references of slopes, in the order of their use: each gives values (or None) and flags.

@@ -240,7 +240,7 @@ def _filtered(values, size):
             mirror = {"mode": "edge"}
         padded = np.pad(padded, ends, **mirror)
     window = np.lib.stride_tricks.sliding_window_view(padded, (size, size))
-    window = window.reshape(*values.shape, -1)
+    window = window.reshape(values.shape + (-1,))
     valid = np.isfinite(values) | (np.isfinite(window).sum(axis=-1) >= 3)
     out = np.full(values.shape, np.nan)
     out[valid] = np.nanmedian(window[valid], axis=-1)

@@ -204,7 +204,7 @@ def _byte_order(data):
     for order in "<>":
         if len(data) < 12:
             return None
-        size, count = (int(x) for x in np.frombuffer(data, f"{order}i4", 2))
+        size, count = map(int, np.frombuffer(data, f"{order}i4", 2))
         if 1 < count < _MOST_AGES and 4 * count + 60 <= size < 4 * count + 2000:
             return order
     return None

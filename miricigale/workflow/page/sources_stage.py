@@ -44,7 +44,7 @@ FLAGS = {
     "source browser",
     version=2,
     needs=("truth", "mosaics", "highres", "photometry", "matches", "fits"),
-    sections=("run.name", "catalog", *KERNEL, "photometry", "fit", "report"),
+    sections=("run.name", "catalog") + KERNEL + ("photometry", "fit", "report"),
     resources=sed_resources,
     units=truth_names,
     # the prior of the patch that is shown is of no truth

@@ -42,7 +42,7 @@ from miricigale.workflow.labels import (
 from miricigale.workflow.page.numbers import MIPS_LIMIT
 
 #: Classes that sources are found in, as columns of tables.
-CLASS_COLUMNS = (*CLASS_NAMES, "unknown")
+CLASS_COLUMNS = CLASS_NAMES + ("unknown",)
 #: Bins of the histograms of ranks.
 _RANK_BINS = 10
 #: PAH features that are looked for in the residuals.

@@ -30,8 +30,8 @@ log = logging.getLogger(__name__)
 
 #: Sections of the configuration on which the grids of images depend, what is exposed, and kernels.
 GRID = ("pointing", "exposures")
-IMAGES = (*GRID, "scene", "detector", "reduction")
-KERNEL = (*GRID, "patches", "highres", "photometry.regularization", "reduction")
+IMAGES = GRID + ("scene", "detector", "reduction")
+KERNEL = GRID + ("patches", "highres", "photometry.regularization", "reduction")
 
 #: Reference data of the simulated images.
 IMAGE_RESOURCES = (
@@ -42,7 +42,7 @@ IMAGE_RESOURCES = (
     "filters.sedpy",
 )
 # residual = "etc" says whose pattern it is, not how strong, and a level whose sky
-EXPOSURE_RESOURCES = (*IMAGE_RESOURCES, "instrument.etc", "instrument.zodiacal")
+EXPOSURE_RESOURCES = IMAGE_RESOURCES + ("instrument.etc", "instrument.zodiacal")
 
 
 def study_exposures(config):

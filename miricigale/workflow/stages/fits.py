@@ -92,7 +92,7 @@ class _Field:
     version=4,
     needs=("truth", "mosaics", "photometry", "joined"),
     within=reference,
-    sections=(*PATCHED, "errors", "photometry.match_radius"),
+    sections=PATCHED + ("errors", "photometry.match_radius"),
     plan=lambda config, _: reference(config),
     memory=sources_memory,
 )
@@ -120,7 +120,7 @@ _SAMPLE = ("fit.min_detected", "fit.axes", *(f"fit.{key}" for key in CUTS))
     "match to the truth",
     version=2,
     needs=("catalog", "seds", "truth", "mosaics", "photometry", "joined", "errors"),
-    sections=(*PATCHED, "errors.coverage", "photometry.match_radius", *_SAMPLE),
+    sections=PATCHED + ("errors.coverage", "photometry.match_radius") + _SAMPLE,
     units=truth_names,
     reads=lambda config, unit: [unit, *filter(None, catalog_pieces(config))],
     plan=fit_plan,
@@ -194,7 +194,7 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
 
 #: What fits of mock photometry read of the configuration.
 _EXISTING = ("catalog", "fit.bands", "fit.depths", "exposures.filters")
-FIT_SECTIONS = (*_EXISTING, "fit.axes", "fit.model_error")
+FIT_SECTIONS = _EXISTING + ("fit.axes", "fit.model_error")
 
 
 def set_plan(config, unit):

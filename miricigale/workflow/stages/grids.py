@@ -18,7 +18,7 @@ from miricigale.workflow.stages.exposures import (
 from miricigale.workflow.truths import truth_names, unit_names
 
 #: Sections of the configuration on which the grids of patches depend.
-PATCHED = (*GRID, "patches", "highres.pixel_scale")
+PATCHED = GRID + ("patches", "highres.pixel_scale")
 
 
 class SkyPatch(NamedTuple):

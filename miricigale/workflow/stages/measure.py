@@ -47,7 +47,7 @@ def make_templates(context, patch):
     "forced photometry",
     version=7,
     needs=("mosaics", "highres", "kernels", "templates"),
-    sections=(*KERNEL, "photometry.method"),
+    sections=KERNEL + ("photometry.method",),
     resources=IMAGE_RESOURCES,
     units=truth_bands,
     plan=patch_plan,

@@ -69,7 +69,7 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
     "point sources",
     version=9,
     needs=("kernels",),
-    sections=(*IMAGES, "patches", "highres", *DETECTION, "photometry.method", "point_sources"),
+    sections=IMAGES + ("patches", "highres") + DETECTION + ("photometry.method", "point_sources"),
     resources=EXPOSURE_RESOURCES,
     units=lambda config: band_names(config) if config.point_sources.enabled else (),
     plan=exposure_plan,

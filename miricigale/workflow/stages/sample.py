@@ -35,7 +35,7 @@ class SampleFlags(Flags):
 #: Keys of the cuts of [fit]: the last flags.
 CUTS = tuple(flag.name.lower() for flag in SampleFlags)[-4:]
 #: What is no galaxy of a field that counts, wherever it is.
-NOT_COUNTED = sum(SampleFlags[key.upper()] for key in ("star", "no_model", *CUTS))
+NOT_COUNTED = sum(SampleFlags[key.upper()] for key in ("star", "no_model") + CUTS)
 _COMPARE = {"<=": le, ">=": ge, "<": lt, ">": gt, "=": eq}
 
 

@@ -33,7 +33,7 @@ def sky_units(config):
     "skies",
     "many skies",
     needs=("truth", "errors", "matches"),
-    sections=(*FIT_SECTIONS, "fit.skies", "fit.min_detected"),
+    sections=FIT_SECTIONS + ("fit.skies", "fit.min_detected"),
     resources=sed_resources,
     plan=set_plan,
     units=sky_units,

@@ -66,7 +66,7 @@ def galaxy_parameters(config, catalog, best, *, seed):
     """
     table = QTable({"id": catalog["id"]})
     table["redshift"] = np.asarray(catalog["redshift"], float)
-    for name in (*GALAXY_PARAMETERS, "mass"):
+    for name in GALAXY_PARAMETERS + ("mass",):
         if f"{name}_best" in best.colnames:
             table[name] = best[f"{name}_best"]
     # sources of which a band of the fit shows the dust
@@ -238,7 +238,7 @@ def _truth_plan(config, unit):
     "model fluxes",
     version=3,
     needs=("catalog", "seds"),
-    sections=(*MODELS, "catalog", "exposures.filters", "fit.bands", "fit.depths", "highres.filter"),
+    sections=MODELS + ("catalog", "exposures.filters", "fit.bands", "fit.depths", "highres.filter"),
     resources=sed_resources,
     units=truth_names,
     reads=lambda config, _: catalog_pieces(config),

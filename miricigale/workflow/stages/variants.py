@@ -43,7 +43,7 @@ RATES = "rates"
     version=3,
     needs=("truth", "highres", "kernels", "templates"),
     within=reference,
-    sections=(*IMAGES, "patches", "highres", "photometry.method", "photometry.match_radius"),
+    sections=IMAGES + ("patches", "highres", "photometry.method", "photometry.match_radius"),
     resources=EXPOSURE_RESOURCES,
     units=lambda config: band_names(config) if config.variants.images else (),
     plan=lambda config, unit: {
@@ -71,7 +71,7 @@ def measure_variants(context, band):
     for name, changes in plan["changes"].items():
         # all by rates, also where the study simulates ramps
         changes = changes | {"exposures": {"kind": "rates"}}
-        changed = changed_config(config, (*IMAGES, "highres"), changes)
+        changed = changed_config(config, IMAGES + ("highres",), changes)
         images = []
         for exposure, light in zip(exposures, lights, strict=True):
             image = light.copy()
