@@ -13,7 +13,7 @@ from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import band_plans, wall_clock
 from miricigale.planning.sample import make_sample
 from miricigale.utils.exceptions import config_error
-from miricigale.utils.named_values import subset
+from miricigale.utils.named_values import places, subset
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.tables import error_column, require_columns
@@ -201,7 +201,7 @@ class Planner:
             return wall_clock(chosen, self.config.overheads, pointings=pointings).to_value(u.h)
 
         # other bands may be too short to be split into dithers
-        rows = [exposures.bands.index(name) for name in bands]
+        rows = places(bands, exposures.bands)
         times = np.array(exposures.by_band("time"))[rows]
         dithers = np.array(exposures.by_band("dithers"))[rows]
         group = frames_per_group(exposures.readout) * frame_time(exposures.readout).value

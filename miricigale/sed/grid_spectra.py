@@ -10,6 +10,7 @@ from miricigale.sed.chain import GALAXY
 from miricigale.sed.spectrum import cell_means, distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import places
 from miricigale.utils.options import check_that
 
 
@@ -96,7 +97,7 @@ def draw_fluxes(grid, index, scale, names, extra, model):
         flux = grid.flux(z, g, k, f)[:, columns]
         out[row][:, in_grid] = scale[row][:, None] * flux
     if extra and len(index):
-        extra_columns = [names.index(name) for name in extra]
+        extra_columns = places(extra, names)
         flux = model_fluxes(model, grid, index, list(extra.values()))
         out[:, :, extra_columns] = flux * scale[:, :, None]
     return out

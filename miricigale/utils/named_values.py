@@ -31,3 +31,8 @@ def without(mapping, names):
 def without_none(mapping):
     """Return the items of a dictionary whose value is not None."""
     return {key: value for key, value in mapping.items() if value is not None}
+
+
+def places(names, sequence):
+    """List the index of each name in a sequence of names, such as columns of bands in an array."""
+    return [sequence.index(name) for name in names]

@@ -7,6 +7,7 @@ from miricigale.fitting.results.percentile_columns import LEVELS
 from miricigale.fitting.results.table_columns import ODDS
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import places
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_table
@@ -193,8 +194,8 @@ def _check_same(whose, first, name, second):
     elif set(bands) != set(second.fitted_filters):
         got = f"the bands {list(second.fitted_filters)}"
     else:
-        first_columns = [first.filters.index(band) for band in bands]
-        second_columns = [second.filters.index(band) for band in bands]
+        first_columns = places(bands, first.filters)
+        second_columns = places(bands, second.filters)
         for values in ("flux", "flux_err", "limit"):
             a = getattr(first, values)[:, first_columns]
             b = getattr(second, values)[:, second_columns]

@@ -4,6 +4,7 @@ import numpy as np
 from astropy.table import Table, vstack
 
 from miricigale.utils.missing_values import plain_floats
+from miricigale.utils.named_values import places
 from miricigale.utils.options import check_that
 
 #: Columns that hold known redshifts, the first that is there.
@@ -43,7 +44,7 @@ def fit_numbers(results, step=1):
 
 def _numbers(part):
     n = len(part)
-    bands = [part.filters.index(name) for name in part.fitted_filters]
+    bands = places(part.fitted_filters, part.filters)
     measured = np.isfinite(part.sigma[:, bands]) & ~part.limit[:, bands]
     error = part.flux_err[:, bands]
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -8,6 +8,7 @@ from miricigale.fitting.results.corner_panels import marked_values
 from miricigale.fitting.results.table_columns import OUTLIER
 from miricigale.sed.spectrum import distance
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import places
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import FNU, to_array
@@ -121,7 +122,7 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
     results._one("plot_sed")
     if filters is None:
         filters = fitted_curves(results)
-    order = [filters.names.index(name) for name in results.filters]
+    order = places(results.filters, filters.names)
     if model is not None or results.model is not None:
         sed = results.best_sed(model)
         kwargs.setdefault("spectrum", (sed.wave, sed.fnu))

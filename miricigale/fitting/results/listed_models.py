@@ -4,6 +4,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.sed import grid_spectra
+from miricigale.utils.named_values import places
 
 
 def models_of_draws(draws):
@@ -73,5 +74,5 @@ def fluxes_between_nodes(draws, names, extra, model):
     if extra:
         models, index = models_of_draws(draws)
         flux = grid_spectra.model_fluxes(model, models, index, list(extra.values()))
-        out[:, [names.index(name) for name in extra]] = flux * draws.scale[:, None]
+        out[:, places(extra, names)] = flux * draws.scale[:, None]
     return out

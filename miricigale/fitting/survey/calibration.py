@@ -18,6 +18,7 @@ from miricigale.fitting.survey.band_errors import (
     select_fluxes,
 )
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import places
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_columns, require_columns
@@ -336,7 +337,7 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
     if longest is not None:
         good &= _rest_wavelengths(results) < to_array(longest, WAVE, "longest", ndim=0)
     bands = list(results.fitted_filters)
-    columns = [results.filters.index(name) for name in bands]
+    columns = places(bands, results.filters)
     n = good[:, columns].sum(axis=0)
     if reference is None:
         reference = bands[int(np.argmax(n))]

@@ -6,6 +6,7 @@ from astropy.table import vstack
 from miricigale import photometry, psf
 from miricigale.photometry.commands.patches import RIM, own_rows
 from miricigale.photometry.fit.bands import spread_rows
+from miricigale.utils.named_values import places
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, KERNEL
@@ -85,7 +86,7 @@ def join_detections(context, _):
         table["label"] = table["id"]
         tables.append(table[grid.is_near(grid.names.index(name), xy, RIM)])
     joined = vstack(tables, metadata_conflicts="silent")
-    numbers = np.array([grid.names.index(name) for name in joined["patch"]])
+    numbers = np.array(places(joined["patch"], grid.names))
     xy = np.transpose(wcs.world_to_pixel(joined["sky"]))
     joined = joined[own_rows(numbers, grid, xy)]
     joined["id"] = np.arange(1, len(joined) + 1)

@@ -6,6 +6,7 @@ from astropy.modeling.models import BlackBody
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet
+from miricigale.utils.named_values import places
 
 TEMPERATURES = np.geomspace(2000, 30000, 120) * u.K
 WAVELENGTHS = np.geomspace(0.2, 40, 1500) * u.um
@@ -22,8 +23,8 @@ def star_fluxes(catalog, measured, wanted):
     measured = list(measured)
     wanted = list(wanted)
     filters = FilterSet.from_names(list(dict.fromkeys(measured + wanted)))
-    fitted = [filters.names.index(name) for name in measured]
-    predicted = [filters.names.index(name) for name in wanted]
+    fitted = places(measured, filters.names)
+    predicted = places(wanted, filters.names)
     spectra = (BlackBody(TEMPERATURES[:, None])(WAVELENGTHS) * u.sr).to_value(u.uJy)
     weights = filters.weights(WAVELENGTHS)
     models = np.array([weights @ spectrum for spectrum in spectra])
