@@ -7,7 +7,8 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import data_error, file_errors
+from miricigale.utils.curve_columns import curve_columns, unit_of_wavelengths
+from miricigale.utils.exceptions import DataError, data_error, file_errors
 from miricigale.utils.files import packed_open, unpacked_size
 from miricigale.utils.meta import full_meta
 from miricigale.utils.missing_values import floats
@@ -29,9 +30,19 @@ _UNIT = {
 _MEASURED = re.compile(r"\d[ \t]*$")
 #: What the first column is called.
 _WAVE_WORD = re.compile(r"wave|lambda|λ|\bwl\b", re.IGNORECASE)
+#: What descriptions of columns have, and those of filters in general have not.
+_ABOUT_COLUMNS = re.compile(rf"{_WAVE_WORD.pattern}|\bin\b|\bunits?\b", re.IGNORECASE)
 #: What counts the light, in comments and in the parameters of a VOTable.
 _DETECTOR = re.compile(r"detector[\s_]*(?:type)?\s*[:=\t ]\s*(energy|photon|[01])\b", re.IGNORECASE)
-_ENERGY = ("0", "energy")
+#: Keywords of tables that say it, in lower case and without underscores.
+_DETECTOR_KEYWORDS = ("detectortype", "detector", "dettype")
+_ENERGY = re.compile(r"\s*(?:0$|energy\b)", re.IGNORECASE)
+#: Names of columns of the throughput.
+_THROUGHPUT = re.compile(
+    r"through|transm|response|(?:^|[_\W])(?:thr\w*|trans)(?:$|[_\W])", re.IGNORECASE
+)
+#: Percent behind the name of a column.
+_PERCENT = re.compile(r"[\[(]\s*(?:%|percent|per cent)\s*[\])]", re.IGNORECASE)
 #: Two numbers with a comma in place of the point, such as "7,5 0,1".
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+[\s;]+[+-]?\d+,\d+\s*$")
 #: Part of the peak down to which a negative throughput is noise.
@@ -141,24 +152,22 @@ def _of_table(path, unit):
     if path.suffix.lower() == ".csv" and any(map(_is_number, table.colnames)):
         # without names of columns
         return _of_text(path, unit)
-    columns = [table[name] for name in table.colnames[:2]]
-    if columns:
-        column_unit = getattr(columns[0], "unit", None)
-    else:
-        column_unit = None
-    if len(columns) < 2 or (unit is None and column_unit is None):
-        problem = "has not two columns, the first with a unit of wavelength"
-        raise data_error(path, f"{problem}: give 'unit' if it has none")
-    with file_errors(path, "is no filter: its first two columns are not numbers"):
-        first, throughput = map(floats, columns)
-    wave = first * u.Unit(unit or column_unit)
+    wave_name, throughput_name = curve_columns(table, _THROUGHPUT, path)
+    if unit is None:
+        unit = _unit_of_column(table[wave_name], wave_name, path)
+    with file_errors(path, "is no filter: its columns are not numbers"):
+        wave = floats(table[wave_name]) * u.Unit(unit)
+        throughput = floats(table[throughput_name])
+    is_percent = str(getattr(table[throughput_name], "unit", "")) == "%"
+    if is_percent or _PERCENT.search(throughput_name):
+        throughput = throughput / 100
     meta = full_meta(table.meta)
     if path.suffix.lower() in (".xml", ".vot", ".votable"):
         meta = _parameters(path) | meta
     keywords = {}
     for keyword, entry in meta.items():
         keywords[str(keyword).lower().replace("_", "")] = entry
-    energy = str(keywords.get("detectortype", "")).strip().lower() in _ENERGY
+    energy = any(_ENERGY.match(str(keywords.get(key, ""))) for key in _DETECTOR_KEYWORDS)
     name = keywords.get("name") or keywords.get("filterid") or path.stem
     options = {}
     for key, reference in (("reference_wavelength", WAVE), ("reference_temperature", u.K)):
@@ -172,6 +181,18 @@ def _of_table(path, unit):
             carried_meta[key] = meta[key]
     options["meta"] = carried_meta
     return wave, throughput, energy, str(name), options
+
+
+def _unit_of_column(column, name, path):
+    """Unit of a column of wavelengths: its own, or the one in its name, such as ``wave_um`` or ``wave [AA]``."""
+    unit = getattr(column, "unit", None)
+    if unit is not None:
+        return unit_of_wavelengths(unit)
+    try:
+        return unit_of_comments([name], path)
+    except DataError:
+        problem = "has no unit of wavelength in the column or its name"
+        raise data_error(path, f"{problem} {name!r}: give 'unit'") from None
 
 
 def _parameters(path):
@@ -214,13 +235,26 @@ def _of_text(path, unit):
     named = kinds and comments[0].lower() not in kinds
     if unit is None:
         if kinds:
-            unit = u.AA
+            unit = _unit_beside_kind(comments, path)
         else:
             unit = unit_of_comments(comments, path)
     said = _DETECTOR.search("\n".join(comments))
-    energy = kinds[:1] == ["energy"] or (said is not None and said[1].lower() in _ENERGY)
+    energy = kinds[:1] == ["energy"] or (said is not None and _ENERGY.match(said[1]) is not None)
     wave, throughput = data.T
+    if any(_PERCENT.search(text) for text in comments):
+        throughput = throughput / 100
     return wave * u.Unit(unit), throughput, energy, comments[0] if named else path.stem, {}
+
+
+def _unit_beside_kind(comments, path):
+    """Unit of a file of CIGALE's layout: Angstrom, unless a line says that its columns are in another one."""
+    about_columns = [text for text in comments if _ABOUT_COLUMNS.search(text)]
+    try:
+        return unit_of_comments(about_columns, path)
+    except DataError as err:
+        if "does not state" in str(err):
+            return u.AA
+        raise
 
 
 def _is_number(text):

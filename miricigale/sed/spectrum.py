@@ -1,6 +1,7 @@
 """Spectra as observed: wavelengths and flux densities, of a whole and of its parts."""
 
 import dataclasses
+import re
 from dataclasses import dataclass, field
 
 import astropy.units as u
@@ -9,6 +10,13 @@ from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet, as_filter
+from miricigale.instrument import DQ
+from miricigale.utils.curve_columns import (
+    curve_columns,
+    is_quality,
+    unit_of_fluxes,
+    unit_of_wavelengths,
+)
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive
@@ -21,6 +29,9 @@ from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number, to_array
 
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
+
+#: Names of columns of flux densities.
+_FLUX_NAME = re.compile(r"flux(?:_?density)?|f_?nu|f_?lam(?:bda)?|s_?nu", re.IGNORECASE)
 
 #: Unit of the parts of a spectrum in files, another one than that of the whole.
 _PART = u.nJy
@@ -67,6 +78,32 @@ def cell_means(x, y, edges):
     beyond = edges - x[step]
     at_edges = integral[step] + beyond * (y[step] + 0.5 * slope * beyond)
     return np.diff(at_edges) / np.diff(edges)
+
+
+def _with_unit(column, parse):
+    """A column as a quantity, its unit read by ``parse``; None without one."""
+    unit = getattr(column, "unit", None)
+    if unit is None:
+        return None
+    unit = parse(unit)
+    if unit == column.unit:
+        return column
+    return floats(column) * unit
+
+
+def _without_flagged(fnu, table):
+    """Fluxes that are NaN where a column DQ of JWST forbids their use, or a column of truth values masks them."""
+    for name in table.colnames:
+        flags = np.ma.getdata(table[name])
+        if name.lower() == "dq" and flags.dtype.kind in "iu":
+            bad = flags.astype(np.int64) & int(DQ.DO_NOT_USE) != 0
+        elif name.lower() == "mask" and flags.dtype.kind == "b":
+            bad = flags
+        else:
+            continue
+        if bad.any():
+            fnu = np.where(bad, np.nan, floats(fnu)) * fnu.unit
+    return fnu
 
 
 class _Flux(u.Quantity):
@@ -308,7 +345,8 @@ class SED(Frozen, Interactive):
         Parameters
         ----------
         path : path-like
-            As `write` makes it, or with wavelengths and flux densities in the first two columns, with units.
+            As `write` makes it, or with a column of wavelengths and one of flux densities, both with units. These
+            are the columns that are called so, else the first two; errors, weights and flags are left alone.
 
         Returns
         -------
@@ -318,18 +356,27 @@ class SED(Frozen, Interactive):
         ------
         `~miricigale.utils.exceptions.DataError`
             If it is no such file.
+        ValueError
+            If a sample is missing, or not to be used by a column ``DQ`` of JWST or ``mask``.
         """
         table = read_table(path, wanted="a spectrum")
-        units = [getattr(column, "unit", None) for column in table.columns.values()]
-        if len(units) < 2 or None in units:
+        wave_name, flux_name = curve_columns(table, _FLUX_NAME, path)
+        wave = _with_unit(table[wave_name], unit_of_wavelengths)
+        fnu = _with_unit(table[flux_name], unit_of_fluxes)
+        if wave is None or fnu is None:
             raise data_error(path, "has no two columns with units, wavelengths and flux densities")
-        wave, fnu, *names = table.colnames
-        lights = [name for name in names if table[name].unit.is_equivalent(FNU)]
+        fnu = _without_flagged(fnu, table)
+        lights = []
+        for name in table.colnames:
+            unit = getattr(table[name], "unit", None)
+            is_other = name not in (wave_name, flux_name) and not is_quality(name)
+            if is_other and isinstance(unit, u.UnitBase) and unit.is_equivalent(FNU):
+                lights.append(name)
         with reading(path, "a spectrum"):
             meta = full_meta(table.meta)
             redshift = float(meta.pop("redshift", 0.0))
-            parts = {n: cls(table[wave], table[n], redshift=redshift) for n in lights}
-            return cls(table[wave], table[fnu], redshift=redshift, meta=meta, components=parts)
+            parts = {n: cls(wave, table[n], redshift=redshift) for n in lights}
+            return cls(wave, fnu, redshift=redshift, meta=meta, components=parts)
 
     @classmethod
     def from_synphot(cls, spectrum, *, redshift=None):

@@ -13,6 +13,7 @@ from miricigale.sed.components.igm import Meiksin2006
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
 from miricigale.sed.stated_units import stated_units
+from miricigale.utils.curve_columns import unit_of_fluxes, unit_of_wavelengths
 from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, file_errors, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats, plain_floats
@@ -23,9 +24,6 @@ from miricigale.utils.units import FNU, WAVE
 
 _SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii")
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
-#: How libraries write units that astropy does not know, in small letters.
-_UNITS = {"angstrom": u.AA, "angstroms": u.AA, "microns": u.um}
-_UNITS |= {"flam": _FLAM, "fnu": _FLAM * u.AA / u.Hz}
 #: Parameters that a grid has itself.
 _OF_GRIDS = frozenset({"redshift", "mass", "frac_agn"})
 #: Where spectra that end before are continued to.
@@ -96,7 +94,8 @@ def _read_file(file):
         # NaN where a value is lacking, which is none of a spectrum
         stated = _stated(file, table)
         wave_unit = stated[0] or u.AA
-        wave = plain_floats(table[first], first, "spectrum") * _unit(table[first], wave_unit)
+        wave = plain_floats(table[first], first, "spectrum")
+        wave = wave * unit_of_wavelengths(table[first].unit or wave_unit)
         endings = "|".join(map(re.escape, _SUFFIXES))
         stem = re.sub(rf"({endings})?(\.gz)?$", "", file.name, flags=re.I)
         out = {}
@@ -115,7 +114,8 @@ def _read_file(file):
                         name = stem
                     else:
                         name = f"{stem}[{part}]"
-                    out[name] = SED(wave, flux * _unit(table[column], stated[1] or _FLAM))
+                    unit = unit_of_fluxes(table[column].unit or stated[1] or _FLAM)
+                    out[name] = SED(wave, flux * unit)
         return out
 
 
@@ -124,12 +124,6 @@ def _stated(file, table):
     if any(column.unit is not None for column in table.itercols()):
         return None, None
     return stated_units(file, table.colnames)
-
-
-def _unit(column, default):
-    if column.unit is None:
-        return default
-    return _UNITS.get(str(column.unit).lower(), column.unit)
 
 
 def template_grid(spectra, filters, *, beyond="error", redshift=None):

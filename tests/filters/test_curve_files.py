@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import MaskedColumn, QTable
 from numpy.testing import assert_allclose
 
@@ -89,6 +90,75 @@ def test_energy_counters_of_the_svo_and_of_comments_weigh_by_wavelength(tmp_path
     assert_allclose(Filter.read(tmp_path / "c.ecsv").pivot.value, energy.pivot.value, rtol=1e-5)
 
 
+@pytest.mark.parametrize("word", ["Energy counter", "energy", "0"])
+def test_the_detector_may_be_said_in_words(tmp_path, word):
+    """An energy counter by a word is one by the number."""
+    number = Filter.read(write(tmp_path / "0.xml", _svo(0)))
+    words = Filter.read(write(tmp_path / "w.xml", _svo(word)))
+    assert words.pivot == number.pivot
+    photon = Filter.read(write(tmp_path / "1.xml", _svo("Photon counter")))
+    assert photon.pivot > number.pivot
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("WAVELENGTH", "SEGMENT", "THROUGHPUT"),
+        ("throughput", "wave", "thr_err"),
+        ("id", "wave", "Transmission"),
+        ("wave", "error", "t"),
+    ],
+)
+@pytest.mark.parametrize("unit", ["ANGSTROMS", "A", "um", "MICRONS"])
+def test_columns_of_a_curve_are_found_by_their_names(tmp_path, names, unit):
+    """Files of STScI have further columns, and units that astropy does not know."""
+    wave = np.array([7.0, 7.1, 7.6, 8.2, 8.8])
+    throughput = np.array([0, 0.5, 0.9, 0.8, 0])
+    if unit.startswith("A"):
+        wave = wave * 1e4
+    columns = []
+    for name in names:
+        if name.lower().startswith("wave"):
+            columns.append(fits.Column(name, "D", unit=unit, array=wave))
+        elif name.lower() in ("throughput", "transmission", "t"):
+            columns.append(fits.Column(name, "D", array=throughput))
+        else:
+            columns.append(fits.Column(name, "D", array=np.ones(5)))
+    fits.BinTableHDU.from_columns(columns).writeto(tmp_path / "f.fits")
+    band = Filter.read(tmp_path / "f.fits")
+    assert_allclose(band.pivot.value, PIVOT, rtol=1e-6)
+    assert band.throughput.max() == 0.9
+
+
+def test_two_throughputs_in_one_table_are_refused(tmp_path):
+    table = QTable({"wave": [7.0, 8.0] * u.um, "through_a": [1.0, 1.0], "through_b": [1.0, 2.0]})
+    table.write(tmp_path / "two.ecsv")
+    match = "several columns that may be meant, through_a, through_b"
+    refuses(match, Filter.read, tmp_path / "two.ecsv", error=DataError)
+
+
+def test_percent_are_hundredths(tmp_path):
+    rows = MICRON.replace(" 0.", " ")
+    text = Filter.read(write(tmp_path / "t.dat", "# wave(um) T(%)\n" + rows))
+    table = QTable({"wave": text.wave, "throughput": text.throughput * 100 * u.percent})
+    table.write(tmp_path / "t.ecsv")
+    for band in (text, Filter.read(tmp_path / "t.ecsv")):
+        assert_allclose(band.throughput.max(), 0.09)
+
+
+def test_units_in_names_of_columns_and_beside_the_word_photon(tmp_path):
+    body = MICRON.replace(" ", ",")
+    for name in ("wavelength_um", "wave [um]", "lambda(micron)"):
+        band = Filter.read(write(tmp_path / "c.csv", f"{name},throughput\n{body}"))
+        assert_allclose(band.pivot.value, PIVOT, rtol=1e-6)
+    # in the layout of CIGALE, whose own files are in Angstrom
+    head = "# mine\n# photon\n"
+    band = Filter.read(write(tmp_path / "c.dat", head + "# wavelengths in nm\n" + NANO))
+    assert_allclose(band.pivot.value, PIVOT, rtol=1e-6)
+    band = Filter.read(write(tmp_path / "c.dat", head + "# a band of 8 microns\n" + ANGSTROM))
+    assert_allclose(band.pivot.value, PIVOT, rtol=1e-6)
+
+
 def test_small_negative_points_are_zero_and_counted(tmp_path):
     band = Filter.read(write(tmp_path / "n.dat", "# um\n7.0 -1e-5\n7.1 0.5\n7.6 0.9\n8.8 -2e-6\n"))
     assert band.meta["n_negative"] == 2
@@ -158,7 +228,7 @@ def test_words_in_a_table_of_numbers_are_refused_with_the_file(tmp_path):
     """A title above the names of the columns, as in the tables of optics of NIRCam."""
     path = tmp_path / "optics.csv"
     path.write_text('"Transmission",\nWavelength,Collimator\n0.6,0.9\n0.7,0.91\n')
-    text = r"optics\.csv is no filter: its first two columns are not numbers: .*Wavelength"
+    text = r"optics\.csv is no filter: its columns are not numbers: .*Wavelength"
     refuses(text, Filter.read, path, unit="um", error=DataError)
 
 

@@ -3,8 +3,10 @@ import operator
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import QTable
 from astropy.tests.helper import assert_quantity_allclose
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.filters import Filter
@@ -105,3 +107,46 @@ def test_a_spectrum_goes_to_specutils():
     assert_quantity_allclose(other.flux, sed.fnu)
     got = Filter("F770W").synthetic_flux(other)
     assert_quantity_allclose(got, sed.synthetic_flux("F770W"), rtol=1e-12)
+
+
+SAMPLED = np.array([1.0, 5.0, 9.0, 20.0])
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"wave": (SAMPLED, "um"), "error": (SAMPLED * 9, "uJy"), "flux": (SAMPLED, "uJy")},
+        {"FLUX": (SAMPLED, "uJy"), "WAVELENGTH": (SAMPLED * 1e4, "ANGSTROMS"), "DQ": (SAMPLED * 0, None)},
+        {"WAVELENGTH": (SAMPLED, "MICRONS"), "FLUX": (SAMPLED, "uJy"), "flux_err": (SAMPLED, "uJy")},
+    ],
+)  # fmt: skip
+def test_columns_of_spectra_are_found_by_their_names(tmp_path, columns):
+    """No error becomes the flux, or a part of it, whatever the order; units are those of STScI too."""
+    table = [fits.Column(name, "D", unit=unit, array=a) for name, (a, unit) in columns.items()]
+    fits.BinTableHDU.from_columns(table).writeto(tmp_path / "s.fits")
+    sed = SED.read(tmp_path / "s.fits")
+    assert_allclose(sed.wave.to_value(u.um), SAMPLED)
+    assert_allclose(sed.fnu.to_value(u.uJy), SAMPLED)
+    assert not sed.components
+
+
+def test_fluxes_per_wavelength_of_stsci(tmp_path):
+    """F_nu = F_lambda lambda^2 / c."""
+    flam = [1e-15, 2e-15, 1e-15]
+    columns = [
+        fits.Column("WAVELENGTH", "D", unit="ANGSTROMS", array=[5e3, 1e4, 2e4]),
+        fits.Column("FLUX", "D", unit="FLAM", array=flam),
+    ]
+    fits.BinTableHDU.from_columns(columns).writeto(tmp_path / "star.fits")
+    fnu = 2e-15 * 1e4**2 / 2.99792458e18 * u.erg / u.s / u.cm**2 / u.Hz
+    assert_allclose(SED.read(tmp_path / "star.fits").fnu[1].to_value(u.uJy), fnu.to_value(u.uJy))
+
+
+@pytest.mark.parametrize(
+    ("name", "flags"), [("DQ", [0, 0, 5, 0]), ("mask", [False, True, False, False])]
+)
+def test_samples_that_a_file_flags_are_in_no_spectrum(tmp_path, name, flags):
+    table = QTable({"wave": SAMPLED * u.um, "flux": SAMPLED * u.uJy, name: flags})
+    table.write(tmp_path / "s.ecsv")
+    with pytest.raises(ValueError, match="'fnu' must be finite values, got 1"):
+        SED.read(tmp_path / "s.ecsv")
