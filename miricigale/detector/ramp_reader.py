@@ -25,6 +25,9 @@ from miricigale.utils.parallel import check_memory
 
 _WANTED = "a ramp of the MIRI imager"
 
+#: Units of counts in headers, in lower case.
+_COUNTS = ("", "dn", "adu", "count", "counts", "ct")
+
 _REFERENCE = np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
 
 #: Kinds of exposures that are imager ramps; ground tests state none.
@@ -72,6 +75,7 @@ def _read(path, hdus):
         sim_meta = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
     check_imager(path, header, kinds=_KINDS, own=sim_meta)
     shape = _ramp_shape(path, hdus["SCI"].header)
+    _check_unit(path, hdus["SCI"].header)
     exposure = _exposure(path, header, shape)
     _check_header(path, header, exposure)
     check_memory(
@@ -94,6 +98,13 @@ def _read(path, hdus):
         if (properties := values["meta"].pop("properties", None)) is not None:
             values["properties"] = DetectorProperties(**properties)
     return values | _flags(path, hdus, exposure, shape)
+
+
+def _check_unit(path, head):
+    """Refuse a ramp that states another unit than counts."""
+    unit = str(head.get("BUNIT", "") or "").strip()
+    problem = f"must hold a ramp in DN, got the unit {unit!r} in SCI"
+    check_data(unit.lower() in _COUNTS, path, problem)
 
 
 def _ramp_shape(path, head):
@@ -205,11 +216,14 @@ def _flags(path, hdus, exposure, shape):
     pixel_dq = np.zeros(shape[2:], np.uint32)
     planes = {"SIM_PIXELDQ", "PIXELDQ"} & {hdu.name for hdu in hdus}
     for name in sorted(planes):
-        # unsigned 32 bits as FITS keeps them: BZERO 2^31
-        stored = np.asarray(hdus[name].data).astype(np.int32).view(np.uint32)
+        stored = np.asarray(hdus[name].data)
         wanted = f"must have flags of {shape[2:]} pixels in {name}"
         check_data(stored.shape == shape[2:], path, f"{wanted}, got {stored.shape}")
-        pixel_dq = pixel_dq | (stored ^ np.uint32(2**31))
+        wanted = f"must have flags that are integers in {name}"
+        check_data(stored.dtype.kind in "iu", path, f"{wanted}, got {stored.dtype}")
+        # unsigned integers are kept in FITS less 2^31, which BZERO says
+        bits = stored.astype(np.int64) + int(hdus[name].header.get("BZERO", 0))
+        pixel_dq = pixel_dq | bits.astype(np.uint32)
     if "SIM_PIXELDQ" not in planes:
         mask = reference_pixel_mask(subarray=exposure.subarray)
         pixel_dq = np.where(mask, pixel_dq | _REFERENCE, pixel_dq)

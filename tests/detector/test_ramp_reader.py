@@ -149,3 +149,28 @@ def test_times_of_the_integrations(make_exposure, make_sky, tmp_path):
         assert_allclose(np.diff(begin), 6 * frame, rtol=1e-5)
         assert begin[0] == pytest.approx(start.mjd, abs=1e-9)
         assert end[-1] == pytest.approx(header["EXPEND"], abs=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int16, np.uint8])
+def test_flags_are_the_same_in_any_type_of_integers(tmp_path, dtype):
+    """FITS keeps unsigned integers less 2^31, and signed ones as they are."""
+    path = tmp_path / "jw_linearity.fits"
+    _, pixel_dq, _ = stage(path)
+    expected = Ramp.read(path).pixel_dq
+    with fits.open(path, mode="update") as hdus:
+        hdus["PIXELDQ"] = fits.ImageHDU((pixel_dq & 0x7F).astype(dtype), name="PIXELDQ")
+    assert_array_equal(Ramp.read(path).pixel_dq & 0x7F, expected & 0x7F)
+    # which are those of the reference pixels alone
+    good = np.s_[:, 4:68]
+    assert not np.any(Ramp.read(path).pixel_dq[good] & DQ.REFERENCE_PIXEL)
+
+
+def test_flags_and_units_of_no_ramp_are_refused(tmp_path):
+    path = tmp_path / "jw_linearity.fits"
+    stage(path)
+    fits.setval(path, "BUNIT", value="electron", extname="SCI")
+    refuses("must hold a ramp in DN, got the unit 'electron'", Ramp.read, path, error=DataError)
+    fits.setval(path, "BUNIT", value="DN", extname="SCI")
+    with fits.open(path, mode="update") as hdus:
+        hdus["PIXELDQ"] = fits.ImageHDU(np.zeros((64, 72), np.float32), name="PIXELDQ")
+    refuses("flags that are integers in PIXELDQ", Ramp.read, path, error=DataError)

@@ -7,7 +7,7 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from miricigale.detector import Detector, Ramp
 from miricigale.instrument import DQ, Exposure
 from miricigale.reduction import RampSettings, Reducer, read_images
@@ -95,3 +95,16 @@ def test_a_reducer_says_what_is_not_by_default():
     assert repr(Reducer()) == "<Reducer native>"
     changed = Reducer(skip_first=3, ramps=RampSettings(neighbor_threshold=7.0))
     assert repr(changed) == "<Reducer native, skip_first=3, own ramps>"
+
+
+def test_groups_of_zero_counts_are_left_out(ramps):
+    """Counts at the floor of the converter are no light: the slope is that of the other groups."""
+    ramp = ramps[0]
+    data = ramp.data.copy()
+    data[:, -3:] = 0
+    lost = Ramp(data, ramp.exposure, pixel_dq=ramp.pixel_dq, effects=ramp.effects, meta=ramp.meta)
+    rate = warned("3 of 12 groups have 0 DN in most pixels", Reducer().fit_ramp, lost)
+    shorter = Reducer(skip_last=3).fit_ramp(ramp)
+    good = ~rate.mask & ~shorter.mask
+    assert good.sum() > 0.9 * good.size
+    assert_allclose(rate.data[good], shorter.data[good], rtol=1e-5, atol=1e-4)

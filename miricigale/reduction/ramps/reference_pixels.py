@@ -30,7 +30,7 @@ def reference_drift(data, reference, offsets=()):
     -------
     drift : `~numpy.ndarray`, shape (n_int, n_group)
         Mean of each group's reference pixels minus the mean over all groups, DN; zeros if
-        there is no reference pixel.
+        there is no reference pixel, and in groups that were lost, whose counts are 0.
 
     Examples
     --------
@@ -48,7 +48,19 @@ def reference_drift(data, reference, offsets=()):
         return np.zeros(data.shape[:2])
     pixels = _without(data, columns, offsets)
     drift = pixels[:, :, reference[:, columns]].mean(axis=-1, dtype=float)
-    return drift - drift.mean()
+    was_read = ~_is_lost(data, reference)
+    if not was_read.any():
+        return np.zeros(data.shape[:2])
+    return np.where(was_read, drift - drift[was_read].mean(), 0.0)
+
+
+def _is_lost(data, reference):
+    """Groups all of whose reference pixels have 0 counts, shape (n_int, n_group): the bias is thousands."""
+    if data.dtype.kind not in "iu":
+        return np.zeros(data.shape[:2], dtype=bool)
+    columns = np.flatnonzero(reference.any(axis=0))
+    pixels = data[..., columns][:, :, reference[:, columns]]
+    return np.all(pixels == 0, axis=-1)
 
 
 def _without(data, columns, offsets):
@@ -83,7 +95,7 @@ def reference_channels(data, reference, *, origin=(0, 0), offsets=()):
     -------
     drift : `~numpy.ndarray`, shape (n_int, n_group, ny, 4)
         DN of the channels, the first that of column 0; zero in the first group of each
-        integration.
+        integration that was not lost, as those of 0 counts are.
 
     Raises
     ------
@@ -120,6 +132,8 @@ def reference_channels(data, reference, *, origin=(0, 0), offsets=()):
     sides = [np.flatnonzero(columns < nx / 2), np.flatnonzero(columns >= nx / 2)]
     parity = (np.arange(ny) + origin[1]) % 2
     values = np.zeros((n_int, n_group, 2, _CHANNELS))
+    lost = _is_lost(data, reference)
+    first = np.argmin(lost, axis=1)
     for channel in range(_CHANNELS):
         mine = [side[columns[side] % _CHANNELS == channel] for side in sides]
         mine = [side for side in mine if side.size]
@@ -130,7 +144,8 @@ def reference_channels(data, reference, *, origin=(0, 0), offsets=()):
             for side in mine:
                 good = valid[np.ix_(rows, side)].ravel()
                 part = pixels[:, :, rows][..., side].reshape(n_int, n_group, -1)[..., good]
-                change = part.astype(float) - part[:, :1]
+                change = part.astype(float) - part[np.arange(n_int), first][:, None]
                 clipped = sigma_clip(change, _CLIP, maxiters=None, cenfunc="mean", axis=-1)
                 values[:, :, odd, channel] += clipped.mean(axis=-1) / len(mine)
+    values[lost] = 0.0
     return values[:, :, parity]

@@ -91,8 +91,7 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
             n_frames=exposure.n_frames,
             drift=_drift(reducer, ramp, maps, reference, drift),
             usable=usable,
-            # those of a simulated ramp are the truth, until a pipeline has found its own
-            group_dq=None if history.simulated and not history.steps else ramp.group_dq,
+            group_dq=_group_flags(ramp, usable),
             first_group=part[0],
             last_group=part[1],
             jump_threshold=thresholds[0],
@@ -109,6 +108,29 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
         # it is known what acted
         return fit
     return dataclasses.replace(fit, settling=note_settling(ramp, maps, skip_first, fit.flags))
+
+
+def _group_flags(ramp, usable):
+    """Flags of groups for the fit, with raw counts of 0 among those that are not used; None for none."""
+    group_dq = ramp.group_dq
+    if ramp.history.simulated and not ramp.history.steps:
+        # the truth, until a pipeline has found its own
+        group_dq = None
+    if ramp.data.dtype.kind not in "iu":
+        return group_dq
+    # at the floor of the converter, as groups that were lost are
+    at_floor = (ramp.data == 0) & usable
+    if not at_floor.any():
+        return group_dq
+    lost = np.count_nonzero(at_floor.sum(axis=(2, 3)) > 0.5 * np.count_nonzero(usable))
+    if lost:
+        n_groups = at_floor.shape[0] * at_floor.shape[1]
+        text = f"{lost} of {n_groups} groups have 0 DN in most pixels and are left out"
+        warn(f"{ramp.meta.get('filename', 'the ramp')}: {text}", ReductionWarning)
+    floor = np.uint8(DQ.AD_FLOOR | DQ.DO_NOT_USE)
+    if group_dq is None:
+        group_dq = np.zeros(ramp.data.shape, np.uint8)
+    return np.where(at_floor, group_dq | floor, group_dq).astype(np.uint8)
 
 
 def shares_charge(reducer, ramp):
