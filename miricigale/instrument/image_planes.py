@@ -7,18 +7,26 @@ from miricigale.utils.options import check_data
 
 #: What maps of the noise hold, and the extensions of an image's own file that hold them.
 NOISE_MAPS = {
-    "error": ("ERR", "ERROR", "RMS", "UNCERT", "SIGMA", "STDDEV"),
-    "variance": ("VAR", "VARIANCE"),
-    "inverse_variance": ("IVAR", "INVVAR"),
-    "weight": ("WHT", "WEIGHT"),
+    "error": (
+        *("ERR", "ERROR", "RMS", "UNCERT", "SIGMA", "STDDEV"),
+        *("UNC", "UNCERTAINTY", "NOISE", "STD", "STDEV", "RMSMAP", "RMS_MAP"),
+    ),
+    # STAT is that of ESO's files
+    "variance": ("VAR", "VARIANCE", "STAT"),
+    "inverse_variance": ("IVAR", "INVVAR", "INV_VAR", "INVERSE_VARIANCE"),
+    "weight": ("WHT", "WEIGHT", "WEIGHTS", "WEIGHT_MAP", "WGT"),
 }
 #: Parts of the variance in files of JWST.
 VARIANCE_PARTS = ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT")
+#: Extensions that mark pixels: 0 is good in masks, bits of flags are those of the telescope.
+MASKS = ("MASK", "BPM", "BADPIX")
+MARKS = (*MASKS, "DQ", "FLAGS", "FLAG")
 #: Extensions that belong to an image, and are none: noise, flags, times and weights.
 PLANES = (
     *(name for names in NOISE_MAPS.values() for name in names),
     *VARIANCE_PARTS,
-    *("DQ", "MASK", "CON", "CTX", "EXP", "EXPTIME", "AREA", "NSAMP"),
+    *MARKS,
+    *("CON", "CTX", "EXP", "EXPTIME", "AREA", "NSAMP", "COVERAGE", "COV", "CVG", "GOODPIX"),
 )
 #: What astropy states in UTYPE.
 _UTYPES = {

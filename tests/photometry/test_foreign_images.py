@@ -5,13 +5,20 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.nddata import CCDData, InverseVariance, StdDevUncertainty, VarianceUncertainty
+from astropy.nddata import (
+    CCDData,
+    InverseVariance,
+    StdDevUncertainty,
+    UnknownUncertainty,
+    VarianceUncertainty,
+)
 from astropy.wcs import WCS
 
 from helpers.errors import refuses
 from miricigale.instrument import Image, pixel_area_map, read_image, write_image
 from miricigale.instrument.sky_axes import grid_angle, pixel_to_radec, radec_axes
 from miricigale.photometry import MosaicFile, read_mosaic
+from miricigale.photometry.images.arrays import image_arrays
 from miricigale.reduction import pixel_map, read_images
 from miricigale.reduction import write_image as write_jwst_image
 from miricigale.scene.sky import local_jacobian, pixel_positions
@@ -345,3 +352,84 @@ def test_images_of_the_sky_are_read_whatever_their_telescope(write, kind):
     path = write(noise(), primary=primary)
     with pytest.warns(PhotometryWarning, match="no map of the noise"):
         assert read_mosaic(path).shape == SHAPE
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        *((name, 0.1, "error") for name in ("NOISE", "STD", "UNC", "RMSMAP")),
+        ("STAT", 0.01, "variance"),
+        ("INVERSE_VARIANCE", 100.0, "inverse_variance"),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_maps_of_the_noise_by_the_names_of_others(tmp_path, name, value, kind, first):
+    """A map of the noise is never taken for the image, though it may be the first of the file."""
+    data = noise()
+    header = tan().to_header(relax=True)
+    header["BUNIT"] = "MJy/sr"
+    planes = [
+        fits.ImageHDU(data, header, name="IMAGE"),
+        fits.ImageHDU(plane(value), header, name=name),
+    ]
+    if first:
+        planes = planes[::-1]
+    fits.HDUList([fits.PrimaryHDU(), *planes]).writeto(tmp_path / "i.fits")
+    image = read_mosaic(tmp_path / "i.fits")
+    np.testing.assert_array_equal(image.data, data)
+    assert image.meta["noise"].startswith(kind)
+    np.testing.assert_allclose(image.uncertainty.array, 0.1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["MASK", "BPM", "BADPIX", "FLAGS"])
+def test_planes_of_bad_pixels_by_the_names_of_others(write, name):
+    bad = np.zeros(SHAPE, np.uint8)
+    bad[:, :5] = 1
+    image = read_mosaic(write(noise(), [("ERR", 1, plane(0.1)), (name, 1, bad)]))
+    np.testing.assert_array_equal(image.mask, bad == 1)
+
+
+def test_a_mask_of_good_pixels_is_warned_of(write):
+    good = np.ones(SHAPE, np.uint8)
+    good[:, :5] = 0
+    path = write(noise(), [("ERR", 1, plane(0.1)), ("MASK", 1, good)])
+    with pytest.warns(PhotometryWarning, match="excludes 94% of the pixels with data"):
+        read_mosaic(path)
+
+
+@pytest.mark.parametrize("number", [-99.0, 0.0, 1e30, -1e31])
+def test_areas_of_one_number_have_no_data(write, number):
+    data = noise()
+    data[:, :8] = number
+    path = write(data, [("ERR", 1, plane(0.1))])
+    with pytest.warns(PhotometryWarning, match=r"480 pixels in areas that are exactly [-\d]"):
+        image = read_mosaic(path)
+    np.testing.assert_array_equal(image.mask, data == np.float32(number))
+
+
+def test_plateaus_of_stars_and_noise_of_few_counts_are_data(write):
+    y, x = np.indices(SHAPE)
+    star = 1e3 * np.exp(-((x - 40) ** 2 + (y - 30) ** 2) / 60) + noise()
+    # a saturated core
+    clipped = np.minimum(star, 500).astype(np.float32)
+    assert np.count_nonzero(clipped == 500) > 100
+    assert not read_mosaic(write(clipped, [("ERR", 1, plane(0.1))])).mask.any()
+    # four of ten pixels are 0 by chance, as counts are whole
+    counts = np.round(noise(1.0))
+    assert 0.3 < np.mean(counts == 0) < 0.5
+    assert not read_mosaic(write(counts, [("ERR", 1, plane(1.0))])).mask.any()
+
+
+@pytest.mark.parametrize(
+    ("text", "jansky"),
+    [("JY/PIXEL", 1.0), ("UJY/pix", 1e-6), ("microJy/arcsec2", 1e-6 * SCALE**2 * 3600**2)],
+)
+def test_units_of_brightness_in_capitals_and_words(write, text, jansky):
+    data = noise()
+    image = read_mosaic(write(data, [("ERR", 1, plane(0.1))], BUNIT=text))
+    np.testing.assert_allclose(image.data, data * (jansky * 1e-6 / AREA), rtol=1e-4)
+
+
+def test_uncertainties_of_unknown_kind_are_refused():
+    image = CCDData(noise(), unit="MJy/sr", wcs=tan(), uncertainty=UnknownUncertainty(plane(0.1)))
+    refuses("a StdDevUncertainty, .* got UnknownUncertainty", image_arrays, image, "image")

@@ -4,7 +4,7 @@ import dataclasses
 
 import astropy.units as u
 import numpy as np
-from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.nddata import CCDData, StdDevUncertainty, UnknownUncertainty
 from astropy.stats import mad_std
 from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
 
@@ -93,7 +93,7 @@ def image_arrays(image, name, dtype=float):
     Warns
     -----
     `~miricigale.utils.exceptions.PhotometryWarning`
-        If areas that are exactly 0 are taken as without data.
+        If areas of one number, such as 0 or -99, are taken as without data.
     """
     (data, factor), (noise, noise_factor), usable = _checked(image, name)
     area = _areas(image.wcs, np.empty(usable.shape, dtype))
@@ -148,7 +148,12 @@ def _checked(image, name):
         negative = np.count_nonzero(np.asarray(image.uncertainty.array)[usable] < 0)
         wanted = "an image with uncertainties of 0 (no data) or more"
         check_that(not negative, name, wanted, f"{negative} pixels below 0")
-        sigma = image.uncertainty.represent_as(StdDevUncertainty)
+        wanted = "an image with a StdDevUncertainty, VarianceUncertainty or InverseVariance"
+        kind = type(image.uncertainty)
+        check_that(kind is not UnknownUncertainty, name, wanted, kind.__name__)
+        # inverse variances of 0, which is no data, are infinite
+        with np.errstate(divide="ignore"):
+            sigma = image.uncertainty.represent_as(StdDevUncertainty)
         scale = factor
         if sigma.unit is not None:
             scale = float((1 * sigma.unit).to_value(unit))

@@ -20,6 +20,13 @@ _COUNTS = (
     (r"(?<=/)\s*s(?:ec(?:onds?)?)?\b", "s"),
 )
 
+#: Areas in units of brightness as headers write them, in lower case.
+_AREAS = {
+    "pixel": u.one, "pix": u.one, "pixels": u.one, "px": u.one,
+    "arcsec2": u.arcsec**2, "arcsec^2": u.arcsec**2, "arcsec**2": u.arcsec**2, "sqarcsec": u.arcsec**2,
+    "sr": u.sr, "str": u.sr, "ster": u.sr, "steradian": u.sr,
+}  # fmt: skip
+
 #: What counts may be.
 _BASES = (u.electron, u.ct, u.adu, u.DN, u.ph)
 
@@ -36,6 +43,12 @@ def parsed_unit(text):
     flux = flux_unit(text)
     if isinstance(flux, u.UnitBase):
         return flux
+    # JY/PIXEL, microJy/arcsec2
+    numerator, _, denominator = text.partition("/")
+    flux = flux_unit(numerator)
+    area = _AREAS.get(denominator.strip().lower())
+    if isinstance(flux, u.UnitBase) and area is not None:
+        return flux / area
     replaced = text
     for pattern, name in _COUNTS:
         replaced = re.sub(pattern, name, replaced, flags=re.IGNORECASE)

@@ -18,6 +18,8 @@ from miricigale.instrument.dq_schemes import bad_pixels
 from miricigale.instrument.header_wcs import check_kind_of_exposure, image_wcs, is_exposure
 from miricigale.instrument.image import Image
 from miricigale.instrument.image_planes import (
+    MARKS,
+    MASKS,
     NOISE_MAPS,
     PLANES,
     VARIANCE_PARTS,
@@ -148,9 +150,10 @@ class MosaicFile:
         File with a map of the noise, on the pixels of the image; at most one. Errors and variances
         are in the unit of the image and its square, or in that of their own ``BUNIT``, and are taken
         as they are, as inverse variances are. The scale of weights is measured on the sky. By default the first
-        extension of the image's own file among ERR, ERROR, RMS, UNCERT, SIGMA and STDDEV (errors), VAR and
-        VARIANCE, IVAR and INVVAR, WHT and WEIGHT, of the image's EXTVER, that is not all 0 or NaN; then the sum of
-        JWST's VAR_POISSON, VAR_RNOISE and VAR_FLAT. UTYPE says of what kind those of astropy are.
+        extension of the image's own file among ERR, ERROR, RMS, UNCERT, SIGMA, STDDEV, UNC, NOISE and STD
+        (errors), VAR, VARIANCE and STAT, IVAR and INVVAR, WHT and WEIGHT, of the image's EXTVER, that is not all 0
+        or NaN; then the sum of JWST's VAR_POISSON, VAR_RNOISE and VAR_FLAT. UTYPE says of what kind those of
+        astropy are.
     background_box : int, optional
         If given, a background is measured in boxes of so many pixels and subtracted.
     psf : path-like, optional
@@ -291,14 +294,14 @@ class MosaicFile:
         -------
         image : `~astropy.nddata.CCDData`
             In MJy/sr, with WCS and mask (True where a pixel is not finite, has no weight or no
-            error, is one of an area that is exactly 0, or is marked in an extension MASK or, as not
-            to be used, in DQ), and with a
+            error, is one of an area of one number (0, or -99 and the like), or is marked in an extension
+            MASK, BPM or BADPIX or, as not to be used, in DQ or FLAGS), and with a
             `~astropy.nddata.StdDevUncertainty` unless there is no map of the noise. Fluxes in
             pixels are divided by the solid angle of each pixel. ``meta`` has ``filter``, ``pa_aper``
             (deg), ``source`` (the file), ``source_unit``, ``calibration``, ``noise``, ``noise_scale``
             (rms of the source-free pixels in units of the map's errors), ``weight_scale``
             (by which errors of a weight map were multiplied), ``sky_over_noise`` (median over rms
-            of those pixels), ``n_filled`` (pixels in areas that are exactly 0) and ``n_masked``, as
+            of those pixels), ``n_filled`` (pixels in areas of one number) and ``n_masked``, as
             far as they are known. None of a section without a usable pixel.
 
         Raises
@@ -314,7 +317,7 @@ class MosaicFile:
         -----
         `~miricigale.utils.exceptions.PhotometryWarning`
             If there is no map of the noise, its scale departs from 1 by more than 10 times, or areas
-            that are exactly 0 are masked.
+            of one number are masked, or a mask excludes most pixels with data.
         """
         from miricigale.instrument import pixel_area_map
 
@@ -330,7 +333,7 @@ class MosaicFile:
             else:
                 factor = data.dtype.type(factor.to_value(SURFACE_BRIGHTNESS))
             usable = np.isfinite(data)
-            usable &= self._marked_good(hdus, header.index, meta)
+            usable &= self._marked_good(hdus, header.index, meta, usable & (data != 0))
             kind, values, source = self._noise_map(hdus, header, usable)
         meta.update(source_unit=header.unit, calibration=how)
         sigma = None
@@ -477,7 +480,7 @@ class MosaicFile:
         plane = plane_data(hdu)
         return bool(np.any(np.isfinite(plane) & (plane != 0)))
 
-    def _marked_good(self, hdus, index, meta):
+    def _marked_good(self, hdus, index, meta, has_data):
         """Find pixels that no extension of marks or weights excludes; note the scheme of the bits in ``meta``."""
         header = hdus[index].header
 
@@ -496,14 +499,27 @@ class MosaicFile:
                 good = good & (values > 0)
                 continue
             has_planes = any(str(key).startswith("MP_") for key in hdu.header)
-            if name == "MASK" and not has_planes:
+            if name in MASKS and not has_planes:
                 # a mask of astropy's has no bits
                 good = good & (values == 0)
+                self._check_sense(name, values != 0, has_data)
                 continue
             bad, scheme = bad_pixels(values, hdu.header, get, f"{self.path}[{name}]")
             good = good & ~bad
             meta["dq_scheme"] = scheme
         return good
+
+    def _check_sense(self, name, masked, has_data):
+        """Warn of a mask that excludes most pixels with data, as one does in which 1 is good."""
+        if not has_data.any():
+            return
+        part = np.mean(masked[has_data])
+        if part > _MOST:
+            msg = (
+                f"{self.path}[{name}] excludes {part:.0%} of the pixels with data: what is not 0 is bad there. "
+                "If 1 is good in it, write 1 less it"
+            )
+            warn(msg, PhotometryWarning)
 
     def _in_unit(self, hdu, kind, unit, path):
         """Read a map of the noise in the unit that the image states, as far as both do."""
@@ -555,8 +571,10 @@ def _native(data):
 
 #: Power of the image's unit that a map of the noise has; the scale of weights is measured.
 _POWERS = {"error": 1, "variance": 2, "inverse_variance": -2}
-#: Extensions that mark pixels: 0 is good in MASK, bits of DQ are those of the telescope, weights are above 0.
-_MARKS = ("MASK", "DQ", "WHT")
+#: Extensions that mark pixels, and weights, which are above 0.
+_MARKS = (*MARKS, "WHT")
+#: Part of the pixels with data that a mask may exclude without a warning.
+_MOST = 0.5
 
 
 def _sigma(kind, values):

@@ -9,6 +9,12 @@ from miricigale.utils.units import FNU
 
 #: Pixels of the smallest area that counts as filled.
 _FILLED = 25
+#: Side of a block of equal pixels that noise of a few counts does not make.
+_BLOCK = 5
+#: Noise next to an area that was filled, as a part of the number in it.
+_FAR = 0.01
+#: Pixels of which the different numbers are counted.
+_SAMPLE = 20_000
 
 #: Of what is no sky: the Gaussian that smooths, and the rim (pixels).
 _WIDTH = 2.0
@@ -59,30 +65,69 @@ def weight_scale(data, weight, *, mask=None):
 
 def filled_areas(values, usable):
     """
-    Find areas of pixels that are exactly 0 for want of data, such as the corners of drizzled images.
+    Find areas of pixels of one number for want of data, such as the corners of drizzled images.
 
-    ``usable`` are the pixels that count as data so far. Nowhere True if the pixels next to such areas have
-    no noise either (their median is below a tenth of that of all others): then the image is a noiseless
-    one, and 0 is its sky.
+    That number is 0, or the lowest or highest of the image if it is far beyond the pixels next to it, such as -99.
+
+    Parameters
+    ----------
+    values : `~numpy.ndarray`, shape (ny, nx)
+        The image.
+    usable : bool `~numpy.ndarray`, shape (ny, nx)
+        Pixels that count as data so far.
+
+    Returns
+    -------
+    filled : bool `~numpy.ndarray`, shape (ny, nx)
+        Nowhere True if the pixels next to areas of 0 have no noise either (their median is below a tenth of that
+        of all others): then the image is a noiseless one, and 0 is its sky.
     """
+    filled = _areas_of(values, usable, 0.0)
+    if not usable.any():
+        return filled
+    some_value = values.flat[np.argmax(usable)]
+    lowest = np.min(values, where=usable, initial=some_value)
+    highest = np.max(values, where=usable, initial=some_value)
+    for value in (lowest, highest):
+        if value != 0:
+            filled |= _areas_of(values, usable, value)
+    return filled
+
+
+def _areas_of(values, usable, value):
+    """Areas of one number next to pixels with noise, which are far from it if it is not 0."""
     import scipy.ndimage
 
-    filled = usable & (values == 0)
+    filled = usable & (values == value)
     if np.count_nonzero(filled) < _FILLED:
         return np.zeros_like(usable)
+    core = filled
+    if _is_coarse(values, usable):
+        # noise of a few counts is the same number by chance, though not in whole blocks
+        core = scipy.ndimage.binary_erosion(filled, np.ones((_BLOCK, _BLOCK), dtype=bool))
     labels, n = scipy.ndimage.label(filled)
     large = np.bincount(labels.ravel(), minlength=n + 1) >= _FILLED
+    large &= np.bincount(labels[core], minlength=n + 1) > 0
     large[0] = False
     filled = large[labels]
-    is_beside = scipy.ndimage.binary_dilation(filled, iterations=2) & usable & (values != 0)
-    is_other = usable & (values != 0)
+    is_beside = scipy.ndimage.binary_dilation(filled, iterations=2) & usable & (values != value)
+    is_other = usable & (values != value)
     if np.count_nonzero(is_beside) < 8:
         return np.zeros_like(usable)
     noise_beside = np.median(np.abs(values[is_beside]))
     noise = np.median(np.abs(values[is_other]))
-    if not noise_beside > 0.1 * noise:
+    is_noisy = noise_beside > 0.1 * noise
+    # a saturated star is bright around its plateau
+    is_far = value == 0 or noise_beside < _FAR * abs(value)
+    if not (is_noisy and is_far):
         return np.zeros_like(usable)
     return filled
+
+
+def _is_coarse(values, usable):
+    """Whether an image has few different numbers, as one in whole counts has."""
+    sample = values[usable & (values != 0)][:_SAMPLE]
+    return np.unique(sample).size < 0.1 * sample.size
 
 
 def mask_filled(values, usable, name):
@@ -90,8 +135,9 @@ def mask_filled(values, usable, name):
     filled = filled_areas(values, usable)
     n = int(np.count_nonzero(filled))
     if n:
+        numbers = " or ".join(f"{value:g}" for value in np.unique(values[filled]))
         msg = (
-            f"{name} has {n} pixels in areas that are exactly 0, though not masked, beside pixels with "
+            f"{name} has {n} pixels in areas that are exactly {numbers}, though not masked, beside pixels with "
             "noise: they are taken as without data"
         )
         warn(msg, PhotometryWarning)
