@@ -4,6 +4,7 @@ import logging
 import math
 
 import numpy as np
+from astropy.stats import gaussian_fwhm_to_sigma
 from scipy.fft import fftshift, ifftshift, irfft2, next_fast_len, rfft2
 
 from miricigale.psf import _core
@@ -84,8 +85,12 @@ def gaussian_gain(source, target, names="hi, lo"):
         If the sharp PSF is the wider one by its core and at half maximum; ``names`` are the caller's for the two.
     """
     c = len(source) // 2
-    cores = [_core.core_moments(image)[2] for image in (source, target)]
     halves = [_core.half_maximum_width(image, c, c) for image in (source, target)]
+    cores = []
+    for image, half in zip((source, target), halves, strict=True):
+        _, _, width = _core.core_moments(image)
+        # cores narrower than their pixels have no moments
+        cores.append(width if math.isfinite(width) else half * gaussian_fwhm_to_sigma)
     # one alone misleads: a blurred core has no wings, a pattern of resampling may be narrow
     if cores[0] > 1.05 * cores[1] and halves[0] > 1.1 * halves[1]:
         wanted = "the sharp and the wide PSF, in this order"

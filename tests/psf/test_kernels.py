@@ -13,7 +13,7 @@ from scipy.signal import fftconvolve
 
 from helpers.cases import cases_of
 from helpers.errors import refuses
-from helpers.light import gaussian_image
+from helpers.light import gaussian_image, pixel_gaussian
 from miricigale.instrument import north_up_wcs
 from miricigale.psf import (
     MatchingKernel,
@@ -224,6 +224,20 @@ def test_gain_of_gaussians_is_that_of_the_gaussian_between_them():
     found = wiener.gaussian_gain(sharp, wide)
     assert found == pytest.approx(0.5 / np.sqrt(np.pi * (3.0**2 - 1.5**2)), rel=0.02)
     assert wiener.gaussian_gain(sharp, sharp) == 1.0
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.5])
+def test_cores_narrower_than_a_pixel_are_matched(sigma):
+    """As NIRCam's short bands on pixels of 0.06 arcsec; pixels add 1/12 to the variance of both."""
+    line = pixel_gaussian(61, 30, sigma)
+    wide_line = pixel_gaussian(61, 30, 2.0)
+    sharp = np.outer(line, line)
+    wide = np.outer(wide_line, wide_line)
+    expected = 0.5 / np.sqrt(np.pi * (2.0**2 - sigma**2))
+    assert wiener.gaussian_gain(sharp, wide) == pytest.approx(expected, rel=0.03)
+    _, _, figures = wiener.choose("auto", wiener.wiener(sharp, wide), sharp, wide, 1e-3)
+    assert figures["within_limits"]
+    assert figures["residual"] < 0.01
 
 
 def test_energies_are_compared_up_to_half_the_image():
