@@ -1,5 +1,6 @@
 """Galaxies that a segmentation divides into several segments: which belong together, and each piece's light."""
 
+import functools
 import itertools
 
 import numpy as np
@@ -120,8 +121,14 @@ class _Piece:
         self._variance = variance[model.stamp]
         self._own = self._labels == label
         self._foreign = is_source[self._labels] & ~self._own
+
+    @functools.cached_property
+    def _touching(self):
+        """Labels of the segments of others that it touches, ascending."""
+        if not self._foreign.any():
+            return np.zeros(0, self._labels.dtype)
         grown = scipy.ndimage.binary_dilation(self._own, iterations=_TOUCHING)
-        self._touching = np.unique(self._labels[grown & self._foreign])
+        return np.unique(self._labels[grown & self._foreign])
 
     @property
     def reaches_over(self):

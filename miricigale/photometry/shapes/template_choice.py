@@ -208,17 +208,23 @@ class _Lights:
                 if model is None:
                     return None
                 neighbor_light = sum_of_all[model.stamp] - model.image
-                if turn:
-                    weight, _, _ = self._weight(model.stamp, label, model.labels)
-                    if (
-                        np.sum(((neighbor_light - model.neighbor_light) * weight) ** 2)
-                        < _CONTAMINATED_CHI2
-                    ):
-                        return model
+                if turn and not self._is_contaminated(model, label, neighbor_light):
+                    return model
                 return self._model(label, xy, neighbor_light, population, model)
 
             models = parallel_map(refit, zip(models, sources, strict=True), executor=self.executor)
         return models
+
+    def _is_contaminated(self, model, label, neighbor_light):
+        """Return whether the light of neighbors is another than when a model was fitted, by its chi^2."""
+        change = neighbor_light - model.neighbor_light
+        # an upper limit of chi^2, on all pixels of the stamp, is enough for most
+        with np.errstate(divide="ignore", invalid="ignore"):
+            limit = np.sum(change * change / self.variance[model.stamp], dtype=float)
+        if limit < 0.99 * _CONTAMINATED_CHI2:
+            return False
+        weight, _, _ = self._weight(model.stamp, label, model.labels)
+        return np.sum((change * weight) ** 2) >= _CONTAMINATED_CHI2
 
     def rejoined(self, models, sources, population):
         """
@@ -242,15 +248,17 @@ class _Lights:
         groups = []
         lights = self
         # what has no peak of its own first: its profile is no evidence against others
-        for find in [continued_groups] * _PASSES + [claimed_groups] * _PASSES:
-            new_groups = find(models, sources, lights.segments, *lights.as_seen)
-            if not new_groups:
-                continue
-            groups = joined_groups(groups, new_groups)
-            new = set(itertools.chain.from_iterable(new_groups))
-            lights = self._of_galaxies([[labels[k] for k in group] for group in groups])
-            changed = [group for group in groups if not new.isdisjoint(group)]
-            models, sources = lights._put_together(models, sources, population, changed)
+        for find in (continued_groups, claimed_groups):
+            for _ in range(_PASSES):
+                new_groups = find(models, sources, lights.segments, *lights.as_seen)
+                if not new_groups:
+                    # models are the same in the next pass
+                    break
+                groups = joined_groups(groups, new_groups)
+                new = set(itertools.chain.from_iterable(new_groups))
+                lights = self._of_galaxies([[labels[k] for k in group] for group in groups])
+                changed = [group for group in groups if not new.isdisjoint(group)]
+                models, sources = lights._put_together(models, sources, population, changed)
         reaching = reaching_over(models, sources, lights.segments, *lights.as_seen)
         members = {group[0]: group for group in groups}
         for k in reaching:
