@@ -5,6 +5,7 @@ import numpy as np
 
 from miricigale.sed import COSMOLOGY
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
@@ -19,7 +20,7 @@ PUBLISHED_LIGHT = tuple(map(tuple, _TABLES["light"]["rows"]))
 #: 10^10.3 Msun and 10^-9.3 / yr, slope per dex of mass between 10^8.5 and 10^10.3 Msun, slope per dex of specific
 #: star-formation rate (100 Myr) between 10^-12 and 10^-8 / yr, scatter in dex; of quiescent galaxies mean and
 #: scatter of log10 of ``dust_excess``; strength of the 3.3 um feature; sources. By benchmarks/dust_colors.py.
-CEERS_DUST = {name: tuple(row) for name, row in _TABLES["ceers_dust"].items()}
+CEERS_DUST = convert_values(tuple, _TABLES["ceers_dust"])
 
 
 def main_sequence_sfr(stellar_mass, age_of_universe):

@@ -31,7 +31,7 @@ from miricigale.utils.missing_values import (
     plain_floats,
     without_codes,
 )
-from miricigale.utils.named_values import field_names, field_values
+from miricigale.utils.named_values import convert_values, field_names, field_values
 from miricigale.utils.options import check_choice, check_data, check_names, check_that
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, flux_unit
@@ -198,7 +198,7 @@ class CatalogMap:
         else:
             del values["error_factors"]
         values["columns"] = dict(self.columns)
-        values["units"] = {name: str(unit) for name, unit in self.units.items()}
+        values["units"] = convert_values(str, self.units)
         return values
 
     def names(self, colnames, argument="catalog"):

@@ -11,6 +11,7 @@ from miricigale.filters import filter as filter_curves
 from miricigale.refdata.lookup import cache_folder, fingerprint_of
 from miricigale.sed import chain
 from miricigale.sed.grid import ModelGrid
+from miricigale.sed.parameter import default_values
 from miricigale.utils.configuration import conf
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import DataError
@@ -32,7 +33,7 @@ def grid_key(model, axes, filters):
                 "name": c.name,
                 "versions": [vars(t)["version"] for t in type(c).__mro__ if "version" in vars(t)],
                 "settings": c.settings,
-                "defaults": {n: p.default for n, p in c.parameters.items()},
+                "defaults": default_values(c.parameters),
                 "data": c.fingerprint,
                 "packages": {name: importlib.metadata.version(name) for name in c.packages},
             }

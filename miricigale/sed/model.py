@@ -13,7 +13,7 @@ from miricigale.sed.component import in_order, read_config
 from miricigale.sed.derived import DERIVED, Derived
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
-from miricigale.sed.parameter import Parameter
+from miricigale.sed.parameter import Parameter, default_values
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
 from miricigale.utils.interactive import Interactive
@@ -297,7 +297,7 @@ class SEDModel(Interactive):
     @property
     def defaults(self):
         """Default of every parameter in its unit: dict of name to float."""
-        return {name: parameter.default for name, parameter in self._parameters.items()}
+        return default_values(self._parameters)
 
     def component(self, role):
         """The component of a role (one of `~miricigale.sed.ROLES`), or None."""

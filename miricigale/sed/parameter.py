@@ -188,3 +188,8 @@ class Parameter:
         else:
             unit = ""
         return f"<Parameter {self.name!r} {self.default}{unit}, {self.bounds}: {self.doc}>"
+
+
+def default_values(parameters):
+    """Return the default of each `Parameter`, in its unit, by name."""
+    return {name: parameter.default for name, parameter in parameters.items()}

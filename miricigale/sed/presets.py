@@ -7,6 +7,7 @@ from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.component import COMPONENTS
 from miricigale.utils.exceptions import argument_error, warn
+from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 
@@ -280,7 +281,7 @@ def _values(name):
     """New arrays of a table of ``presets.toml``; redshifts are even in ln(1 + z)."""
     table = dict(declared("miricigale.sed", "presets.toml")[name])
     step = table.pop("redshift", None)
-    out = {axis: np.array(values) for axis, values in table.items()}
+    out = convert_values(np.array, table)
     if step is None:
         return out
     return out | {"redshift": _redshifts(**step)}

@@ -13,6 +13,7 @@ from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, s
 from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ModelWarning, units_error, warn
+from miricigale.utils.named_values import convert_values, rows_of
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
@@ -204,7 +205,7 @@ def spectra(model, values):
         return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, **options)
 
     meta = {**model.meta, "parameters": quantities, "derived": derived}
-    components = {name: sed(part) for name, part in parts.items()}
+    components = convert_values(sed, parts)
     return sed(spectrum, meta=meta, components=components)
 
 
@@ -259,7 +260,7 @@ class _Blocks:
         return (
             spectra,
             model_of_row,
-            {name: array[model_of_row] for name, array in observed.items()},
+            rows_of(observed, model_of_row),
         )
 
     def run(self, rows):
@@ -293,7 +294,7 @@ class _Blocks:
             chain.wave, chain.log_wave, chain.to_lnu, light, spectra, model_of_row, power, dim, sky, z, scale,
             *self.bands, UNCOVERED, flux,
         )  # fmt: skip
-        block = {name: column[rows] for name, column in values.items()}
+        block = rows_of(values, rows)
         return flux, scaled_quantities(self.model, derived, mass, z, self.far[rows], block)
 
 

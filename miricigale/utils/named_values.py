@@ -36,3 +36,13 @@ def without_none(mapping):
 def places(names, sequence):
     """List the index of each name in a sequence of names, such as columns of bands in an array."""
     return [sequence.index(name) for name in names]
+
+
+def convert_values(function, mapping):
+    """Return a dictionary with the same keys, and what a function makes of each value."""
+    return {key: function(value) for key, value in mapping.items()}
+
+
+def rows_of(columns, rows):
+    """Return some rows (an index, a slice or a mask) of columns by name."""
+    return {name: column[rows] for name, column in columns.items()}

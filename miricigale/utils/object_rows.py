@@ -9,6 +9,7 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_that
 
 #: Types of fields: an array whose first axis is the objects, and a dict of such.
@@ -64,7 +65,7 @@ class ObjectRows(Interactive):
         mapped = {}
         for name, value in self._per_object():
             if isinstance(value, dict):
-                mapped[name] = _ByName({key: function(array) for key, array in value.items()})
+                mapped[name] = _ByName(convert_values(function, value))
             else:
                 if value is None:
                     mapped[name] = None

@@ -6,6 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.instrument import imager_columns
+from miricigale.utils.named_values import convert_values
 from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.grids import grid_of, patch_bands, study_patches
@@ -34,7 +35,7 @@ def disk_use(config):
     >>> print(f"{sum(use.values()) / 1e6:.0f} MB")
     270 MB
     """
-    return {name: int(n_bytes) for name, n_bytes in _Size(config).disk().items()}
+    return convert_values(int, _Size(config).disk())
 
 
 def study_cost(config):

@@ -19,7 +19,7 @@ from miricigale.fitting.results.object_plots import draw_objects
 from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure, plain_text
 from miricigale.plotting.comparison import plot_redshifts
-from miricigale.utils.named_values import without
+from miricigale.utils.named_values import convert_values, without
 from miricigale.utils.package_tables import declared
 
 #: Largest number of examples on the page.
@@ -389,7 +389,7 @@ def _settings(page, results):
     settings = without(first.meta.get("fit", {}), ["filters"])
     if results.model is not None:
         settings |= results.model.recipe
-    rows = {name: _setting_text(value) for name, value in settings.items()}
+    rows = convert_values(_setting_text, settings)
     for name, axis in first.axes.items():
         ends = f"from {axis.values[0]:g} to {axis.values[-1]:g} {u.Unit(axis.unit)}"
         rows[f"axis {name}"] = f"{axis.values.size} {ends}".strip()

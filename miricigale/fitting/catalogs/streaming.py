@@ -35,6 +35,7 @@ from miricigale.utils.files import PARTIAL
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.ids import Duplicates
 from miricigale.utils.meta import plain_value, undated
+from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
@@ -393,7 +394,7 @@ def _job(fitter, rows, options, catalog_settings):
         "chunk_rows": rows.chunk_rows,
         "redshift": redshift_content,
         "redshift_prior": content_sha256(prior),
-        "fitter": {name: content_sha256(value) for name, value in fitter.backend.content.items()},
+        "fitter": convert_values(content_sha256, fitter.backend.content),
         "settings": fitter.settings() | {"max_reduced_chi2": HIGH_CHI2},
     }
     if options["pairs"]:

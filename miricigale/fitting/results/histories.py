@@ -5,6 +5,7 @@ import numpy as np
 
 from miricigale.fitting.posterior.posterior import check_levels
 from miricigale.fitting.results.percentile_columns import LEVELS, suffix
+from miricigale.sed.parameter import default_values
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 
@@ -124,7 +125,7 @@ def plot_best_sfh(results, ax=None, *, model=None, **kwargs):
     if component is None:
         raise argument_error("model", "given where results were read from a file", "None")
     best = best_parameters(result, model)
-    values = {name: parameter.default for name, parameter in component.parameters.items()}
+    values = default_values(component.parameters)
     values |= {name: float(best[name].value) for name in values if name in best}
     lookback = (np.arange(_STEPS) + 0.5) / _STEPS * values["age"]
     rates = rates_at(component, values, lookback) * best["mass"].to(u.Msun).value

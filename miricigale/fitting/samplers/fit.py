@@ -18,7 +18,7 @@ from miricigale.fitting.samplers.run import Calls, FluxModel, positive_normal, s
 from miricigale.fitting.samplers.space import Space, redshift_axis
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.named_values import attributes
+from miricigale.utils.named_values import attributes, convert_values
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
@@ -127,11 +127,11 @@ class SamplerFit:
         if self.profile:
             mass = "profile"
         return {
-            "priors": {name: str(prior) for name, prior in self.space.free.items()},
+            "priors": convert_values(str, self.space.free),
             "mass": mass,
             "scale_error": self.scale_error,
             **attributes(request, ("n_live", "n_effective", "max_calls")),
-            "options": {name: str(value) for name, value in request.options.items()},
+            "options": convert_values(str, request.options),
             "constants": {name: v for name, v in fixed if name not in ("mass", "redshift")},
         }
 

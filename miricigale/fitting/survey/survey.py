@@ -24,6 +24,7 @@ from miricigale.refdata import locate
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import DataError, FitWarning, warn
 from miricigale.utils.files import replacing
+from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table
@@ -247,7 +248,7 @@ class SurveyCalibration:
                 },
                 mass_function=mass_function,
                 scores=scores,
-                errors={name: np.array(e) for name, e in meta.get("errors", {}).items()},
+                errors=convert_values(np.array, meta.get("errors", {})),
             )
         except (KeyError, TypeError, ValueError) as error:
             msg = f"{msg}, or a damaged one: {error!r}"

@@ -12,6 +12,7 @@ from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import data_error, file_errors
+from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_data
 from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table
@@ -104,7 +105,7 @@ def read_skirtor(path):
 
 def _check_product(path, axes):
     """Refuse holes and values that are not the library's."""
-    values = {name: np.unique(column) for name, column in axes.items()}
+    values = convert_values(np.unique, axes)
     for name, nodes in values.items():
         strange = sorted(set(nodes.tolist()) - set(SKIRTOR_AXES[name]))
         if strange:

@@ -11,7 +11,7 @@ from astropy.table import Table
 from miricigale.utils.caching import cached_property
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import cached_by_file, open_fits
-from miricigale.utils.named_values import subset
+from miricigale.utils.named_values import convert_values, subset
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
@@ -232,7 +232,7 @@ def write_library(library, path):
         The file; one that is there is replaced.
     """
     text = {name: list(getattr(library, name)) for name in ("axes", "values", "spectra", "summary")}
-    text["units"] = {name: str(unit) for name, unit in library.units.items()}
+    text["units"] = convert_values(str, library.units)
     rows = Table(library.axes | library.values)
     for name in rows.colnames:
         rows[name].unit = _fits_unit(library, name)

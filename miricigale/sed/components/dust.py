@@ -6,7 +6,7 @@ from miricigale.refdata.libraries.table import open_library
 from miricigale.refdata.tables import read_images
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
-from miricigale.sed.parameter import Parameter
+from miricigale.sed.parameter import Parameter, default_values
 from miricigale.utils.caching import cached
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
@@ -64,7 +64,7 @@ class DustEmission(Component):
         spectrum : `~numpy.ndarray`
             L_lambda in W/um; the integral over `nodes`, by trapezoids, is 1 W.
         """
-        full = {name: par.default for name, par in self.parameters.items()} | values
+        full = default_values(self.parameters) | values
         nodes = self.nodes()
         spectrum = self.spectrum(full)
         return np.interp(wave, nodes, spectrum / np.trapezoid(spectrum, nodes), left=0, right=0)

@@ -8,7 +8,7 @@ from astropy.table import QTable
 
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
-from miricigale.sed.parameter import Parameter
+from miricigale.sed.parameter import Parameter, default_values
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table
@@ -220,7 +220,7 @@ class TableSFH(StarFormationHistory):
         self._rates.flags.writeable = False
         length = self._rates.shape[1] / 1e3
         super().__init__(**{"age": length} | defaults)
-        why = self.invalid({name: par.default for name, par in self.parameters.items()})
+        why = self.invalid(default_values(self.parameters))
         if why:
             raise ValueError(why)
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from miricigale.refdata.lookup import fingerprint
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, OtherResultsError
+from miricigale.utils.named_values import convert_values
 from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import print_line
 from miricigale.workflow.engine.display import Display
@@ -115,7 +116,7 @@ class StudyRunner:
             self.units[stage.name] = stage.unit_names(config)
             for unit in self.units[stage.name]:
                 self._parts[stage.key(unit)] = (stage, unit)
-        names = {name: Units(units) for name, units in self.units.items()}
+        names = convert_values(Units, self.units)
         # by unit and stage: keys of the units that it reads
         self._inputs = {}
         self._needed = {}

@@ -6,6 +6,7 @@ from miricigale import photometry, sed
 from miricigale.evaluation import fraction_interval, photoz_metrics, recovery_metrics
 from miricigale.fitting import GridSettings
 from miricigale.photometry.errors.error_model import HERSCHEL_DEPTHS
+from miricigale.utils.named_values import convert_values
 from miricigale.workflow.derived import rows_of
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample, true_ranks
@@ -93,7 +94,7 @@ def fit_experiment(context, unit):
         sample = sample[rows]
     bands = list(context.config.exposures.filters)
     redshift = None
-    options = {"axes": {key: np.array(values) for key, values in plan["axes"].items()}}
+    options = {"axes": convert_values(np.array, plan["axes"])}
     if name == "far_infrared":
         light = far_infrared_photometry(sample, seed=context.seed)
         bands += list(HERSCHEL_DEPTHS)

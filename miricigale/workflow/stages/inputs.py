@@ -16,7 +16,7 @@ from miricigale.scene import read_catalog
 from miricigale.utils.caching import cached
 from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.named_values import subset
+from miricigale.utils.named_values import convert_values, subset
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.engine.stage import LONG, stage
@@ -45,7 +45,7 @@ def input_axes(kind, *, dust=False):
 
 def plain_axes(axes):
     """Return plain values of a grid's axes, for hashing."""
-    return {name: list(values) for name, values in axes.items()}
+    return convert_values(list, axes)
 
 
 def fit_plan(config, _):

@@ -6,7 +6,7 @@ from astropy.table import vstack
 from miricigale import photometry, psf
 from miricigale.photometry.commands.patches import RIM, own_rows
 from miricigale.photometry.fit.bands import spread_rows
-from miricigale.utils.named_values import places
+from miricigale.utils.named_values import places, rows_of
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, KERNEL
@@ -161,4 +161,4 @@ def _detections(context, patch):
 def joined_photometry(tables):
     """Join tables of results by band into one, with a row for each detection."""
     columns = ["id", "sky", "flux", error_column("flux"), "flags"]
-    return photometry.join_bands({name: table[columns] for name, table in tables.items()})
+    return photometry.join_bands(rows_of(tables, columns))

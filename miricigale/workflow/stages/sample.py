@@ -12,6 +12,7 @@ from scipy.ndimage import uniform_filter
 from miricigale.photometry import ErrorModel
 from miricigale.photometry.images.arrays import nearest_values
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import rows_of
 from miricigale.utils.tables import Flags, error_column
 from miricigale.workflow.options import of_option, require
 
@@ -74,7 +75,7 @@ def matched_errors(matched, inside, bands, *, noise=None, **options):
     for name in bands:
         truth[name] = matched[f"{name}_true"]
     if noise is not None:
-        noise = {name: values[inside] for name, values in noise.items()}
+        noise = rows_of(noise, inside)
     return ErrorModel.from_tables(
         truth[inside], matched[inside], filters=bands, noise=noise, **options
     )
