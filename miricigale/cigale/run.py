@@ -11,7 +11,7 @@ from miricigale.cigale.setup import CigaleSetup
 from miricigale.filters.band_names import band_filters, xray_energies
 from miricigale.filters.filter_arguments import given_filters
 from miricigale.utils.exceptions import CatalogWarning, ConfigError, config_error, warn
-from miricigale.utils.named_values import without
+from miricigale.utils.named_values import convert_values, without
 from miricigale.utils.options import check_choice
 from miricigale.utils.outputs import check_output
 from miricigale.utils.tables import error_column
@@ -73,30 +73,31 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         chain = read_modules(
             config["sed_modules"], modules, folder=path.parent, libraries=libraries
         )
-        bands, lost = band_filters(dict.fromkeys(c.removesuffix("_err") for c in columns), names)
-        wanted = [band for band in analysis["bands"] if band not in bands.values()]
-        predicted, xray_bands = band_filters(dict.fromkeys(wanted), names)
+        bands, lost = band_filters(dict.fromkeys(map(_without_error, columns)), names)
+        fitted = set(bands.values())
+        others = dict.fromkeys(band for band in analysis["bands"] if band not in fitted)
+        predicted, lost_predictions = band_filters(others, names)
     except (ConfigError, ValueError) as err:
         raise config_error(path, f"cannot be used: {err}") from err
-    hard = {x for x in (*bands, *predicted) if xray_energies(x) and x not in names}
-    if chain.xray:
-        dark = set()
-    else:
+    # bands of X-rays, which only the module of X-rays fills
+    hard = {name for name in bands | predicted if xray_energies(name) and name not in names}
+    dark = set()
+    if not chain.xray:
         dark = hard
-    bands = without(bands, dark)
-    predicted = without(predicted, dark)
+        bands = without(bands, dark)
+        predicted = without(predicted, dark)
     if not bands:
         raise config_error(path, f"has no band that is known here, of {', '.join(lost) or 'none'}")
     for band in bands.values():
         if band not in columns:
             raise config_error(path, f"has {error_column(band)} among the bands, and not {band}")
-    computed = {theirs for theirs, *_ in cigale_names(chain.modules).values()}
+    computed = {entry[0] for entry in cigale_names(chain.modules).values()}
     if chain.xray and not hard:
         chain.left_out.append(f"{chain.modules['xray']} (no band of it)")
     if dark or not hard:
         computed -= {"xray.alpha_ox", "xray.agn_Lx_2to10keV", "agn.intrin_Lnu_2500A_30deg"}
     variables = analysis["variables"]
-    unknown = [f"band {name}" for name in dict.fromkeys([*lost, *xray_bands])]
+    unknown = [f"band {name}" for name in dict.fromkeys(lost + lost_predictions)]
     if unknown:
         # the last one says what to do
         unknown[-1] += f" (no filter here: {GIVE_FILTER})"
@@ -104,12 +105,18 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     for entry in chain.left_out:
         is_module = "." not in entry and " " not in entry
         left_out.append(f"module {entry}" if is_module else entry)
-    left_out += [f"band {name} (no module xray)" for name in sorted(dark)]
+    for name in sorted(dark):
+        left_out.append(f"band {name} (no module xray)")
     left_out += unknown
-    left_out += [f"variable {name}" for name in variables if name not in computed]
-    left_out += [f"property {x}" for x in config["properties"] if not x.endswith("_err")]
+    for name in variables:
+        if name not in computed:
+            left_out.append(f"variable {name}")
+    for name in config["properties"]:
+        if not name.endswith("_err"):
+            left_out.append(f"property {name}")
     chain.left_out[:] = left_out
-    extended = [x for x in {**bands, **predicted}.values() if x.endswith("_ext") and x not in names]
+    all_bands = (bands | predicted).values()
+    extended = [name for name in all_bands if name.endswith("_ext") and name not in names]
     if extended:
         chain.differs.append(f"bands {', '.join(extended)}: curves of point sources")
     flag = analysis["lim_flag"]
@@ -120,7 +127,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         data_file=path.parent / config["data_file"] if config["data_file"] else None,
         bands=bands,
         predicted=without(predicted, bands),
-        columns=tuple(c for c in columns if c.removesuffix("_err") in bands.values()),
+        columns=tuple(name for name in columns if _without_error(name) in bands.values()),
         variables=tuple(name for name in variables if name in computed),
         additional_error=config["additionalerror"],
         limits=LIMIT_FLAGS[flag] != "none",
@@ -128,7 +135,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         mock=analysis["mock_flag"],
         method=config["analysis_method"],
         names=names,
-        **{k: tuple(v) if isinstance(v, list) else v for k, v in vars(chain).items()},
+        **convert_values(_frozen, vars(chain)),
     )
     text = setup.describe()
     if strict and (setup.left_out or setup.replaced):
@@ -136,6 +143,18 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     if text:
         warn(f"{path}:\n{text}", CatalogWarning)
     return setup
+
+
+def _without_error(column):
+    """Name of the band of a column of fluxes or errors."""
+    return column.removesuffix("_err")
+
+
+def _frozen(value):
+    """A list as a tuple, and anything else as it is."""
+    if isinstance(value, list):
+        return tuple(value)
+    return value
 
 
 def fit_cigale(

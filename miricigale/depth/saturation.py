@@ -10,6 +10,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from miricigale.instrument import Exposure, electron_rate, miri_detector
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns
 
@@ -289,16 +290,26 @@ def forecast_table(forecasts):
     for forecast in forecasts:
         if not isinstance(forecast, SaturationForecast):
             raise argument_error("forecasts", "made of SaturationForecast", repr(forecast))
-    columns = {}
-    for name in ("filter", "dither", "readout", "subarray", "n_groups", "n_integrations"):
-        columns[name] = [getattr(f.exposure, name) for f in forecasts]
-    columns["group_time"] = u.Quantity([f.exposure.group_time for f in forecasts])
-    for name in ("sky_fraction", "sky_group", "n_pixels"):
-        columns[name] = [getattr(f, name) for f in forecasts]
-    rows = [f.saturated for f in forecasts]
-    columns["n_sources"] = [len(r) for r in rows]
-    columns["first_group"] = [int(r["group"].min()) if len(r) else 0 for r in rows]
-    columns["ids"] = [" ".join(map(str, r["id"])) for r in rows]
-    table = QTable(columns)
+    rows = []
+    for forecast in forecasts:
+        sources = forecast.saturated
+        first_group = 0
+        if len(sources):
+            first_group = int(sources["group"].min())
+        names = (
+            "filter",
+            "dither",
+            "readout",
+            "subarray",
+            "n_groups",
+            "n_integrations",
+            "group_time",
+        )
+        row = attributes(forecast.exposure, names)
+        row |= attributes(forecast, ("sky_fraction", "sky_group", "n_pixels"))
+        row |= {"n_sources": len(sources), "first_group": first_group}
+        row["ids"] = " ".join(map(str, sources["id"]))
+        rows.append(row)
+    table = QTable(rows)
     table["sky_fraction"].info.description = "of the full well by the last group"
     return table

@@ -111,8 +111,10 @@ def _int_times(exposure, start):
     begin = start + step * np.arange(n_int)
     shifts = {"start": 0.0, "mid": length / 2, "end": length}
     columns = {"integration_number": np.arange(1, n_int + 1, dtype=np.int32)}
-    columns |= {f"int_{name}_MJD_UTC": begin + shift for name, shift in shifts.items()}
-    columns |= {f"int_{name}_BJD_TDB": np.full(n_int, np.nan) for name in shifts}
+    for name, shift in shifts.items():
+        columns[f"int_{name}_MJD_UTC"] = begin + shift
+    for name in shifts:
+        columns[f"int_{name}_BJD_TDB"] = np.full(n_int, np.nan)
     return fits.BinTableHDU(Table(columns), name="INT_TIMES")
 
 

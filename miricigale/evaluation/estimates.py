@@ -151,8 +151,10 @@ def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):
     columns = [floats(column) for column in columns]
     if not columns or len(set(map(len, columns))) != 1:
         raise argument_error("columns", "of one length", [column.shape for column in columns])
-    is_finite = [np.atleast_2d(np.isfinite(column).T).any(axis=0) for column in columns]
-    columns = [column[np.all(is_finite, axis=0)] for column in columns]
+    good = np.ones(len(columns[0]), bool)
+    for column in columns:
+        good &= np.atleast_2d(np.isfinite(column).T).any(axis=0)
+    columns = [column[good] for column in columns]
     n = len(columns[0])
     if n == 0:
         return Estimate(np.nan, n=0, n_all=n_all)

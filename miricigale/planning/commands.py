@@ -51,7 +51,8 @@ def plan_table(*, quick=False):
         row["limit_proposal"] = np.round(proposal_limit(name), 2)
         rows.append(row | {"fwhm": psf_fwhm(name)})
     order = ["filter", "groups", "integrations", "dithers", "time", "sky_in_well"]
-    return QTable(rows)[[*order, "limit_etc", "limit", "limit_proposal", "fwhm"]]
+    order += ["limit_etc", "limit", "limit_proposal", "fwhm"]
+    return QTable(rows)[order]
 
 
 def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=False):
@@ -94,8 +95,9 @@ def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=F
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise argument_error("folder", "a folder, or nothing yet", f"the file {folder}")
-    names = ["plan.html", "plan.toml", "comparison.ecsv", "areas.ecsv"]
-    paths = [folder / name for name in names]
+    # those of a plan with fewer sets, too
+    paths = [folder / "plan.html", folder / "plan.toml"]
+    paths += [folder / "comparison.ecsv", folder / "areas.ecsv"]
     for pattern in ("bands-[0-9]*.ecsv", "sources-[0-9]*.ecsv"):
         paths += sorted(folder.glob(pattern))
     # refused before the fits, which take minutes
@@ -113,9 +115,12 @@ def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=F
     with replacing(folder / "plan.toml", overwrite=overwrite) as partial:
         partial.write_text(config.to_toml(), encoding="utf-8")
     tables = {"comparison": comparison}
-    tables |= {} if areas is None else {"areas": areas}
-    tables |= {f"sources-{k}": plan.sources for k, plan in enumerate(plans)}
-    tables |= {f"bands-{k}": plan.band_table() for k, plan in enumerate(plans) if plan.bands}
+    if areas is not None:
+        tables["areas"] = areas
+    for k, plan in enumerate(plans):
+        tables[f"sources-{k}"] = plan.sources
+        if plan.bands:
+            tables[f"bands-{k}"] = plan.band_table()
     for name, table in tables.items():
         write_table(table, folder / f"{name}.ecsv", overwrite=overwrite)
     write_page(folder / "plan.html", planner, plans, comparison, areas, overwrite=overwrite)

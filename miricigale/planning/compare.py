@@ -104,8 +104,8 @@ def area_table(planner, plans):
     >>> planner = Planner(load_plan(overrides={"survey": {"areas": [1, 4]}}))  # doctest: +SKIP
     >>> area_table(planner, planner.divide())["pointings", "area", "n_agn"]  # doctest: +SKIP
     """
-    rows = [_row(planner, plan, planner.accuracy(plan)) for plan in plans]
-    for row in rows:
-        row["pointings"] = int(row.pop("plan"))
-    table = QTable(rows)
-    return table[["pointings", *(name for name in table.colnames if name != "pointings")]]
+    rows = []
+    for plan in plans:
+        row = _row(planner, plan, planner.accuracy(plan))
+        rows.append({"pointings": int(row.pop("plan"))} | row)
+    return QTable(rows)

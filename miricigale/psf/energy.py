@@ -12,7 +12,7 @@ from miricigale.psf.effects import detector_response
 from miricigale.psf.model import enclosed_light, instrument_psf
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.package_tables import declared
-from miricigale.utils.tables import described_columns
+from miricigale.utils.tables import described_rows
 from miricigale.utils.units import ANGLE, to_array
 
 
@@ -192,29 +192,32 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
     ----------- ------ ----------- ------- -----
     miri.f1500w  0.513       0.488   0.681 0.818
     """
-    sampled = []
-    for i, item in enumerate(psfs):
-        sampled.append(instrument_psf(item, f"psfs[{i}]"))
-    psfs = sampled
-    names = [psf.filter or "" for psf in psfs]
-    columns = {
-        "filter": names,
-        "frame": [psf.frame for psf in psfs],
-        "angle": [psf.angle.value if psf.frame == "sky" else np.nan for psf in psfs] * u.deg,
-        "includes": [" ".join(psf.includes) for psf in psfs],
-        "fwhm": u.Quantity([psf.fwhm for psf in psfs]),
-        "fwhm_gaussian": u.Quantity([fwhm(psf, method="gaussian") for psf in psfs]),
-        "fwhm_flight": [psf_fwhm(n).value if n in imager_filters() else np.nan for n in names]
-        * ANGLE,
-        "r80": [_r80(psf) for psf in psfs] * ANGLE,
-        "enclosed": [psf.enclosed for psf in psfs],
-    }
     texts = dict(declared("miricigale.psf", "columns.toml"))
+    radius_of_column = {}
     for radius in radii:
         name = f"eef_{radius.to_value(ANGLE):g}"
-        energies = []
-        for psf in psfs:
-            energies.append(encircled_energy(psf, radius))
-        columns[name] = energies
+        radius_of_column[name] = radius
         texts[name] = f"fraction of all light within {radius}"
-    return described_columns(columns, texts)
+    rows = []
+    for i, item in enumerate(psfs):
+        psf = instrument_psf(item, f"psfs[{i}]")
+        name = psf.filter or ""
+        row = {
+            "filter": name,
+            "frame": psf.frame,
+            "angle": np.nan * u.deg,
+            "includes": " ".join(psf.includes),
+            "fwhm": psf.fwhm,
+            "fwhm_gaussian": fwhm(psf, method="gaussian"),
+            "fwhm_flight": np.nan * ANGLE,
+            "r80": _r80(psf) * ANGLE,
+            "enclosed": psf.enclosed,
+        }
+        if psf.frame == "sky":
+            row["angle"] = psf.angle
+        if name in imager_filters():
+            row["fwhm_flight"] = psf_fwhm(name)
+        for column, radius in radius_of_column.items():
+            row[column] = encircled_energy(psf, radius)
+        rows.append(row)
+    return described_rows(rows, texts)

@@ -197,7 +197,9 @@ class Chain:
         return stars, np.array([place[key] for key in keys], dtype=np.int64)
 
     def _make_stars(self, values):
-        sfh, stellar, nebular = (self.by_role[r] for r in STELLAR)
+        sfh = self.by_role["sfh"]
+        stellar = self.by_role["stellar"]
+        nebular = self.by_role["nebular"]
         n = len(values)
         light = np.zeros((2, n, self.wave.size))
         if nebular is None:
@@ -212,8 +214,8 @@ class Chain:
             v = self._dict(key, *STELLAR[1:])
             age, spectra, surviving, ionizing = self._populations(v["metallicity"])
             parts = [histories[row] for row in rows]
-            flat = np.concatenate([*parts, [0.0]])
-            end = np.cumsum([h.size for h in parts])
+            flat = np.append(np.concatenate(parts), 0.0)
+            end = np.cumsum(list(map(len, parts)))
             weights = stellar.masses(flat, end, v)
             out["sfr"][rows] = flat[end - 1]
             for last in (10, 100):
@@ -236,9 +238,12 @@ class Chain:
                     light[part, rows, : self._hard] *= v["f_esc"]
                     photons = _core.weighted_sums(shares, ionizing)
                     gas[part, rows] = _core.weighted_sums(photons, self._glow(key))
-        light += 0.0 if gas is None else gas
+        if gas is None:
+            gas = (None, None)
+        else:
+            light += gas
         visual = light[:, :, self.at[VISUAL]].sum(axis=0)
-        return Stars(*light, *((None, None) if gas is None else gas), visual=visual, **out)
+        return Stars(light[0], light[1], gas[0], gas[1], visual=visual, **out)
 
     # ------------------------------------------------------- attenuation and dust
 
@@ -341,7 +346,8 @@ class Chain:
         """
         observed = self.wave[first:last] * (1.0 + redshift)
         values = self._dict(key, *SKY)
-        igm, foreground = (self.by_role[role] for role in SKY)
+        igm = self.by_role["igm"]
+        foreground = self.by_role["foreground"]
         out = np.ones(observed.size)
         if igm is not None:
             igm_values = subset(values, self.names("igm"))

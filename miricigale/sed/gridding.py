@@ -68,7 +68,7 @@ def _distinct_agn(component, rows):
     groups = {}
     for row in rows:
         inert = component.inert(row)
-        key = tuple((name, value) for name, value in row.items() if name not in inert)
+        key = tuple(without(row, inert).items())
         groups.setdefault((key, tuple(sorted(inert))), []).append(row)
     out = []
     names = [inert for _, inert in groups]
@@ -79,8 +79,11 @@ def _distinct_agn(component, rows):
 
 
 def _parameter_table(parameters, rows):
-    columns = {name: np.array([row[name] for row in rows], dtype=float) for name in parameters}
-    return described_table({n: (columns[n] * p.unit, p.doc) for n, p in parameters.items()})
+    columns = {}
+    for name, parameter in parameters.items():
+        values = np.array([row[name] for row in rows], dtype=float)
+        columns[name] = (values * parameter.unit, parameter.doc)
+    return described_table(columns)
 
 
 class Galaxies:
@@ -149,10 +152,12 @@ def agn_table(model, parts):
         "l_6um": observed["six"],
         "ir_luminosity": observed["infrared"],
     }
-    texts = {name: DERIVED[name].text for name in values}
-    texts["ir_luminosity"] = "3-1000 um light of the AGN"
-    per = "W for each W of AGN power"
-    columns = {n: (v * scale * u.one, f"{texts[n]}, {per}") for n, v in values.items()}
+    columns = {}
+    for name, power in values.items():
+        text = DERIVED[name].text
+        if name == "ir_luminosity":
+            text = "3-1000 um light of the AGN"
+        columns[name] = (power * scale * u.one, f"{text}, W for each W of AGN power")
     return model.chain.lnu(spectra) * scale[:, None], described_table(columns)
 
 

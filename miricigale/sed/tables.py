@@ -157,7 +157,7 @@ def _stack(filters):
     """All passbands one after the other, as `_core.band_means` takes them."""
     waves = [band.wave.to_value(WAVE) for band in filters]
     curves = [np.asarray(band.throughput, dtype=float) for band in filters]
-    start = np.cumsum([0, *(w.size for w in waves)])
+    start = np.append(0, np.cumsum(list(map(len, waves))))
     band_wave = np.concatenate(waves)
     return start, band_wave, *_core.band_tables(start, band_wave, np.concatenate(curves))
 

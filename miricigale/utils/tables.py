@@ -174,7 +174,8 @@ def described_rows(rows, texts):
     Parameters
     ----------
     rows : iterable of dict
-        Values of one row each by name, all with the same names; there may be none.
+        Values of one row each by name, all with the same names; there may be none. Quantities make a column with
+        their unit.
     texts : dict of str to str
         Description of each column by name; the order of the columns is that of the rows.
 
@@ -189,7 +190,13 @@ def described_rows(rows, texts):
     """
     rows = list(rows)
     names = list(rows[0]) if rows else list(texts)
-    columns = {name: np.array([row[name] for row in rows]) for name in names}
+    columns = {}
+    for name in names:
+        values = [row[name] for row in rows]
+        if rows and isinstance(values[0], u.Quantity):
+            columns[name] = u.Quantity(values)
+        else:
+            columns[name] = np.array(values)
     return described_columns(columns, texts)
 
 

@@ -157,7 +157,7 @@ def pixel_map(wcs_in, wcs_out, shape):
         raise argument_error(
             "wcs_out (the grid's wcs)", wanted, "one that diverges there"
         ) from None
-    x, y = (np.reshape(values, grid_x.shape) for values in pixels)
+    x, y = np.reshape(pixels, (2,) + grid_x.shape)
     if x.shape == (ny, nx):
         return x, y
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
@@ -165,7 +165,9 @@ def pixel_map(wcs_in, wcs_out, shape):
         return np.full((2, ny, nx), np.nan)
     rows = np.arange(ny, dtype=float)
     columns = np.arange(nx, dtype=float)
-    return tuple(RectBivariateSpline(nodes_y, nodes_x, values)(rows, columns) for values in (x, y))
+    x_of_nodes = RectBivariateSpline(nodes_y, nodes_x, x)
+    y_of_nodes = RectBivariateSpline(nodes_y, nodes_x, y)
+    return x_of_nodes(rows, columns), y_of_nodes(rows, columns)
 
 
 def weight_map(source):
@@ -361,10 +363,8 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
         weight = weight.astype(np.float32)
         if part is None or not weight.any():
             continue
-        parts = [
-            np.square(np.asarray(sigma(im), float)),
-            *(image_variances[name] for name in names),
-        ]
+        parts = [np.square(np.asarray(sigma(im), float))]
+        parts += [image_variances[name] for name in names]
         parts = [np.where(weight > 0, plane, 0.0).astype(np.float32) for plane in parts]
         add_image(sink, im, weight, (x, y), wcs, pixfrac, data2=parts)
         touched = sink.out_wht[part] > before[part]
@@ -445,7 +445,7 @@ def _filled(values, nowhere):
     """
     y, x = np.nonzero(~nowhere)
     terms = np.stack([np.ones(x.size), x, y], axis=1)
-    plane, *_ = np.linalg.lstsq(terms, values[~nowhere], rcond=None)
+    plane = np.linalg.lstsq(terms, values[~nowhere], rcond=None)[0]
     rows, columns = np.indices(values.shape)
     smooth = plane[0] + plane[1] * columns + plane[2] * rows
     nearest = distance_transform_edt(nowhere, return_distances=False, return_indices=True)
@@ -471,11 +471,14 @@ def extent_of(pixel_map, shape):
     if not overlaps(pixel_map, shape):
         return None
     x, y = pixel_map
-    ends = [(np.nanmin(values) - 2, np.nanmax(values) + 3) for values in (y, x)]
-    return tuple(
-        slice(max(0, int(low)), min(n, int(high) + 1))
-        for (low, high), n in zip(ends, shape, strict=True)
-    )
+    return _reached(y, shape[0]), _reached(x, shape[1])
+
+
+def _reached(values, n):
+    """Rows or columns out of ``n`` around coordinates, with a margin for the sides of pixels."""
+    low = np.nanmin(values) - 2
+    high = np.nanmax(values) + 3
+    return slice(max(0, int(low)), min(n, int(high) + 1))
 
 
 def _scale(wcs):

@@ -78,15 +78,14 @@ def sky_flats(images, *, window=None, box=16):
     out = None
     # peaks of the response look like sources: these are searched for when it is gone
     for search in (False, True):
-        if search:
-            images_flat = [
-                with_data(im, im.data / flat.data) for im, flat in zip(images, out, strict=True)
-            ]
-            sources = [estimate_background(im, warn=False).source_mask for im in images_flat]
-        hidden = zip(images, masks, sources, strict=True)
-        levels = [float(np.median(im.data[~(mask | source)])) for im, mask, source in hidden]
-        check_that(min(levels) > 0, "images", "of positive sky levels", f"{min(levels):.3g}")
-        relative = [with_data(im, im.data / v) for im, v in zip(images, levels, strict=True)]
+        relative = []
+        for k, im in enumerate(images):
+            if search:
+                flat_image = with_data(im, im.data / out[k].data)
+                sources[k] = estimate_background(flat_image, warn=False).source_mask
+            level = float(np.median(im.data[~(masks[k] | sources[k])]))
+            check_that(level > 0, "images", "of positive sky levels", f"{level:.3g}")
+            relative.append(with_data(im, im.data / level))
         out = []
         for template in other_medians(relative, masks, sources, [1.0] * len(images), uses):
             finite = np.isfinite(template)
