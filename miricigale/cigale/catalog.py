@@ -103,7 +103,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     except ValueError as err:
         raise data_error(path, f"cannot be used: {err}") from None
     check_data(filters, path, f"has no band that is known here, of {', '.join(chosen) or 'none'}")
-    left_out = [*lost, *(f"{name} (line)" for name in lines)]
+    left_out = lost + [f"{name} (line)" for name in lines]
     named = {*_OWN, *chosen, *map(error_column, chosen)}
     if bands is not None:
         unused = []

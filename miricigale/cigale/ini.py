@@ -50,7 +50,7 @@ def parse_ini(path):
             del section[key]
     validity = config.validate(validate.Validator(), preserve_errors=True)
     for sections, key, error in configobj.flatten_errors(config, validity):
-        key = ".".join([*sections, str(key)])
+        key = ".".join(sections + [str(key)])
         raise config_error(path, f"is wrong at {key}: {error or 'missing'}")
     return config.dict()
 
@@ -113,7 +113,7 @@ def _count(number):
 def _spaced(function):
     def values(start, stop, num=50, **options):
         names = ["base", "endpoint"]
-        check_that({*options} <= {*names}, "arguments", f"of {names}", sorted(options))
+        check_that(options.keys() <= set(names), "arguments", f"of {names}", sorted(options))
         return function(float(start), float(stop), _count(num), **options)
 
     return values

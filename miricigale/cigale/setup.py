@@ -211,12 +211,12 @@ class CigaleSetup:
         by_name = {filter_.name: filter_ for filter_ in self.names.values()}
         by_name |= {name: xray_filter(name, band) for name, band in self.xray_bands().items()}
         if names is None:
-            names = [*self.bands, *self.predicted]
+            names = list(self.bands | self.predicted)
         return FilterSet([by_name.get(name, name) for name in names])
 
     def xray_bands(self):
         """X-ray bands among ``bands`` and ``predicted``: name to lowest and highest energy."""
-        names = [name for name in (*self.bands, *self.predicted) if xray_energies(name)]
+        names = [name for name in self.bands | self.predicted if xray_energies(name)]
         return {name: xray_energies(name) * u.keV for name in names if name not in self.names}
 
     def grid(self, names, redshifts=None):

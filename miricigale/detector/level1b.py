@@ -163,7 +163,7 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False, ob
         times = _int_times(exposure, begun)
     shape = (exposure.n_integrations, exposure.n_groups) + exposure.shape
     axes = [("NAXIS", len(shape))] + [(f"NAXIS{i + 1}", n) for i, n in enumerate(shape[::-1])]
-    structure = [("XTENSION", "IMAGE"), ("BITPIX", 16), *axes, ("PCOUNT", 0), ("GCOUNT", 1)]
+    structure = [("XTENSION", "IMAGE"), ("BITPIX", 16)] + axes + [("PCOUNT", 0), ("GCOUNT", 1)]
     scaling = [("EXTNAME", "SCI"), ("BZERO", 32768), ("BSCALE", 1)]
     science = fits.Header(structure + scaling) + science
     lock = threading.Lock()

@@ -116,7 +116,7 @@ def catalog_messages(lost, pieces, treatment="taken as missing, by the number th
             codes = ", ".join(f"{value:g}" for value in sorted(counts)[:3])
             parts.append(f"{name} {counts.total()} of {sizes[name]} ({codes})")
     if len(parts) > _FEW:
-        parts = [*parts[:_FEW], f"and {len(parts) - _FEW} more bands"]
+        parts = parts[:_FEW] + [f"and {len(parts) - _FEW} more bands"]
     if parts:
         yield f"{treatment}: {'; '.join(parts)}"
 

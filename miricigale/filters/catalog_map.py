@@ -243,7 +243,7 @@ class CatalogMap:
             check_names([theirs], f"column of {argument} (for {ours!r})", colnames)
         ours = {theirs: name for name, theirs in columns.items()}
         unmapped = (name for name in colnames if name in ours or name not in columns)
-        lost = [*lost, *(name for name in self.left_out if name in colnames)]
+        lost = lost + [name for name in self.left_out if name in colnames]
         return {name: ours.get(name, name) for name in unmapped}, [n for n in lost if n not in ours]
 
     def convert(self, table, argument="catalog"):

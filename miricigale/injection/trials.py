@@ -293,7 +293,7 @@ def run_trial(field, injection, base, sources, image_file=None):
             former=None if field.has_prior else base.former, image_file=image_file
         )
         return QTable(), measured.table
-    measured, *_ = field.measure(sources, base.psfs, base.former, image_file)
+    measured = field.measure(sources, base.psfs, base.former, image_file)[0]
     image = measured.image
     result = measured.result
     rows = QTable({"row": sources["row"], "sky": sources["sky"].icrs})

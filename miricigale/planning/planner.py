@@ -133,13 +133,13 @@ class Planner:
         #: Sources of the caller, if there are any.
         self._caller_sources = sources
         if sources is not None:
-            wanted = ("id", "redshift", "frac_agn", *self.bands)
+            wanted = ("id", "redshift", "frac_agn") + self.bands
             require_columns(sources, wanted, "sources", units=dict.fromkeys(self.bands, u.uJy))
 
     @property
     def bands(self):
         """Existing bands and those of MIRI."""
-        return (*self.config.fit.bands, *self.config.exposures.bands)
+        return self.config.fit.bands + self.config.exposures.bands
 
     @functools.cached_property
     def sources(self):

@@ -172,5 +172,5 @@ class Cutouts:
                 strips[:, top : top + panels.n, x_start : x_start + panels.n] = shades[:, row]
         sheet = Image.fromarray(strips.reshape(-1, strips.shape[2]))
         gray = np.repeat(255 - np.round(255 * np.arange(N_GRAY) / (N_GRAY - 1)).astype(int), 3)
-        sheet.putpalette([*gray.tolist(), *NO_DATA])
+        sheet.putpalette(gray.tolist() + list(NO_DATA))
         return sheet, np.transpose(limits)

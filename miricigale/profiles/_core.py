@@ -21,11 +21,15 @@ from miricigale.utils.compilation import njit
 
 #: Columns of a parameter row.
 PARAMETERS = (
-    *("x", "y", "total", "intensity"),  # center, total light, central intensity per cell
-    *("xx", "xy", "yx", "yy"),  # pixel offsets to the unit circle: X = xx dx + xy dy, ...
-    *("a", "b", "c"),  # w = R^2 = a dx^2 + 2 b dx dy + c dy^2
-    *("power", "bn"),  # intensity ~ exp(-bn w^power), power = 1 / (2 n)
-)
+    # center, total light, central intensity per cell
+    "x", "y", "total", "intensity",
+    # pixel offsets to the unit circle: X = xx dx + xy dy, Y = yx dx + yy dy
+    "xx", "xy", "yx", "yy",
+    # w = R^2 = a dx^2 + 2 b dx dy + c dy^2
+    "a", "b", "c",
+    # intensity ~ exp(-bn w^power), power = 1 / (2 n)
+    "power", "bn",
+)  # fmt: skip
 
 #: The table of enclosed light is even in ln(R / R_e): first node, step, number of nodes.
 TABLE_START = math.log(1e-8)

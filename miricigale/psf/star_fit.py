@@ -11,13 +11,13 @@ from miricigale.utils.options import check_that
 #: Terms of a correction and the standard deviation of each by its prior: relative width of the core, its
 #: elongation along the axes and the diagonals, and the light beyond some full widths at half maximum.
 _BEYOND = (1, 2, 4, 8)
-TERMS = dict.fromkeys(["width", "elongation", "diagonal", *(f"wings_{n}" for n in _BEYOND)], 0.1)
+TERMS = dict.fromkeys(["width", "elongation", "diagonal"] + [f"wings_{n}" for n in _BEYOND], 0.1)
 
 #: How many of the terms may change over the field; standard deviations of all terms, and of their changes from the
 #: middle of the field to its edges; deviation of single cells, as a fraction of the light about them.
 _SLOPED = 3
 _CELLS = 0.1
-_SPREAD = np.array([*TERMS.values(), *[0.05] * (2 * _SLOPED)])
+_SPREAD = np.array(list(TERMS.values()) + [0.05] * (2 * _SLOPED))
 
 #: Least number of stars that are left out one by one (of fewer, halves are), with which changes over the field and
 #: single cells are tried; how much smaller chi-square must be of what was left out, and as a part of it: less may

@@ -156,7 +156,7 @@ def choose(regularization, make, source, target, tolerance):
         if regularization in REGULARIZATIONS:
             regularization = REGULARIZATIONS[regularization]
         elif regularization != "auto":
-            names = ["auto", *REGULARIZATIONS]
+            names = ["auto"] + list(REGULARIZATIONS)
             raise argument_error("regularization", f"positive or one of {names}", regularization)
     if regularization != "auto":
         check_positive(regularization, "regularization")

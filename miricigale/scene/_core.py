@@ -393,8 +393,13 @@ def fill_outskirts(grid, start, stop, rows, tables, w_zone, w_smooth, w_cut, lan
                     total += _add_row(
                         grid[i + step],
                         share[i + step - start],
-                        *(first, last, low, high),
-                        *(light, shift_x, shift_y),
+                        first,
+                        last,
+                        low,
+                        high,
+                        light,
+                        shift_x,
+                        shift_y,
                         w_light,
                         float(step),
                     )

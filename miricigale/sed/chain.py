@@ -98,19 +98,18 @@ class Chain:
 
     def __init__(self, components, *, span=INFRARED):
         self.by_role = {role: components.get(role) for role in ROLES}
+        marks = (SIX, VISUAL) + INFRARED + tuple(span)
         parts = [c.nodes() for c in components.values() if len(c.nodes())]
         limit = _core.LYMAN_LIMIT * np.array([1 - 1e-5, 1 + 1e-5])
         windows = np.ravel(UV_WINDOWS)
-        wave = _core.merge_nodes([*parts, [SIX, VISUAL, *INFRARED, *span], limit, windows])
+        wave = _core.merge_nodes(parts + [marks, limit, windows])
         wave.flags.writeable = False
         self.wave = wave
         self.log_wave = np.log(wave)
         self.weights = _core.trapezoid_weights(wave)
         self.to_lnu = wave**2 / _core.LIGHT
         self._hard = int(np.searchsorted(wave, _core.LYMAN_LIMIT))  # these ionize hydrogen
-        self.at = {
-            x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED, *span)
-        }
+        self.at = {x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in marks}
         self.functionals = self._functionals()
         self.reference_row = 0
         if tuple(span) != INFRARED:
@@ -258,7 +257,8 @@ class Chain:
             gas = attenuation.gas_factor(self.wave, values)
         else:
             gas = None
-        return *attenuation.factors(self.wave, values), gas
+        young, old = attenuation.factors(self.wave, values)
+        return young, old, gas
 
     def attenuated(self, stars, rows, keys, dust_keys=None, out=None):
         """
@@ -289,8 +289,8 @@ class Chain:
             dust_keys, dusty = distinct(dust_keys)
             dust = self.dusts(dust_keys)
         parts = [stars.young[block], stars.old[block], none]
-        *dims, gas = zip(*map(self.factors, different), strict=True)
-        dims = [*map(np.array, dims), none]
+        young_factor, old_factor, gas = zip(*map(self.factors, different), strict=True)
+        dims = [np.array(young_factor), np.array(old_factor), none]
         if gas[0] is not None:
             young = stars.nebular_young[block]
             old = stars.nebular_old[block]

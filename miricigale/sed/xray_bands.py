@@ -53,13 +53,15 @@ class Source(NamedTuple):
     def spectrum(self, energy):
         """L_E in W/keV."""
         shape = _shape(energy, self.index, self.cutoff)
-        return self.power * shape / _energy(*self.band, self.index, self.cutoff)
+        return self.power * shape / _energy(self.band, self.index, self.cutoff)
 
     def dimming(self, band, redshift, far):
         """F_nu in uJy, the mean of an observed band (keV), over the power; distances in m."""
         low, high = band
-        share = [_energy(low * (1 + z), high * (1 + z), self.index, self.cutoff) for z in redshift]
-        share = np.array(share) / _energy(*self.band, self.index, self.cutoff)
+        share = [
+            _energy((low * (1 + z), high * (1 + z)), self.index, self.cutoff) for z in redshift
+        ]
+        share = np.array(share) / _energy(self.band, self.index, self.cutoff)
         return share / (4.0 * np.pi * far**2 * (high - low) * _PER_KEV * _MICROJANSKY)
 
 
@@ -93,7 +95,7 @@ class XRays:
         at_30, at_angle = a1 * mu + a2 * mu**2 + 1.0 - a1 - a2
         # L_E at 2 keV, whose integral over the spectrum's shape is the power
         at_two = 10.0 ** (alpha_ox / _PER_DEX) * disk * at_angle / at_30 * _PER_KEV
-        shape = _energy(*_HARD, self.photon_index, cut) / _shape(_TWO, self.photon_index, cut)
+        shape = _energy(_HARD, self.photon_index, cut) / _shape(_TWO, self.photon_index, cut)
         return Source(at_two * shape, self.photon_index, cut, _HARD)
 
 
@@ -245,8 +247,9 @@ def _shape(energy, index, cut):
     return energy ** (1.0 - index) * np.exp(-energy / cut)
 
 
-def _energy(low, high, index, cut):
-    """Integral of E^(1 - Gamma) exp(-E / cut) over energies."""
+def _energy(band, index, cut):
+    """Integral of E^(1 - Gamma) exp(-E / cut) over the energies of a band."""
+    low, high = band
     middle = 0.5 * np.log(high * low)
     half = 0.5 * np.log(high / low)
     energy = np.exp(middle + half * _NODES)

@@ -77,7 +77,7 @@ def _feed_array(digest, value):
     _feed(digest, getattr(value, "unit", None))
     array = np.asarray(getattr(value, "value", value))
     if array.dtype.kind == "O":
-        _feed(digest, [array.shape, *array.ravel().tolist()])
+        _feed(digest, [array.shape] + array.ravel().tolist())
         return
     # one byte order, so that what came from a file counts as the same
     array = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))

@@ -294,7 +294,7 @@ def _write_fits(path, tables, n_rows):
     with open(path, "wb") as stream:
         for table in tables:
             header, rows = _fits_rows(table)
-            columns = [*header["TFORM*"].values()]
+            columns = list(header["TFORM*"].values())
             if layout is None:
                 layout = columns
                 header["NAXIS2"] = n_rows

@@ -93,7 +93,7 @@ class Section:
         dataclasses.dataclass(frozen=True)(cls)
         entries = [f"{name}\n    {doc}" for name, doc in cls.docs().items()]
         cls.__doc__ = "\n".join(
-            [inspect.cleandoc(cls.__doc__), "", "Parameters", "----------", *entries]
+            [inspect.cleandoc(cls.__doc__), "", "Parameters", "----------"] + entries
         )
 
     @classmethod

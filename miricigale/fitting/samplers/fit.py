@@ -226,7 +226,7 @@ class SamplerFit:
         flags = np.array(data.flags)
         n = len(data)
         columns = self.columns
-        quantities = ("mass", *columns)
+        quantities = ("mass",) + tuple(columns)
         size = {name: axis.values.size for name, axis in axes.items()}
         n_axes = len(axes)
         n_derived = len(quantities)
@@ -247,7 +247,7 @@ class SamplerFit:
             "converged": np.zeros(n, bool),
             "pdf": {name: np.full((n, size[name]), np.nan) for name in axes},
             "pairs": {(x, y): np.full((n, size[x], size[y]), np.nan) for x, y in pairs},
-            "best": {name: np.full(n, np.nan) for name in (*axes, *quantities)},
+            "best": {name: np.full(n, np.nan) for name in tuple(axes) + quantities},
         }
         for row in np.flatnonzero((flags & int(FitFlags.UNFITTED)) == 0):
             posterior = self._sample(data._take(row), spaces[row], seed, axes, pairs)
@@ -259,6 +259,11 @@ class SamplerFit:
                         array[row] = value[key]
                 else:
                     out[name][row] = value
+        units = [MASS]
+        descriptions = [FORMED_TEXT]
+        for column in columns.values():
+            units.append(column.unit)
+            descriptions.append(column.text)
         return FitResults(
             **data.columns,
             flags=flags,
@@ -267,8 +272,8 @@ class SamplerFit:
             best_index=np.full((n, 4), -1),
             best_scale=out["best"]["mass"],
             quantities=quantities,
-            units=(MASS, *(column.unit for column in columns.values())),
-            descriptions=(FORMED_TEXT, *(c.text for c in columns.values())),
+            units=tuple(units),
+            descriptions=tuple(descriptions),
             intensive=tuple(name for name, column in columns.items() if not column.extensive),
             constants=self.settings()["constants"],
             **out,

@@ -218,7 +218,7 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
 
 def visit_of(image):
     """The visit of an image, of the keyword VISIT_ID of its observation."""
-    visit, *_ = image.meta.get("keywords", {}).get("VISIT_ID", [None])
+    visit = image.meta.get("keywords", {}).get("VISIT_ID", [None])[0]
     check_that(visit is not None, "images", "ones with the keyword VISIT_ID", "one without")
     return visit
 
@@ -280,9 +280,9 @@ def _aligned(detected, catalog, radius, argument):
     places = [(coordinates.ra.deg, coordinates.dec.deg) for coordinates in positions] or [([], [])]
     sky = SkyCoord(*np.concatenate(places, axis=1), unit="deg")
     if len(sky):
-        i, j, *_ = search_around_sky(sky, catalog, radius * ANGLE)
+        i, j = search_around_sky(sky, catalog, radius * ANGLE)[:2]
     else:
-        i, j, *_ = ([], [])
+        i, j = ([], [])
     coordinates, target = (
         np.stack(plane.world_to_pixel(s[k]), axis=1) * 3600 if len(k) else np.empty((0, 2))
         for s, k in ((sky, i), (catalog, j))

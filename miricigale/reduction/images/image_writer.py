@@ -106,7 +106,7 @@ def write_image(image, path, *, planes=None, overwrite=False):
     extension = asdf_extension()
     if wcs is not None:
         # what is no WCS keyword of this image confuses
-        written = {*science, "DATE-OBS", "MJD-OBS", "TIMESYS"}
+        written = set(science) | {"DATE-OBS", "MJD-OBS", "TIMESYS"}
         sky = wcs.to_header(relax=True).cards
         science.extend(card for card in sky if card.keyword not in written)
         primary["S_WCS"] = "COMPLETE"
@@ -114,7 +114,7 @@ def write_image(image, path, *, planes=None, overwrite=False):
         x = np.array([-0.5, -0.5, nx - 0.5, nx - 0.5])
         y = np.array([-0.5, ny - 0.5, ny - 0.5, -0.5])
         corners = np.transpose(pixel_to_radec(wcs, x, y)).flat
-        science["S_REGION"] = " ".join(["POLYGON ICRS", *(f"{angle:.9f}" for angle in corners)])
+        science["S_REGION"] = "POLYGON ICRS " + " ".join(f"{angle:.9f}" for angle in corners)
         if cal and "resample" in steps:
             if "PIXAR_SR" not in science:
                 science["PIXAR_SR"] = proj_plane_pixel_area(wcs) * u.deg.to(u.rad) ** 2
@@ -148,7 +148,7 @@ def write_image(image, path, *, planes=None, overwrite=False):
             hdus[-1].header["BUNIT"] = unit
     # a process that is killed leaves no half of a file
     with replacing(path, overwrite=overwrite) as partial:
-        write_fits([*hdus, extension], partial)
+        write_fits(hdus + [extension], partial)
     return path
 
 

@@ -81,7 +81,7 @@ class SkyBoxes:
         coefficients = np.zeros(6)
         keep = np.ones(level.size, bool)
         for _ in range(10 if number else 0):
-            fitted, *_ = np.linalg.lstsq(terms[keep, :number], level[keep], rcond=None)
+            fitted = np.linalg.lstsq(terms[keep, :number], level[keep], rcond=None)[0]
             coefficients[:number] = fitted
             residual = level - terms @ coefficients
             inner = residual[keep]

@@ -80,7 +80,7 @@ class Report:
         rows += [("written", f"{self.path} ({self.path.stat().st_size / 1e6:.1f} MB)")]
         rows += [("record", f"{record_path(self.path)} (checksums of all files)")]
         column = max(len(key) for key, _ in rows) + 1
-        return "\n".join([library.name, *(f"    {key:{column}}{text}" for key, text in rows)])
+        return "\n".join([library.name] + [f"    {key:{column}}{text}" for key, text in rows])
 
 
 def _listed(values):

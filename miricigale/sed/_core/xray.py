@@ -42,6 +42,8 @@ def xray_flux(l_2_10kev, redshift, far, band, photon_index, transmission=1.0):
     L (2-10 keV, rest) times the ratio of the bands, (1 + z)^(2 - Gamma) / (4 pi far^2), and what
     absorption leaves.
     """
-    ratio = power_law_energy(*band, photon_index) / power_law_energy(*_BAND, photon_index)
+    ratio = power_law_energy(band[0], band[1], photon_index) / power_law_energy(
+        _BAND[0], _BAND[1], photon_index
+    )
     stretch = (1.0 + np.asarray(redshift, dtype=float)) ** (2.0 - np.asarray(photon_index))
     return l_2_10kev * ratio * stretch * transmission / (4.0 * np.pi * np.square(far))

@@ -199,7 +199,7 @@ FIT_SECTIONS = _EXISTING + ("fit.axes", "fit.model_error")
 
 def set_plan(config, unit):
     """Return axes and MIRI bands of a fit, and the zero points of its existing bands where they are others."""
-    truth, name, *_ = unit.split("/")
+    truth, name = unit.split("/")[:2]
     plan = {"axes": fit_plan(config, unit), "bands": band_sets(config)[name]}
     size = dict(study_truths(config)[truth].perturbations).get("zero_point_existing")
     if size:

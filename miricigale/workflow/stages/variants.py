@@ -129,7 +129,7 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
         fluxes = {STUDY: matched[band].value}
         for name, variant in tables.items():
             fluxes[name] = variant[band][band].value
-        good = inside & np.all(np.isfinite([true, *fluxes.values()]), axis=0)
+        good = inside & np.all(np.isfinite([true] + list(fluxes.values())), axis=0)
         bright = field & (true > 10 ** (-0.4 * (limit - 23.9)))
         faint = good & ~bright
         rng = stream(seed, "variants", band)
