@@ -112,26 +112,27 @@ class Work:
         shape = (self.shape[0], self.frames.n_groups, wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape[2:], np.uint32)
         group_dq = np.zeros(shape, np.uint8)
-        block_arguments = (self.frames, self.properties, wide, pixel_dq, group_dq)
-        _, array, later = self._lit(Block, block_arguments, self.keyed)
+        make_block = functools.partial(
+            Block, self.frames, self.properties, wide, pixel_dq, group_dq
+        )
+        _, array, later = self._lit(make_block, self.light[wide], self.keyed)
         for effect, key in later:
-            array = effect.apply(array, Block(*block_arguments, key, self.previous))
+            array = effect.apply(array, make_block(key, self.previous))
         counts, flags = array[:, :, inner], group_dq[:, :, inner]
         if self.exposure.n_frames > 1:
             counts, flags = _averaged(counts, flags, self.exposure.n_frames)
         return counts, pixel_dq[inner], flags
 
-    def _lit(self, kind, block_arguments, chain):
+    def _lit(self, make_block, light, chain):
         """
         Draw the electrons of light and dark current together: a sum of Poisson numbers is one.
 
         Returns the mean rate, the ramp, and the effects of the chain that are left.
         """
-        light = self.light[block_arguments[2]]
         n = next(i for i, (effect, _) in enumerate(chain) if isinstance(effect, Photons))
         for effect, key in chain[:n]:
-            light = effect.apply(light, kind(*block_arguments, key))
-        block = kind(*block_arguments, chain[n][1])
+            light = effect.apply(light, make_block(key))
+        block = make_block(chain[n][1])
         mean = chain[n][0].expected(light, block)
         if type(chain[n][0]).apply is not Photons.apply:
             # a kind of its own, that may draw otherwise
@@ -139,7 +140,7 @@ class Work:
         for effect, key in chain[n + 1 :]:
             if type(effect).apply is not Dark.apply:
                 break
-            mean = effect.expected(mean, kind(*block_arguments, key))
+            mean = effect.expected(mean, make_block(key))
             n += 1
         ramp = np.zeros(block.ramp_shape, np.float32)
         electrons = np.ascontiguousarray(mean * block.group_time, float)
@@ -152,16 +153,13 @@ class Work:
         wide, inner = self._with_halo(rows, chain)
         shape = (wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape, np.uint32)
-        context = (
-            self.exposure,
-            self.properties,
-            wide,
-            pixel_dq,
-            np.zeros((1, 1) + shape, np.uint8),
+        flags = np.zeros((1, 1) + shape, np.uint8)
+        make_block = functools.partial(
+            WholeBlock, self.exposure, self.properties, wide, pixel_dq, flags
         )
-        mean, ramp, later_effects = self._lit(WholeBlock, context, chain)
+        mean, ramp, later_effects = self._lit(make_block, self.light[wide], chain)
         for effect, key in later_effects:
-            block = WholeBlock(*context, key, self.previous)
+            block = make_block(key, self.previous)
             mean = effect.expected(mean, block)
             ramp = effect.apply(ramp, block)
         hits = (np.empty((3, 0), np.int32), np.empty(0))
@@ -169,7 +167,9 @@ class Work:
         for effect, key in self.keyed:
             if isinstance(effect, CosmicRays):
                 # the shape alone is used of its flags
-                hits = effect.hits(Block(*context[:2], rows, pixel_dq, flags, key))
+                hits = effect.hits(
+                    Block(self.exposure, self.properties, rows, pixel_dq, flags, key)
+                )
         return mean[inner], ramp[0, 0, inner], pixel_dq[inner], *hits
 
 

@@ -1,5 +1,6 @@
 """The chain of components worked out on one grid of rest wavelengths: arrays only."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,10 +26,10 @@ UV_WINDOWS = tuple(map(tuple, _DECLARED["uv_windows"]))
 COLOR_BANDS = _DECLARED["color_bands"]
 COLORS = _DECLARED["colors"]
 
-#: Roles whose parameters together shape stars with their gas, the parts of a galaxy, and what lies
-#: between the source and us.
+#: Roles whose parameters together shape stars with their gas, those of a galaxy, and those of what lies between
+#: the source and us.
 STELLAR = ("sfh", "stellar", "nebular")
-GALAXY = (STELLAR, ("attenuation",), ("dust",))
+GALAXY_ROLES = STELLAR + ("attenuation", "dust")
 SKY = ("igm", "foreground")
 MAX_HISTORIES = 128  # stars of so many histories, those made last, are kept
 #: Results that each of these methods of `Chain` keeps.
@@ -143,16 +144,19 @@ class Chain:
         weights[part] = _core.trapezoid_weights(self.wave[part])
         return weights
 
-    def names(self, *roles):
-        """Names of the parameters of these roles."""
-        return tuple(name for role in roles for name in self._names[role])
+    def names(self, roles):
+        """Names of the parameters of a role, or of several."""
+        if isinstance(roles, str):
+            return self._names[roles]
+        return tuple(itertools.chain.from_iterable(map(self._names.get, roles)))
 
-    def key(self, values, *roles):
-        """Values of all parameters of these roles, as a tuple."""
-        return tuple(values[name] for name in self.names(*roles))
+    def key(self, values, roles):
+        """Values of all parameters of a role, or of several, as a tuple."""
+        return tuple(map(values.get, self.names(roles)))
 
-    def _dict(self, key, *roles):
-        return dict(zip(self.names(*roles), key, strict=True))
+    def _dict(self, key, roles):
+        """Values of a `key` by the names of the parameters."""
+        return dict(zip(self.names(roles), key, strict=True))
 
     # ------------------------------------------------------------------ stars
 
@@ -177,7 +181,7 @@ class Chain:
 
     def _glow(self, key):
         """Light of the gas on our grid for one photon, by a key of the stellar roles without history."""
-        spectra = self.by_role["nebular"].by_photon(self._dict(key, *STELLAR[1:]))
+        spectra = self.by_role["nebular"].by_photon(self._dict(key, STELLAR[1:]))
         return np.ascontiguousarray((self._hat("nebular") @ spectra.T).T)
 
     def stars(self, keys):
@@ -189,7 +193,7 @@ class Chain:
         place, stars = self._kept
         if not all(key in place for key in keys):
             different, rows = distinct(keys)
-            stars = self._make_stars([self._dict(key, *STELLAR) for key in different])
+            stars = self._make_stars([self._dict(key, STELLAR) for key in different])
             if len(different) <= MAX_HISTORIES:  # those that follow may share them
                 self._kept = ({key: row for row, key in enumerate(different)}, stars)
             return stars, rows
@@ -207,10 +211,10 @@ class Chain:
             gas = np.zeros_like(light)
         out = {name: np.zeros(n) for name in _OF_STARS.split()}
         histories = [sfh.history(v) for v in values]
-        keys, kind = distinct([self.key(v, *STELLAR[1:]) for v in values])
+        keys, kind = distinct([self.key(v, STELLAR[1:]) for v in values])
         for i, key in enumerate(keys):
             rows = np.flatnonzero(kind == i)
-            v = self._dict(key, *STELLAR[1:])
+            v = self._dict(key, STELLAR[1:])
             age, spectra, surviving, ionizing = self._populations(v["metallicity"])
             parts = [histories[row] for row in rows]
             flat = np.append(np.concatenate(parts), 0.0)
@@ -345,7 +349,7 @@ class Chain:
         Given at the rest wavelengths from number ``first`` to ``last``, that one not included.
         """
         observed = self.wave[first:last] * (1.0 + redshift)
-        values = self._dict(key, *SKY)
+        values = self._dict(key, SKY)
         igm = self.by_role["igm"]
         foreground = self.by_role["foreground"]
         out = np.ones(observed.size)
@@ -358,7 +362,7 @@ class Chain:
 
     def sky(self, values):
         """Transmission between the source and us at every rest wavelength, for a dict of values."""
-        return self.sky_transmission(values["redshift"], self.key(values, *SKY))
+        return self.sky_transmission(values["redshift"], self.key(values, SKY))
 
     # --------------------------------------------------------------- derived values
 

@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet
-from miricigale.sed.chain import GALAXY
+from miricigale.sed.chain import STELLAR
 from miricigale.sed.spectrum import cell_means, distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
@@ -141,11 +141,13 @@ def _factors(model, grid, index):
     galaxies, galaxy = np.unique(index[:, 1], return_inverse=True)
     models, agn = np.unique(index[:, 2], return_inverse=True)
     rows = [row_values(model, grid.galaxy_parameters, g) for g in galaxies.tolist()]
-    keys = [[chain.key(row, *roles) for row in rows] for roles in GALAXY]
-    light, absorbed = chain.attenuated(*chain.stars(keys[0]), *keys[1:])
+    stars, history_of_row = chain.stars([chain.key(row, STELLAR) for row in rows])
+    dims = [chain.key(row, "attenuation") for row in rows]
+    dusts = [chain.key(row, "dust") for row in rows]
+    light, absorbed = chain.attenuated(stars, history_of_row, dims, dusts)
     for i, row in enumerate(rows):
         if (excess := row.get("dust_excess", 1.0)) != 1.0:
-            light[i] += (excess - 1.0) * absorbed[i] * chain.dust(keys[2][i])
+            light[i] += (excess - 1.0) * absorbed[i] * chain.dust(dusts[i])
             absorbed[i] *= excess
     reference = absorbed
     if model.frac_agn_definition != "dust":

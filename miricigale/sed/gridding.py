@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import astropy.units as u
 import numpy as np
 
-from miricigale.sed.chain import GALAXY, distinct
+from miricigale.sed.chain import GALAXY_ROLES, STELLAR, distinct
 from miricigale.sed.derived import DERIVED, galaxy_quantities
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
@@ -18,7 +18,6 @@ from miricigale.utils.tables import described_table
 from miricigale.utils.units import WAVE
 
 #: Roles whose parameters shape the galaxy.
-GALAXY_ROLES = sum(GALAXY, ())
 _COLD = 30.0  # um at rest, beyond which dust heated by the mean field shines
 
 
@@ -92,8 +91,9 @@ class Galaxies:
     def __init__(self, model, rows):
         chain = self.chain = model.chain
         excess = [row.get("dust_excess", 1.0) for row in rows]
-        stars, dims, dusts = ([chain.key(row, *roles) for row in rows] for roles in GALAXY)
-        self.stars, self.star_rows = chain.stars(stars)
+        self.stars, self.star_rows = chain.stars([chain.key(row, STELLAR) for row in rows])
+        dims = [chain.key(row, "attenuation") for row in rows]
+        dusts = [chain.key(row, "dust") for row in rows]
         # many galaxies: their spectra are in memory once
         pairs, self.light_rows = distinct(zip(self.star_rows.tolist(), dims, strict=True))
         self.starlight = np.empty((len(pairs), chain.wave.size))

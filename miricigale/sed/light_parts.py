@@ -233,7 +233,7 @@ def part_parameters(model):
     names = model.chain.names
     of_agn = tuple(name for name in names("agn") if name != "frac_agn")
     return {
-        "starlight": names(*STELLAR, "attenuation"),
+        "starlight": names(STELLAR) + names("attenuation"),
         "dust": names("dust"),
         "agn": of_agn,
     }

@@ -8,7 +8,7 @@ from astropy.table import QTable, Table
 
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
-from miricigale.sed.chain import GALAXY, SIX, SKY, STELLAR, distinct
+from miricigale.sed.chain import SIX, SKY, STELLAR, distinct
 from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.caching import cached
@@ -166,7 +166,7 @@ def spectra(model, values):
     """The spectrum of one model with its parts and derived quantities; see `SEDModel.evaluate`."""
     chain = model.chain
     z = values["redshift"]
-    stars, rows = chain.stars([chain.key(values, *STELLAR)])
+    stars, rows = chain.stars([chain.key(values, STELLAR)])
     dim = chain.key(values, "attenuation")
     (starlight,), absorbed = chain.attenuated(stars, rows, [dim])
     absorbed *= values.get("dust_excess", 1.0)
@@ -221,14 +221,15 @@ class _Blocks:
         self.span = np.array([bands[1].min(), bands[1].max()])
         self._light = np.empty((BLOCK, self.chain.wave.size))
 
-    def _keys(self, rows, *roles):
-        return _keys(self.values, self.chain.names(*roles), rows)
+    def _keys(self, rows, roles):
+        return _keys(self.values, self.chain.names(roles), rows)
 
     def galaxies(self, rows):
         """Light of galaxies, and their derived quantities."""
         chain = self.chain
-        stars, dims, dusts = (self._keys(rows, *roles) for roles in GALAXY)
-        stars, history_of_row = chain.stars(stars)
+        stars, history_of_row = chain.stars(self._keys(rows, STELLAR))
+        dims = self._keys(rows, "attenuation")
+        dusts = self._keys(rows, "dust")
         light, absorbed = chain.attenuated(
             stars, history_of_row, dims, dusts, self._light[: len(rows)]
         )
@@ -280,7 +281,7 @@ class _Blocks:
             definition = self.model.frac_agn_definition
             derived |= agn_quantities(definition, fraction / (1 - fraction), derived, observed)
             power = derived["agn_power"]
-        names = ("redshift", *chain.names(*SKY))
+        names = ("redshift",) + chain.names(SKY)
         different, sky = distinct(_keys(values, names, rows))
         dim = np.ones((len(different), chain.wave.size))
         # the sky is needed where a band is
