@@ -275,7 +275,6 @@ class FitRows(ObjectRows):
 
     #: Where the formats of files are registered.
     io_module = "miricigale.fitting.results.io"
-    _other_names = {"quantile": "percentile"}
 
     def with_model(self, model):
         """Return a copy that knows the `~miricigale.sed.SEDModel`, for other bands and for spectra."""

@@ -32,7 +32,7 @@ def samples(results, key):
         If the object was not fitted, or the fit was no sampler's (see `BayesFitter.sample`).
     """
     if results.draws is None:
-        msg = "results of a grid hold no draws; BayesFitter.sample makes some"
+        msg = "results of a grid hold no draws; fitter.sample(photometry, 1000, seed=1) makes some"
         raise ValueError(msg)
     result = results.loc[key]._fitted_one()
     values = zip(results.parameters, result.draws.T, strict=True)

@@ -17,7 +17,7 @@ from miricigale.fitting.posterior.posterior import (
     moments,
 )
 from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, kept_percentiles
-from miricigale.fitting.results import drawing, histories
+from miricigale.fitting.results import drawing, histories, inference_data
 from miricigale.fitting.results.percentile_columns import LEVELS
 from miricigale.fitting.results.sample_flags import worst_bands
 from miricigale.fitting.results.table_columns import FIELDS, ODDS, OUTLIER, TEXTS
@@ -548,6 +548,7 @@ class FitResults(FitRows):
         return self
 
     samples = drawing.samples
+    to_arviz = inference_data.of_results
     best_sed = drawing.best_sed
     plot_sed = drawing.plot_sed
     plot_pdf = drawing.plot_pdf

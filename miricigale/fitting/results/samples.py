@@ -10,7 +10,7 @@ from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.posterior.posterior import FitRows, bin_edges, cell_edges, check_levels
 from miricigale.fitting.posterior.priors import grid_priors
 from miricigale.fitting.posterior.quantities import FRACTIONS, Quantities
-from miricigale.fitting.results import histories
+from miricigale.fitting.results import histories, inference_data
 from miricigale.fitting.results.corner_panels import draw_panel, marked_values
 from miricigale.fitting.results.drawing import CORNER, labeled
 from miricigale.fitting.results.listed_models import fluxes_between_nodes, models_of_draws
@@ -527,6 +527,7 @@ model : `~miricigale.sed.SEDModel`, optional
         bands = [table[name] for name in table.colnames[1:]]
         return plot_sed_band(table["wave"], bands, ax=ax, rest=rest, **kwargs)
 
+    to_arviz = inference_data.of_samples
     sfh_band = histories.sfh_band
     plot_sfh = histories.plot_sfh_band
 
