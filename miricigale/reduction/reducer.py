@@ -319,7 +319,7 @@ class Reducer(Interactive):
         """
         return subtract_dithers(self, list(images), wcs=wcs)
 
-    def mosaic(self, images, wcs=None):
+    def mosaic(self, images, wcs=None, *, pixel_scale=_SCALE):
         """
         Drizzle images onto one grid.
 
@@ -330,6 +330,8 @@ class Reducer(Interactive):
             are three or more images and that was not done before.
         wcs : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or image, optional
             Of the output, with ``pixel_shape``; by default as of `run`.
+        pixel_scale : `~astropy.units.Quantity`, optional
+            Of the output without ``wcs``.
 
         Returns
         -------
@@ -347,7 +349,8 @@ class Reducer(Interactive):
         """
         images = [as_exposure(image) for image in exposure_list(images)]
         if wcs is None:
-            wcs = own_grid(images, _SCALE)
+            to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
+            wcs = own_grid(images, pixel_scale)
         else:
             wcs = as_wcs(wcs)
         return self.drizzle(images, wcs)[0].image

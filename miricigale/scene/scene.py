@@ -150,8 +150,11 @@ class Scene(Interactive):
                 filter = exposure.filter
             if wcs is None:
                 wcs = exposure.wcs
-        for name, value in (("filter", filter), ("wcs", wcs)):
-            check_that(value is not None, name, "given, or an exposure", "None")
+        check_that(filter is not None, "filter", "given, or an exposure", "None")
+        wanted = (
+            "given, or an exposure (instrument.north_up_wcs makes one of center, scale and shape)"
+        )
+        check_that(wcs is not None, "wcs", wanted, "None")
         wcs = as_wcs(wcs)
         check_that(wcs.pixel_shape is not None, "wcs", "a WCS with its pixel_shape", "one without")
         name = str(getattr(filter, "name", filter))

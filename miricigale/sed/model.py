@@ -4,6 +4,7 @@ import functools
 from collections.abc import Mapping
 
 import astropy.units as u
+import numpy as np
 
 from miricigale.filters import FilterSet
 from miricigale.refdata import citations
@@ -33,7 +34,6 @@ _MODEL_PARAMETERS = {
         "Dust luminosity over the power that attenuation takes; 1 is energy balance.",
     ),
 }
-_OTHER_NAMES = {"z": "redshift", "stellar_mass": "mass"}
 for _name, _parameter in _MODEL_PARAMETERS.items():
     _parameter.name = _name
 
@@ -415,14 +415,12 @@ class SEDModel(Interactive):
         ValueError
             If a value is outside its bounds, or the galaxy older than the universe.
         """
-        by_our_name = {}
+        parameters = tables.by_our_names(parameters)
         for name, value in parameters.items():
-            by_our_name[_OTHER_NAMES.get(name, name)] = value
-        parameters = by_our_name
-        parameters = tables.plain_mass(parameters)
-        for name in parameters:
             if name not in self._parameters:
                 raise unknown_name("parameter", name, self._parameters)
+            wanted = "one number (fluxes() takes several models)"
+            check_that(np.ndim(value) == 0, name, wanted, f"shape {np.shape(value)}")
         out = {}
         for name, par in self._parameters.items():
             if name in parameters:
@@ -475,7 +473,11 @@ class SEDModel(Interactive):
         """Derived quantities of one model: dict of name to `~astropy.units.Quantity`."""
         return self.evaluate(**parameters).derived
 
-    def fluxes(self, table, filters):
+    def plot(self, ax=None, **parameters):
+        """Draw the spectrum of one model, see `evaluate` and `SED.plot`; returns the axes."""
+        return self.evaluate(**parameters).plot(ax=ax)
+
+    def fluxes(self, table=None, filters=None, **parameters):
         """
         Band fluxes of any list of models, at their own redshifts.
 
@@ -486,6 +488,9 @@ class SEDModel(Interactive):
             none; ``redshift`` is needed. Other columns than parameters are left alone.
         filters : `~miricigale.filters.FilterSet` or list of str
             The bands.
+        **parameters
+            Numbers or arrays of one shape by parameter name, in place of a table:
+            ``model.fluxes(["F770W"], redshift=[0.5, 1.0])``.
 
         Returns
         -------
@@ -514,6 +519,17 @@ class SEDModel(Interactive):
         >>> model.fluxes(rows, ["miri.f770w"])["miri.f770w"].round(2)
         <Quantity [6.57, 2.42] uJy>
         """
+        if parameters:
+            if filters is None:
+                # bands alone may stand first
+                filters, table = table, None
+            check_that(table is None, "table", "left out beside parameters by name", "both")
+            for name in tables.by_our_names(parameters):
+                if name not in self._parameters:
+                    raise unknown_name("parameter", name, self._parameters)
+            table = tables.parameter_table(parameters)
+        for name, value in (("table", table), ("filters", filters)):
+            check_that(value is not None, name, "given, or parameters by name", "None")
         return tables.flux_table(self, table, self._bands(filters))
 
     def grid(self, axes, filters, *, cache=True):

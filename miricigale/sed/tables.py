@@ -12,12 +12,14 @@ from miricigale.sed.chain import SIX, SKY, STELLAR, distinct
 from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.caching import cached
-from miricigale.utils.exceptions import ModelWarning, units_error, warn
+from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn
 from miricigale.utils.named_values import convert_values, rows_of
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
 
+#: Names of parameters that are usual elsewhere, with ours.
+_OTHER_NAMES = {"z": "redshift", "stellar_mass": "mass", "fracAGN": "frac_agn"}
 #: Names of the logarithm of a mass in lower case.
 _LOG_MASSES = ("log_mass", "logmass", "lmass", "log_m")
 
@@ -76,6 +78,44 @@ def _columns(model, table):
         else:
             out[name] = np.full(len(table), par.default)
     return out
+
+
+def by_our_names(values):
+    """
+    Values of parameters by our names, with the mass for its logarithm.
+
+    Parameters
+    ----------
+    values : dict or `~astropy.table.Table`
+        By parameter. A usual name of elsewhere, such as ``z``, counts where ours is not there.
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`
+        See `plain_mass`.
+    """
+    names = values.colnames if isinstance(values, Table) else list(values)
+    others = {theirs: ours for theirs, ours in _OTHER_NAMES.items() if theirs in names}
+    out = values.copy()
+    for theirs, ours in others.items():
+        if ours not in names:
+            out[ours] = out[theirs]
+            del out[theirs]
+    return plain_mass(out)
+
+
+def parameter_table(parameters):
+    """Table of a row for each model, of numbers or arrays of one shape by parameter."""
+    values = {name: u.Quantity(value) for name, value in parameters.items()}
+    try:
+        shape = np.broadcast_shapes((1,), *(value.shape for value in values.values()))
+    except ValueError:
+        shapes = ", ".join(f"{name} {value.shape}" for name, value in values.items())
+        raise argument_error("parameters", "of one shape", shapes) from None
+    check_that(len(shape) == 1, "parameters", "numbers or arrays of one dimension", shape)
+    return QTable(
+        {name: np.broadcast_to(value, shape, subok=True) for name, value in values.items()}
+    )
 
 
 def plain_mass(values):
@@ -301,7 +341,7 @@ class _Blocks:
 
 def flux_table(model, table, filters):
     """Fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
-    table = plain_mass(QTable(as_table(table, "table"), copy=False))
+    table = by_our_names(QTable(as_table(table, "table"), copy=False))
     _warn_of_slips(model, table.colnames)
     n = len(table)
     names = model.derived_columns()

@@ -18,7 +18,7 @@ class Interactive:
 
     @property
     def _other_names(self):
-        """Names that are usual elsewhere, and the attribute of ours, or of one of its parts ("part.name")."""
+        """Names that are usual elsewhere, and ours: an attribute, one of a part ("part.name"), or "method()"."""
         return declared("miricigale.utils", "other_names.toml").get(type(self).__name__, {})
 
     def __getattr__(self, name):
@@ -26,7 +26,11 @@ class Interactive:
         if name.startswith("_"):
             raise AttributeError(name)
         if name in self._other_names:
-            return operator.attrgetter(self._other_names[name])(self)
+            ours = self._other_names[name]
+            value = operator.attrgetter(ours.removesuffix("()"))(self)
+            if ours.endswith("()"):
+                return value()
+            return value
         if (value := self._value(name)) is not None:
             return value
         msg = f"{type(self).__name__!r} object has no attribute {name!r}"

@@ -367,6 +367,7 @@ class ForcedPhotometryResult(Tabular):
         "errors": "flux_err",
         "flux_error": "flux_err",
         "mag": "magnitude",
+        "table": "to_table()",
     }
 
     @property
