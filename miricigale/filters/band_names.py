@@ -81,6 +81,24 @@ def find_filter(text):
     return name
 
 
+def curves_of_band(band):
+    """
+    List the filters that a band without its camera may be.
+
+    Parameters
+    ----------
+    band : str
+        Such as ``"Ks"``.
+
+    Returns
+    -------
+    names : list of str
+        Names for `~miricigale.filters.Filter.from_name` that end in it.
+    """
+    names = [*FILTERS.names(), *(SEDPY + curve for curve in _curves())]
+    return [name for name in sorted(names) if re.split("[._]", name)[-1].lower() == band.lower()]
+
+
 def name_and_unit(text):
     """
     Take the unit off the end of the name of a column.

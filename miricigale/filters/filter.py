@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters import _core
-from miricigale.filters.band_names import find_filter
+from miricigale.filters.band_names import curves_of_band, find_filter
 from miricigale.filters.curve_files import read_curve
 from miricigale.filters.library import FILTERS, load_curve
 from miricigale.filters.spectra import check_wave, spectrum_arrays
@@ -179,6 +179,10 @@ class Filter(Frozen, Interactive):
         """
         full_name = find_filter(str(name))
         if full_name is None and not str(name).startswith("sedpy."):
+            cameras = curves_of_band(str(name))
+            if cameras:
+                msg = f"no filter {name!r} without its camera: {', '.join(cameras)}"
+                raise KeyError(msg)
             raise unknown_name("filter", name, FILTERS.names())
         return _from_name(full_name or str(name))
 
