@@ -17,16 +17,40 @@ class Parser(argparse.ArgumentParser):
     def error(self, message):
         """Say what is wrong with the arguments, the nearest name that there is, and end with status 2."""
         choice = re.search(r"invalid choice: '?(.+?)'? \(choose from (.+)\)", message)
-        unknown = re.match(r"unrecognized arguments: (\S+)", message)
+        unknown = re.match(r"unrecognized arguments: (.+)", message)
         hint = ""
         if choice:
-            hint = _nearest(choice[1], [name.strip(" '") for name in choice[2].split(",")])
+            names = [name.strip(" '") for name in choice[2].split(",")]
+            hint = _nearest(choice[1], names) or _meant(_BY_PURPOSE.get(choice[1]), names)
         elif unknown:
-            hint = _nearest(unknown[1].partition("=")[0], self.every_flag)
-        self.exit(2, f"{self.prog}: {message}{hint} (see {self.prog} --help)\n")
+            flags = [word.partition("=")[0] for word in unknown[1].split() if word[0] == "-"]
+            hint = "".join(_nearest_option(flag, self.every_name) for flag in flags)
+        prog = f"{self.prog} {self.typed}".strip()
+        self.exit(2, f"{self.prog}: {message}{hint} (see {prog} --help)\n")
 
-    #: Flags of all commands, for the nearest one to a wrong one.
-    every_flag = ()
+    #: The command that was typed, and its flags and positional arguments, for the nearest one to a wrong one.
+    typed = ""
+    every_name = ()
+
+
+#: What users type for a command of another name.
+_BY_PURPOSE = {
+    "help": "--help",
+    "depth": "plan",
+    "etc": "plan",
+    "exptime": "plan",
+    "sensitivity": "plan",
+    "measure": "photometry",
+    "simulate": "run",
+    "study": "run",
+}
+
+
+def _meant(name, names):
+    """Say which name is meant, if it is there."""
+    if name in names or name == "--help":
+        return f"; did you mean {name!r}?"
+    return ""
 
 
 def _nearest(name, names):
@@ -35,6 +59,19 @@ def _nearest(name, names):
     if close:
         return f"; did you mean {close[0]!r}?"
     return ""
+
+
+def _nearest_option(flag, names):
+    """Say which option of a command may be meant, or that an argument has none."""
+    argument = flag.lstrip("-").replace("-", "_").upper()
+    if argument in names:
+        return f"; {argument} has no option before it"
+    flags = [name for name in names if name.startswith("-")]
+    # the last word of an option, such as --unit for --flux-unit
+    ending = [name for name in flags if name.endswith("-" + flag.lstrip("-"))]
+    if len(ending) == 1:
+        return f"; did you mean {ending[0]!r}?"
+    return _nearest(flag, flags)
 
 
 def quantity_in(unit):
@@ -154,6 +191,7 @@ def workers(scheduler, n_threads, memory=None):
 def make_parser(argv):
     """Return the parser of the program; help texts are complete where they are asked for."""
     words = {}
+    words_typed = [word for word in argv if not word.startswith("-")]
     if not argv or {"-h", "--help"} & set(argv):
         from miricigale.filters.surveys import SURVEYS
         from miricigale.workflow.config import preset_names
@@ -199,7 +237,9 @@ def make_parser(argv):
             stopped=command.get("stopped", "miricigale: stopped"),
             option_names=names,
         )
-        parser.every_flag += tuple(names.values())
+        if words_typed[: name.count(" ") + 1] == name.split():
+            parser.typed = name
+            parser.every_name = tuple(names.values())
     return parser
 
 
@@ -253,8 +293,8 @@ def in_options(message, names):
     '--chunk-rows must be >= 1'
     """
     return re.sub(
-        r"'(\w+)'(?= must | is | column '| given\))",
-        lambda match: names.get(match[1], match[0]),
+        r"'(\w+)'(?= must | is | column '| given\))|(?<=\(or )'(\w+)'(?=\))",
+        lambda match: names.get(match[1] or match[2], match[0]),
         message,
     )
 

@@ -180,7 +180,11 @@ def test_help_names_presets_and_surveys(capsys):
         (["fit"], "miricigale fit: the following arguments are required: CATALOG"),
         (["fitt"], "miricigale: argument COMMAND: invalid choice: 'fitt'"),
         (["fitt"], "; did you mean 'fit'? (see miricigale --help)"),
-        (["fit", "a.fits", "--flux-unti", "Jy"], "did you mean '--flux-unit'?"),
+        (["fit", "a.fits", "--flux-unti", "Jy"], "did you mean '--flux-unit'? (see miricigale fit"),
+        (["fit", "--catalog", "a.fits"], "CATALOG has no option before it"),
+        (["fit", "a.fits", "--unit", "Jy"], "did you mean '--flux-unit'?"),
+        (["help", "fit"], "did you mean '--help'?"),
+        (["sensitivity", "F770W"], "did you mean 'plan'?"),
         (
             ["run", "goodss", "--quick", "--plan", "--until", "mosaic"],
             "--until is 'mosaic', which is no",

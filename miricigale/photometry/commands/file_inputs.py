@@ -378,7 +378,7 @@ def _check_psfs(image, highres, kernel):
         if file.psf is not None or can_be_modeled(file.header):
             continue
         if name in MODEL_FILTERS:
-            wanted = f"given, for the header of {file.path} has no PA_APER (or '{prefix}psf')"
+            wanted = f"given (or '{prefix}psf'), for the header of {file.path} has no PA_APER"
             raise argument_error(prefix + "pa_aper", wanted, None)
         name = name or "an image whose filter is unknown ('highres_filter')"
         wanted = f"given (or 'kernel'), for there is no model PSF for {name}"
