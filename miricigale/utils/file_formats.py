@@ -114,6 +114,9 @@ def read_write(what, options=""):
     -------
     read, write
     """
+    if options:
+        # first lines stand at no indent, further ones at that of the class
+        options = cleandoc(options) + "\n"
     docs = [cleandoc(base.__doc__).format(what=what, options=options) for base in (_Read, _Write)]
     return tuple(
         UnifiedReadWriteMethod(type(base.__name__, (base,), {"__doc__": doc}))
