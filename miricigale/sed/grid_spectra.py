@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.filters import FilterSet
+from miricigale.filters import FilterSet, find_filter
 from miricigale.sed.chain import STELLAR
 from miricigale.sed.spectrum import cell_means, distance
 from miricigale.sed.tables import dilution
@@ -68,15 +68,18 @@ def band_names(grid, filters):
         return list(grid.filters), {}
     wanted = "a list of names or a FilterSet"
     check_that(not isinstance(filters, str), "filters", wanted, repr(filters))
-    if isinstance(filters, FilterSet):
-        by_name = {band.name: band for band in filters}
-    else:
-        by_name = {}
-    names = list(by_name or filters)
+    names = []
     curves = {}
-    for name in names:
+    for band in filters:
+        name = getattr(band, "name", band)
         if name not in grid.filters:
-            curves[name] = by_name.get(name, name)
+            # a usual name of a band of the grid
+            name = find_filter(str(name)) or name
+        names.append(name)
+        if name not in grid.filters:
+            curves[name] = name
+            if not isinstance(band, str):
+                curves[name] = band
     return names, curves
 
 

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from helpers.errors import refuses
 from helpers.grids import brute_force, draw_photometry, make_grid, node_fitter
 from helpers.results import assert_same_tables
-from miricigale.filters import FilterSet
+from miricigale.filters import Filter, FilterSet
 from miricigale.fitting import GridSettings, Samples
 from miricigale.sed import SED, SEDModel
 from miricigale.utils.exceptions import DataError
@@ -304,3 +304,12 @@ def test_histories_hold_the_mass_that_was_formed(real):
     assert axes.get_xlabel() == "lookback time (Gyr)"
     assert len(axes.collections) == len(axes.lines) == 1
     plt.close("all")
+
+
+def test_bands_are_named_and_mixed_as_elsewhere(real):
+    """Names, usual names and filters of one's own stand in one list."""
+    box = Filter(np.linspace(9.0, 12.0, 31) * u.um, np.ones(31), name="box")
+    table = real.predict(["F770W", "F1000W", box])
+    expected = real.predict(FilterSet(["miri.f770w", "miri.f1000w", box]))
+    assert_same_tables(table, expected)
+    assert "miri.f1000w_p16" in table.colnames

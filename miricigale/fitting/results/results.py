@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import astropy.units as u
 import numpy as np
 
+from miricigale.filters.band_names import known_filter
 from miricigale.fitting.data.likelihood import FitFlags, filter_names
 from miricigale.fitting.posterior.posterior import (
     FitRows,
@@ -529,8 +530,14 @@ class FitResults(FitRows):
         columns = {"id": (rows.ids, "identifier")}
         if filters is None:
             filters = self.filters
-        names = filter_names("filters", filters)
-        check_names(names, "filter of the models", self.filters)
+        labels = filter_names("filters", filters)
+        try:
+            names = [known_filter(label, self.filters, "filter of the models") for label in labels]
+        except KeyError as err:
+            err.add_note(
+                "draws have other bands: fitter.sample(photometry, 1000, seed=1).predict(filters)"
+            )
+            raise
         for name in names:
             for column, array, text in (
                 (name, rows.model_flux, "posterior mean of the model flux"),
