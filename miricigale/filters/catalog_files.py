@@ -16,6 +16,8 @@ from miricigale.utils.missing_values import plain_floats, without_codes
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
 
+#: Fluxes from which on a fit leaves them out and flags it.
+_FLAGGED = 1e60
 #: Bands whose missing values are counted one by one in a message.
 _FEW = 8
 
@@ -153,8 +155,9 @@ def codes_of(table, bands):
             # the reader of these columns raises the error
             continue
         missing, no_error = without_codes(values, errors)
-        # zeros with zero errors are flagged object by object
-        missing &= values != 0
+        # zeros with zero errors, and what is beyond all measurements, are flagged object by object
+        missing &= (values != 0) & (np.abs(values) < _FLAGGED)
+        no_error &= np.abs(errors) < _FLAGGED
         code = np.where(missing, values, np.nan)
         coded[name] = np.where(no_error & ~missing, errors, code)
     return coded

@@ -33,6 +33,7 @@ from miricigale.utils.missing_values import (
 )
 from miricigale.utils.named_values import convert_values, field_names, field_values
 from miricigale.utils.options import check_choice, check_data, check_names, check_that
+from miricigale.utils.table_files import silent_units
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, flux_unit
 
@@ -281,7 +282,8 @@ class CatalogMap:
         names, _ = self.names(table.colnames, argument)
         out = QTable(meta=table.meta)
         for theirs, ours in names.items():
-            out[ours] = table[theirs]
+            with silent_units():
+                out[ours] = table[theirs]
             unit = name_and_unit(theirs)[1]
             if is_band(ours) and unit is not None and getattr(out[ours], "unit", None) is None:
                 out[ours].unit = unit

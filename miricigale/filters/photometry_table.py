@@ -15,6 +15,7 @@ from miricigale.utils.exceptions import CatalogWarning, units_error, warn
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.table_files import silent_units
 from miricigale.utils.tables import as_table, error_column
 from miricigale.utils.units import FNU, flux_unit
 
@@ -101,9 +102,10 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     ):
         return table
     back = {theirs: ours for ours, theirs in names.items()}
-    out = QTable(table, copy=False)
-    if back:
-        out = QTable({back.get(name, name): out[name] for name in table.colnames}, copy=False)
+    with silent_units():
+        out = QTable(table, copy=False)
+        if back:
+            out = QTable({back.get(name, name): out[name] for name in table.colnames}, copy=False)
     out.meta = table.meta
     if "id" not in out.colnames:
         out["id"] = counted_ids(table, argument)

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 from astropy.table import Column, QTable
 from astropy.units import UnitsWarning, UnrecognizedUnit
-from astropy.utils.exceptions import AstropyWarning
+from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
 from miricigale.utils.ids import is_id_name
 from miricigale.utils.units import flux_unit
@@ -21,6 +21,8 @@ def silent_units():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)
         warnings.filterwarnings("ignore", ".*(?:did not parse as|Invalid unit)", AstropyWarning)
+        # magnitudes with a mask are no quantity of astropy, and are read as they are
+        warnings.filterwarnings("ignore", "column .* has a unit but is kept", AstropyUserWarning)
         yield
 
 

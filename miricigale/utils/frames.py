@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from miricigale.utils.exceptions import CatalogWarning, warn
 from miricigale.utils.ids import is_id_name
 from miricigale.utils.named_values import subset
 from miricigale.utils.options import check_that
@@ -27,12 +28,18 @@ def frame_columns(data, argument):
     -------
     columns : dict of str to array or column
         Missing values are NaN in floats and masked in others (pandas' ``NA``, ``None``, null). An index of pandas
-        that has a name, or is not the count of the rows, is a column: by its name, or ``id``.
+        that has a name, or is not the count of the rows, is a column: by its name, or ``id``. An index of
+        whole numbers or text under another name is ``id`` too where no column is called as ids are.
 
     Raises
     ------
     ValueError
         If two columns have one name, or an index and a column have one name and differ.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.CatalogWarning`
+        If a level of an index has no name, and is left out.
     """
     if not hasattr(data, "index"):
         from miricigale.utils.arrow_tables import arrow_table
@@ -74,6 +81,12 @@ def _of_index(data, columns, argument):
             return {}
         return {"id": _of_series(index)}
     levels = {}
+    unnamed = [i for i, name in enumerate(index.names) if name is None]
+    if unnamed:
+        text = (
+            f"levels of the index without a name are left out ({len(unnamed)} of {index.nlevels})"
+        )
+        warn(f"{argument}: {text}; reset_index() makes columns of them", CatalogWarning)
     for i, name in enumerate(index.names):
         if name is None:
             continue
@@ -84,6 +97,10 @@ def _of_index(data, columns, argument):
             check_that(is_repeated, argument, wanted, f"two of {str(name)!r} that differ")
         else:
             levels[str(name)] = values
+    if index.nlevels == 1 and not any(map(is_id_name, [*levels, *columns])):
+        values = next(iter(levels.values()), None)
+        if values is not None and values.dtype.kind in "iuUSO" and index.is_unique:
+            levels["id"] = values
     return levels
 
 

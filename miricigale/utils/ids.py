@@ -217,7 +217,7 @@ def _of_floats(ids, missing, argument):
     rows = np.flatnonzero(~(np.abs(safe) <= limit))
     if rows.size:
         wanted = f"a table with ids as integers or text, for floats of {8 * ids.dtype.itemsize} bits are not exact"
-        got = f"{safe[rows[0]]!r} in row {rows[0]} (from 0), of {rows.size} so large"
+        got = f"{float(safe[rows[0]])!r} in row {rows[0]} (from 0), of {rows.size} so large"
         raise argument_error(argument, wanted, got)
     return safe.astype(np.int64)
 
@@ -298,7 +298,7 @@ class Duplicates:
 
 
 def warn_of_duplicates(ids, argument, **options):
-    """Warn of ids that occur more than once, with the first three; see `Duplicates.warn`."""
+    """Warn of ids that occur more than once, with the first three, masked ones aside; see `Duplicates.warn`."""
     duplicates = Duplicates()
-    duplicates.add(np.asarray(ids))
+    duplicates.add(np.ma.compressed(np.ma.asarray(ids)))
     duplicates.warn(argument, **options)

@@ -5,7 +5,13 @@ import numpy as np
 from miricigale.utils.exceptions import argument_error
 
 #: Numbers that stand for no value, of either sign in magnitudes, negative in all other columns.
-_CODES = np.array([99.0, 99.9, 99.99, 99.999, 999.0, 999.9, 999.99, 9999.0, 9999.9, 99999.0])
+_CODES = np.array(
+    [99.0, 99.9, 99.99, 99.999, 999.0, 999.9, 999.99, 9999.0, 9999.9, 99999.0, 999999.0]
+)
+#: No flux of a source is as large in any unit of catalogs, from nJy to Jy; programs write 1e20, 1e30 or 1e37.
+_MAX_VALUE = 1e15
+#: No source is as faint in AB magnitudes (4 fJy), nor as bright.
+_MAX_MAGNITUDE = 45.0
 
 
 def without_codes(values, errors=None, *, magnitudes=False, further=()):
@@ -28,11 +34,16 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
     missing, no_error : `~numpy.ndarray` of bool, shape (n,)
         Values that are missing: -99, -999 and the like, unless the error is one of their size (0.2 to 100 times),
         as of noise in nJy; in magnitudes 99 and the like too, and 0 with an error that is not positive or without
-        errors; in fluxes 99 and the like with the same number for the error, and 0 with an error of 0. Errors that
-        are missing though the value may be there: a negative code, unless the value is one to ten times as large
-        and positive, as limits are.
+        errors; in fluxes 99 and the like with the same number for the error, and 0 with an error of 0; and numbers
+        beyond all fluxes and magnitudes, such as 1e20. Errors that are missing though the value may be there: a
+        negative code, unless the value is one to ten times as large and positive, as limits are, and numbers
+        beyond all errors.
     """
     code = is_code(values)
+    largest = _MAX_VALUE
+    if magnitudes:
+        largest = _MAX_MAGNITUDE
+    beyond = np.isfinite(values) & (np.abs(values) >= largest)
     further = np.asarray(list(further), float)
     named = np.isin(values, further)
     none = np.zeros(np.shape(values), bool)
@@ -41,7 +52,7 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
             zero = values == 0
         else:
             zero = none
-        return (code & (magnitudes | (values < 0))) | zero | named, none
+        return (code & (magnitudes | (values < 0))) | zero | named | beyond, none
     repeats_value = errors == values
     size = np.abs(values)
     sigma = np.abs(errors)
@@ -51,11 +62,10 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
     no_error = (coded & (((errors < 0) & ~limit) | magnitudes | repeats_value)) | np.isin(
         errors, further
     )
+    no_error |= np.isfinite(errors) & (sigma >= largest)
     zero = (values == 0) & (~(errors > 0) if magnitudes else errors == 0)
-    missing = (
-        (code & (((values < 0) & (coded | ~noise)) | magnitudes | repeats_value)) | zero | named
-    )
-    return missing, no_error
+    missing = code & (((values < 0) & (coded | ~noise)) | magnitudes | repeats_value)
+    return missing | zero | named | beyond, no_error
 
 
 def negative_codes(values, errors):
@@ -121,6 +131,9 @@ _WORDS = (
     "---",
     "...",
     "masked",
+    # of IRAF and of databases
+    "indef",
+    "\\n",
 )
 
 

@@ -1,5 +1,6 @@
 """Tables of users: read in any of the usual formats, or refused in one sentence, and written by suffix."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
 from miricigale.utils.text_reading import BOM, check_text, first_bytes, read_text
-from miricigale.utils.text_tables import drop_repeated, is_sextractor
+from miricigale.utils.text_tables import drop_repeated, is_sextractor, names_in_comments
 
 
 def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
@@ -221,11 +222,13 @@ def _table_format(path):
         return "ascii.ecsv"
     if suffix in TABLE_FORMATS:
         return TABLE_FORMATS[suffix]
-    named = first.startswith("#") and any(map(is_id_name, first.strip("# \r").split()))
+    named = re.match("#(?!#)", first) and any(map(is_id_name, first.strip("# \r").split()))
     if is_sextractor(start):
         return "ascii.sextractor"
     if named:
         return "ascii.commented_header"
+    if first.startswith("#") and names_in_comments(start.decode("utf-8", "replace")):
+        return "ascii.no_header"
     # which astropy does not try
     if ";" in first:
         return "ascii.csv"

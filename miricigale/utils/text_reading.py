@@ -4,6 +4,7 @@ import math
 import os
 import re
 import warnings
+from pathlib import Path
 
 import numpy as np
 from astropy.io import votable
@@ -11,12 +12,13 @@ from astropy.io.ascii import convert_numpy
 from astropy.table import Column, MaskedColumn, Table
 from astropy.utils.exceptions import AstropyWarning
 
+from miricigale.utils.exceptions import CatalogWarning, warn
 from miricigale.utils.files import is_zip, packed_open
 from miricigale.utils.fits_tables import check_names_differ
 from miricigale.utils.ids import ids_of_text, is_id_name
 from miricigale.utils.missing_values import is_missing_word
 from miricigale.utils.region_files import region_table
-from miricigale.utils.text_tables import csv_layout, without_comments
+from miricigale.utils.text_tables import csv_layout, names_in_comments, without_comments
 
 _PIECE = 1 << 20
 BOM = b"\xef\xbb\xbf"
@@ -35,6 +37,8 @@ def read_text(path, form, id_names):
             raise ValueError("it is JSON, and wanted are columns of text")
         source = str(path)
         options = {"format": form}
+        if form == "ascii.no_header":
+            options["names"] = names_in_comments(start.decode("utf-8", "replace"))
         n_comments = 0
         if form == "ascii.csv":
             options["delimiter"], n_comments = csv_layout(path)
@@ -59,12 +63,34 @@ def read_text(path, form, id_names):
         raise ValueError(msg)
     if form == "votable":
         document = votable.parse(path)
+        _check_status(document, path)
         tables = list(document.iter_tables())
+        if len(tables) > 1:
+            names = ", ".join(str(table.name or table.ID or i) for i, table in enumerate(tables))
+            msg = f"it has {len(tables)} tables ({names}): write one of them to a file of its own"
+            raise ValueError(msg)
         if len(tables) == 1:
             check_names_differ([field.name for field in tables[0].fields])
         # names are what users see; astropy takes the IDs of fields
         return Table.read(document, format=form, use_names_over_ids=True)
     return Table.read(path, format=form)
+
+
+def _check_status(document, path):
+    """Refuse a VOTable in which a service reports an error, and warn of one that it cut off."""
+    for resource in document.resources:
+        for info in document.infos + resource.infos:
+            if str(info.name).upper() != "QUERY_STATUS":
+                continue
+            status = str(info.value).upper()
+            if status == "ERROR":
+                msg = f"the service that wrote it reports an error: {info.content or 'no reason'}"
+                raise ValueError(msg)
+            if status == "OVERFLOW":
+                text = (
+                    "the service that wrote it cut it off (QUERY_STATUS OVERFLOW): rows are missing"
+                )
+                warn(f"{Path(path).name}: {text}", CatalogWarning)
 
 
 def _unmark_first_name(table):

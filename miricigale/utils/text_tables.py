@@ -56,6 +56,35 @@ def csv_layout(path):
     return separator, n_comments
 
 
+def names_in_comments(text):
+    """
+    Find the names of the columns of plain text among several lines of comment before its rows.
+
+    Parameters
+    ----------
+    text : str
+        The start of the file.
+
+    Returns
+    -------
+    names : list of str or None
+        Those of the last line of comment that has as many words as the first row, one of which is called as ids
+        are; None without such a line.
+    """
+    comments = []
+    for line in text.removeprefix(_BOM).splitlines():
+        if _is_comment(line):
+            comments.append(line)
+            continue
+        n_cells = len(line.split())
+        for comment in reversed(comments):
+            names = comment.lstrip("# \t").split()
+            if len(names) == n_cells and any(map(is_id_name, names)):
+                return names
+        return None
+    return None
+
+
 def _is_comment(line):
     """Whether a line is empty or begins with the mark of a comment."""
     return not line.strip() or line.startswith("#")

@@ -2,6 +2,7 @@
 
 import functools
 import re
+import warnings
 
 import astropy.units as u
 import numpy as np
@@ -57,7 +58,8 @@ def flux_unit(unit):
     unit : `~astropy.units.Unit` or str
         ``"nanomaggies"``, ``"nmgy"``, ``"maggies"`` (AB, 3631 Jy for 1) and ``u.mgy`` are units of flux density,
         ``"ABmag"``, ``"mag(AB)"``, ``"AB mag"`` AB magnitudes. Of Jansky any spelling that leaves no choice is
-        taken, such as ``"UJY"`` or ``"microjansky"``, in brackets or not.
+        taken, such as ``"UJY"`` or ``"microjansky"``, in round brackets or not; square ones are logarithms in
+        tables of CDS. A number may stand before a unit, ``"1e-29 erg/s/cm2/Hz"``, as the FITS standard forbids.
 
     Returns
     -------
@@ -73,7 +75,7 @@ def flux_unit(unit):
     Unit("mag(AB)")
     """
     text = re.sub(r"\s+", "", str(unit)).lower()
-    text = re.sub(r"^[\[(](.*)[\])]$", r"\1", text)
+    text = re.sub(r"^\((.*)\)$", r"\1", text)
     if text in _JANSKY_NAMES:
         return _JANSKY_NAMES[text]
     if text in _AB_NAMES:
@@ -82,6 +84,24 @@ def flux_unit(unit):
         return u.Unit(_MAGGY_NAMES[text] * _MAGGY.to(u.uJy))
     if isinstance(unit, u.UnitBase) and u.mgy in unit.bases and unit.is_equivalent(u.mgy):
         return u.Unit(unit.to(u.mgy) * _MAGGY.to(u.uJy))
+    if isinstance(unit, (str, u.UnrecognizedUnit)):
+        return _scaled_unit(str(unit))
+    return None
+
+
+def _scaled_unit(text):
+    """Unit of flux density after a number; None for anything else."""
+    if not re.match(r"\s*\d", text):
+        return None
+    with warnings.catch_warnings():
+        # of several slashes
+        warnings.simplefilter("ignore", u.UnitsWarning)
+        try:
+            unit = u.Unit(text)
+        except (TypeError, ValueError):
+            return None
+    if isinstance(unit, u.UnitBase) and unit.is_equivalent(FNU):
+        return unit
     return None
 
 

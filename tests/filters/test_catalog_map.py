@@ -420,3 +420,21 @@ def test_several_numbers_in_a_row_are_refused(column):
 def test_truth_values_dates_and_complex_numbers_are_no_fluxes(column):
     message = f"numbers in '{BAND}', got values of the type"
     refuses(message, convert, {"id": [1, 2], BAND: column}, units={"flux": "uJy"})
+
+
+@pytest.mark.parametrize("number", [1e20, 1e30, -1e31, 1e37, 3.4e38])
+@pytest.mark.parametrize("unit", ["nJy", "uJy", "ABmag"])
+def test_numbers_beyond_all_fluxes_stand_for_no_value(number, unit):
+    table = Table({"F770W": [number, 21.4, 23.9], "F770W_err": [0.1, number, 0.2]})
+    columns = {"miri.f770w": "F770W", "miri.f770w_err": "F770W_err"}
+    out, coded = CatalogMap(columns, units={"flux": unit}).convert(table)
+    assert np.isnan(out["miri.f770w"].value).tolist() == [True, False, False]
+    assert np.isnan(out["miri.f770w_err"].value).tolist() == [True, True, False]
+    assert coded["miri.f770w"][:2].tolist() == [number, number]
+
+
+def test_magnitudes_that_no_source_has_stand_for_no_value():
+    table = Table({"m": [100.0, 50.0, 31.0], "e": [100.0, 0.1, 0.1]})
+    columns = {"miri.f770w": "m", "miri.f770w_err": "e"}
+    out, _ = CatalogMap(columns, units={"flux": "ABmag"}).convert(table)
+    assert np.isnan(out["miri.f770w"].value).tolist() == [True, True, False]

@@ -335,3 +335,12 @@ def test_numbers_that_look_like_codes_are_reported_before_the_fit(grid, catalog,
     with pytest.warns(MiricigaleWarning, match=rf"catalog\.fits{wanted}") as record:
         fit_file(node_fitter(grid), path, tmp_path / "out", chunk_rows=2)
     assert len(record) == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [([1j] * 6 * u.uJy, "complex numbers"), ([True, False] * 3 << u.uJy, "true and false")],
+)
+def test_what_is_no_real_number_is_refused_with_a_unit_too(grid, catalog, values, words):
+    catalog["band0"] = values
+    refuses(f"numbers in column 'band0', got {words}", node_fitter(grid).fit, catalog)

@@ -3,6 +3,7 @@
 import bz2
 import gzip
 import lzma
+import warnings
 import zipfile
 
 import numpy as np
@@ -12,7 +13,7 @@ from astropy.io import fits
 from astropy.io.votable import from_table
 from astropy.table import MaskedColumn, QTable, Table
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from miricigale.utils.exceptions import CatalogWarning, DataError
 from miricigale.utils.positions import as_positions
 from miricigale.utils.row_files import open_rows, write_rows
@@ -170,3 +171,31 @@ def test_positions_are_positions_after_writing(name, tmp_path):
     write_table(QTable({"id": [1, 2], "sky": sky}), tmp_path / name)
     back = as_positions(read_table(tmp_path / name, wanted="a catalog"), name)
     assert np.all(back.separation(sky).arcsec < 1e-6)
+
+
+STATUS = """<?xml version="1.0"?><VOTABLE version="1.3" xmlns="http://www.ivoa.net/xml/VOTable/v1.3">
+<RESOURCE type="results"><INFO name="QUERY_STATUS" value="{}">of a service</INFO>
+<TABLE><FIELD name="id" datatype="int"/><DATA><TABLEDATA><TR><TD>1</TD></TR></TABLEDATA></DATA></TABLE>
+</RESOURCE></VOTABLE>"""
+
+
+def test_votables_that_a_service_cut_off_or_failed_at(tmp_path):
+    path = tmp_path / "v.xml"
+    path.write_text(STATUS.format("OK"))
+    assert read_table(path, wanted="a table")["id"].tolist() == [1]
+    path.write_text(STATUS.format("OVERFLOW"))
+    warned("v.xml: the service that wrote it cut it off", read_table, path, wanted="a table")
+    path.write_text(STATUS.format("ERROR"))
+    refuses("reports an error: of a service", read_table, path, wanted="a table", error=DataError)
+    table = STATUS[STATUS.index("<TABLE>") : STATUS.index("</RESOURCE>")]
+    path.write_text(STATUS.format("OK").replace(table, table + table))
+    refuses("it has 2 tables .* file of its own", read_table, path, wanted="a", error=DataError)
+
+
+def test_magnitudes_with_missing_values_are_read_without_a_word(tmp_path):
+    magnitudes = fits.Column("m", "D", unit="mag(AB)", array=np.array([23.9, np.nan]))
+    columns = [fits.Column("id", "J", array=np.array([1, 2])), magnitudes]
+    fits.BinTableHDU.from_columns(columns).writeto(tmp_path / "m.fits")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_table(tmp_path / "m.fits", wanted="a table")["m"].tolist() == [23.9, None]

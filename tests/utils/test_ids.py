@@ -11,7 +11,7 @@ from astropy.table import MaskedColumn, QTable, Table
 from astropy.utils.masked import Masked
 from numpy.testing import assert_array_equal
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from miricigale.utils.exceptions import CatalogWarning
 from miricigale.utils.ids import counted_ids, id_column, ids_of_text, warn_of_duplicates
 from miricigale.utils.region_files import write_circles
@@ -306,3 +306,26 @@ def test_names_that_look_like_ids_are_named_where_rows_are_counted(name):
     table = Table({"f": [1.0, 1.0], name: [101, 102]})
     with pytest.warns(CatalogWarning, match=f"rows are counted from 1, though '{name}' looks like"):
         assert counted_ids(table, "catalog").tolist() == [1, 2]
+
+
+def test_an_index_of_pandas_is_the_id_whatever_its_name():
+    pandas = pytest.importorskip("pandas")
+    index = pandas.Index([5, 7], name="cat_number")
+    frame = pandas.DataFrame({"f": [1.0, 2.0]}, index=index)
+    assert as_table(frame, "photometry")["id"].tolist() == [5, 7]
+    assert as_table(frame, "photometry")["cat_number"].tolist() == [5, 7]
+    # which a column of ids goes before
+    frame["NUMBER"] = [1, 2]
+    assert "id" not in as_table(frame, "photometry").colnames
+    # redshifts are no ids
+    frame = pandas.DataFrame({"f": [1.0, 2.0]}, index=pandas.Index([0.5, 0.7], name="z"))
+    assert "id" not in as_table(frame, "photometry").colnames
+    frame.index = pandas.MultiIndex.from_tuples([("A", 1), ("B", 1)])
+    warned(r"levels of the index without a name are left out \(2 of 2\)", as_table, frame, "x")
+
+
+def test_missing_ids_are_no_duplicates_and_numbers_in_messages_are_plain():
+    ids = MaskedColumn([0, 5, 0, 5], mask=[True, False, True, False])
+    warned(r"1 row has an id that occurred before \(5\)", warn_of_duplicates, ids, "x")
+    wrong = Table({"id": np.array([2.0**60, 1.0])})
+    refuses(r"got 1\.152921504606847e\+18 in row 0", read_ids, wrong)

@@ -152,3 +152,29 @@ def test_what_is_no_table_is_refused_in_a_sentence(tmp_path):
     ):
         with pytest.raises(DataError, match=message):
             read_table(path, wanted="a catalog")
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "# made by me\n# on a day\n# id f\n",
+        "# id f\n# of F770W, in uJy\n",
+        "## id f\n",
+        "#id f\n",
+        "# made by me\n\n#\n# id  f\n#\n",
+    ],
+)
+def test_names_of_plain_text_stand_in_any_line_of_comment(head, tmp_path):
+    path = tmp_path / "c.cat"
+    path.write_text(head + "0007 2.5\n9 --\n")
+    table = read_table(path, wanted="a catalog")
+    assert table.colnames == ["id", "f"]
+    assert table["id"].tolist() == ["0007", "9"]
+    assert table["f"].tolist() == [2.5, None]
+
+
+@pytest.mark.parametrize("word", ["INDEF", "\\N", "NA"])
+def test_words_of_iraf_and_of_databases_are_missing(word, tmp_path):
+    path = tmp_path / "c.csv"
+    path.write_text(f"id,f\n1,{word}\n2,3.5\n")
+    assert read_table(path, wanted="a catalog")["f"].tolist() == [None, 3.5]

@@ -469,8 +469,10 @@ def flux_column(table, name):
     if kind not in "fiuO":
         wanted = f"a table with numbers in column {name!r}"
         got = _KINDS.get(kind, str(column.dtype))
-        row = first_word(np.ma.getdata(column))
-        if kind in "US" and row is not None:
+        row = None
+        if kind in "US":
+            row = first_word(np.ma.getdata(column))
+        if row is not None:
             got += f", {column[row]!s:.40} in row {row} (from 0)"
         raise argument_error("photometry", wanted, got)
     array = to_array(column, FNU, name, ndim=1).copy()
