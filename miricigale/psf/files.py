@@ -14,13 +14,17 @@ from miricigale.psf.model import InstrumentPSF, make_psf
 from miricigale.utils.exceptions import PSFWarning, argument_error, data_error, warn
 from miricigale.utils.file_formats import register
 from miricigale.utils.files import file_place, open_fits, split_extension
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_data, check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import ANGLE, to_array
 
 #: Units of an `InstrumentPSF`'s quantities in files.
 _UNITS = {"pixel_scale": ANGLE, "angle": u.deg, "pa_aper": u.deg}
 _LAYOUT = "psf-1"
+#: Part by which two statements of one scale may differ.
+_SAME_SCALE = 0.02
+#: Pixels along a side of the smallest image of a PSF.
+_LEAST_SIDE = 4
 #: Extensions of STPSF's files, the best first: with the distortion and the detector's effects, finely sampled.
 _STPSF_ORDER = ("OVERDIST", "DET_DIST", "OVERSAMP", "DET_SAMP")
 
@@ -141,7 +145,7 @@ class PSFFile:
                 return None
             return in_header * ANGLE
         scale = float(to_array(user_scale, ANGLE, argument))
-        if in_header is not None and abs(scale / in_header - 1) > 0.02:
+        if in_header is not None and abs(scale / in_header - 1) > _SAME_SCALE:
             wanted = f"{in_header:.4g} arcsec, as the header of {self.path} says"
             if oversampling > 1:
                 wanted += f" with {oversampling} cells along a pixel"
@@ -202,6 +206,9 @@ class PSFFile:
             if not np.all(np.isfinite(data)) or not data.max() > 0 or not data.sum() > 0:
                 msg = "is no PSF: it has no light, or pixels that are not finite"
                 raise data_error(self.path, msg)
+        shape = self.planes.shape[1:]
+        problem = f"has {shape} pixels, a PSF needs {_LEAST_SIDE} along either side"
+        check_data(min(shape) >= _LEAST_SIDE, self.path, problem)
         options["meta"] = {"file": self.path, **options.get("meta", {})}
         if len(self.planes) == 1:
             data = self.planes[0]
@@ -319,8 +326,17 @@ def header_grid(header):
     Raises
     ------
     ValueError
-        If the image is mirrored.
+        If the image is mirrored, or its pixels are not square.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.PSFWarning`
+        If two of these differ: which counts.
     """
+    stated = {}
+    for key in ("PIXELSCL", "PIXSCALE"):
+        if isinstance(header.get(key), (int, float)) and header[key] > 0:
+            stated[key] = float(header[key])
     if "CTYPE1" in header:
         wcs = header_wcs(header, where="the PSF or kernel")
     else:
@@ -333,14 +349,39 @@ def header_grid(header):
         c, d = matrix[wcs.wcs.lat]
         if a * d - b * c > 0:
             raise argument_error("path", "a file with east to the left where north is up", wcs)
+        _check_square(matrix * 3600)
         angle = float(np.degrees(np.arctan2(b, d)))
         if not str(wcs.wcs.lngtyp).startswith("RA"):
             angle = float(grid_angle(wcs, (header["NAXIS2"], header["NAXIS1"])).value)
-        return float(np.sqrt(b * c - a * d)) * 3600, angle
-    for key in ("PIXELSCL", "PIXSCALE"):
-        if isinstance(header.get(key), (int, float)) and header[key] > 0:
-            return float(header[key]), None
-    return None, None
+        cell = float(np.sqrt(b * c - a * d)) * 3600
+        _warn_of_contradiction({"world coordinates": cell} | stated)
+        return cell, angle
+    _warn_of_contradiction(stated)
+    return next(iter(stated.values()), None), None
+
+
+def _check_square(matrix):
+    """Refuse coordinates (arcsec) with pixels that are longer than wide."""
+    width, height = np.hypot(matrix[0], matrix[1])
+    if abs(width / height - 1) > _SAME_SCALE:
+        got = f"{width:.4g} by {height:.4g} arcsec"
+        raise argument_error(
+            "path", "a file with square pixels, to which others are resampled", got
+        )
+
+
+def _warn_of_contradiction(scales):
+    """Warn if scales of pixels (arcsec), by what states them, differ."""
+    if not scales:
+        return
+    first, *others = scales
+    for name in others:
+        if abs(scales[name] / scales[first] - 1) > _SAME_SCALE:
+            msg = (
+                f"the header of the PSF or kernel states pixels of {scales[first]:.4g} arcsec ({first}) and of "
+                f"{scales[name]:.4g} ({name}): the first are used"
+            )
+            warn(msg, PSFWarning)
 
 
 def read_psf(

@@ -157,3 +157,36 @@ def test_the_grid_of_a_psf_with_declination_first():
 def test_the_core_is_that_of_the_brightest_peak():
     data = gaussian(dx=2.3, dy=-1.1) + 0.5 * gaussian(dx=30, dy=30)
     np.testing.assert_allclose(core_position(data), (42.3, 38.9), atol=0.02)
+
+
+def _on_sky(tmp_path, width, height, **keywords):
+    """A PSF with pixels of a width and height in arcsec."""
+    header = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN"} | keywords)
+    header.update(CD1_1=-width / 3600, CD2_2=height / 3600, CD1_2=0.0, CD2_1=0.0)
+    fits.PrimaryHDU(gaussian(), header).writeto(tmp_path / "sky.fits", overwrite=True)
+    return tmp_path / "sky.fits"
+
+
+def test_pixels_that_are_not_square_are_refused(tmp_path):
+    match = "square pixels, .* got 0.05 by 0.06 arcsec"
+    refuses(match, read_psf, _on_sky(tmp_path, 0.05, 0.06))
+    # the rounding of a header is none
+    assert read_psf(_on_sky(tmp_path, 0.05, 0.0501)).fwhm.to_value(u.arcsec) == pytest.approx(
+        FWHM, rel=0.01
+    )
+
+
+def test_two_scales_in_one_header_are_warned_of(tmp_path):
+    path = _on_sky(tmp_path, CELL, CELL, PIXELSCL=0.1)
+    with pytest.warns(PSFWarning, match=r"0.05 arcsec \(world coordinates\) and of 0.1 \(PIXELSCL"):
+        assert read_psf(path).fwhm.to_value(u.arcsec) == pytest.approx(FWHM, rel=0.01)
+    header = fits.Header({"PIXELSCL": CELL, "PIXSCALE": 0.06})
+    fits.PrimaryHDU(gaussian(), header).writeto(path, overwrite=True)
+    with pytest.warns(PSFWarning, match=r"\(PIXELSCL\) and of 0.06 \(PIXSCALE\)"):
+        read_psf(path)
+
+
+def test_a_psf_of_few_pixels_is_refused(tmp_path):
+    header = fits.Header({"PIXSCALE": CELL})
+    fits.PrimaryHDU(gaussian(3), header).writeto(tmp_path / "p.fits")
+    refuses(r"has \(3, 3\) pixels, a PSF needs 4", read_psf, tmp_path / "p.fits", error=DataError)
