@@ -31,7 +31,7 @@ n = 20
 
 def star(temperature):
     wave = np.geomspace(0.2, 60, 1500) * u.um
-    return SED(wave, 1e9 * BlackBody(temperature * u.K)(wave) * u.sr)
+    return SED(wave, 1e-21 * BlackBody(temperature * u.K)(wave) * u.sr)
 
 
 model = SEDModel.survey()
