@@ -157,7 +157,7 @@ class Module:
         out = {}
         declared = kind.declared()
         # in the order of the names there, which is that of the axes of a grid
-        for name in sorted(declared, key=[*names, *declared].index):
+        for name in sorted(declared, key=(list(names) + list(declared)).index):
             theirs, _, factor = names.get(name, (name, None, 1.0))
             self._factors[name] = factor
             key = _KEYS.get(name, theirs.rpartition(".")[2])

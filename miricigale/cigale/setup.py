@@ -258,7 +258,7 @@ class CigaleSetup:
         have = [name for name in self.bands if name in photometry.colnames]
         wanted = f"a table with at least one of the columns {list(self.bands)}"
         check_that(have, "photometry", wanted, f"columns {photometry.colnames}")
-        grid = self.grid([*have, *self.predicted], _column(photometry, "redshift"))
+        grid = self.grid(list(have) + list(self.predicted), _column(photometry, "redshift"))
         options = {"model_error": self.additional_error} | options
         return BayesFitter(grid, have, compat=compat, **options)
 

@@ -44,7 +44,7 @@ def classify(frac_agn, *, limits=CLASS_LIMITS):
     frac_agn = floats(frac_agn)
     bad = (frac_agn < 0) | (frac_agn > 1)
     check_that(not np.any(bad), "frac_agn", "between 0 and 1", frac_agn[bad])
-    names = np.array([*CLASS_NAMES, "unknown"])
+    names = np.array(list(CLASS_NAMES) + ["unknown"])
     index = np.searchsorted(limits, frac_agn, side="right")
     index[~np.isfinite(frac_agn)] = len(CLASS_NAMES)
     return names[index]

@@ -256,7 +256,7 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     check_that(not isinstance(bands, str), "bands", "a list of filter names", repr(bands))
     bands = list(bands)
     units = dict.fromkeys([c for band in bands for c in (band, error_column(band))], FNU)
-    require_columns(truth, ["id", "sky", *bands], "truth", units=dict.fromkeys(bands, FNU))
+    require_columns(truth, ["id", "sky"] + list(bands), "truth", units=dict.fromkeys(bands, FNU))
     require_columns(measured, ["id", "sky"], "measured", units=units)
     index, separation = match_sky(measured["sky"], truth["sky"], radius=radius)
     matched = index >= 0

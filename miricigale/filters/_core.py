@@ -20,7 +20,7 @@ def refine(wave, throughput):
         np.geomspace(low, high, int(np.ceil(r)), endpoint=False) if r > 1 else np.array([low])
         for low, high, r in zip(wave[:-1], wave[1:], ratio, strict=True)
     ]
-    fine = np.concatenate([*parts, wave[-1:]])
+    fine = np.concatenate(list(parts) + [wave[-1:]])
     return fine, np.interp(fine, wave, throughput)
 
 

@@ -128,7 +128,7 @@ def _stated_units(table, names, bands, units):
     by_band = units
     if isinstance(units, Mapping):
         by_band = {find_filter(str(name)) or str(name): unit for name, unit in units.items()}
-        accepted = [*bands, "flux"]
+        accepted = list(bands) + ["flux"]
         check_that(
             set(by_band) <= set(accepted), "units", f"a dict with keys among {accepted}", units
         )

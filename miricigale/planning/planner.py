@@ -233,7 +233,7 @@ class Planner:
     @functools.cached_property
     def _existing(self):
         """Mock photometry in the existing bands, the same for every plan."""
-        columns = self.sources[["id", *self.config.fit.bands]]
+        columns = self.sources[["id"] + list(self.config.fit.bands)]
         depths = dict(zip(self.config.fit.bands, self.config.fit.depths, strict=True))
         return existing_errors(depths).perturb(columns, seed=self.config.plan.seed)
 
@@ -334,7 +334,7 @@ class Planner:
         planned = self.band_plans(share, bands)
         plans = subset(planned, bands)
         photometry = self.photometry(plans.values(), measured)
-        all_bands = [*config.fit.bands, *bands]
+        all_bands = list(config.fit.bands) + list(bands)
         fitter = study_fitter(config.fit, all_bands, axes=fit_plan(config, name))
         results = fitter.fit(photometry, executor=self.executor)
         table = self._results(results, photometry, plans)

@@ -192,7 +192,7 @@ def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, 
     ``boxes`` are widths in pixels of further square boxes (drops, output pixels).
     """
     if pixel:
-        widths = [*boxes, 1.0]
+        widths = list(boxes) + [1.0]
     else:
         widths = list(boxes)
     extent = sum(widths) + 5 * jitter + (1 if ipc is not None else 0)

@@ -99,7 +99,7 @@ def example_field(filters=("wfc3.f160w", "miri.f770w"), *, size=30 * u.arcsec, s
     rows = QTable({"id": galaxies["id"], "redshift": galaxies["redshift"]})
     for name, value in _GALAXY.items():
         rows[name] = np.full(len(rows), 1.0) * value
-    light = model.fluxes(rows, list(dict.fromkeys(["wfc3.f160w", *names])))
+    light = model.fluxes(rows, list(dict.fromkeys(["wfc3.f160w"] + list(names))))
     scale = galaxies["wfc3.f160w"] / light["wfc3.f160w"]
     shapes = ["profile", "half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
     truth = galaxies["id", "sky", "redshift", *shapes]

@@ -161,7 +161,7 @@ class Component:
             elif name in parameters:
                 value = parameters[name].check(value)
             else:
-                names = ", ".join([*parameters, *options])
+                names = ", ".join(list(parameters) + list(options))
                 msg = f"{type(self).__name__} has no parameter {name!r}; known: {names}"
                 raise TypeError(msg)
             self.__dict__[name] = value

@@ -236,7 +236,7 @@ class SEDModel(Interactive):
         'survey'
         """
         model = type(self)(
-            [*self.components, *components],
+            list(self.components) + list(components),
             cosmology=self.cosmology,
             frac_agn_definition=self.frac_agn_definition,
         )

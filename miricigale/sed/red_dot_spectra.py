@@ -56,7 +56,9 @@ def _wavelengths():
     optical = np.geomspace(_LYMAN, 1.5, 1200)
     jumps = np.array([_LYMAN, _BALMER])
     both_sides = np.concatenate([jumps * (1.0 - 1e-5), jumps * (1.0 + 1e-5)])
-    return np.unique(np.concatenate([np.geomspace(0.005, 300.0, 800), optical, both_sides, *lines]))
+    return np.unique(
+        np.concatenate([np.geomspace(0.005, 300.0, 800), optical, both_sides] + list(lines))
+    )
 
 
 _WAVE_UM = _wavelengths()

@@ -184,7 +184,7 @@ def _row_flags(model, values, n):
         if not component.refuses or not np.any(good):
             continue
         # each different set of values is asked for once
-        names = [*component.parameters, *component.others]
+        names = list(component.parameters) + list(component.others)
         rows = np.flatnonzero(good)
         different, index = distinct(_keys(values, names, rows))
         bad = [bool(component.invalid(dict(zip(names, row, strict=True)))) for row in different]

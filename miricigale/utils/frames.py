@@ -97,7 +97,7 @@ def _of_index(data, columns, argument):
             check_that(is_repeated, argument, wanted, f"two of {str(name)!r} that differ")
         else:
             levels[str(name)] = values
-    if index.nlevels == 1 and not any(map(is_id_name, [*levels, *columns])):
+    if index.nlevels == 1 and not any(map(is_id_name, list(levels) + list(columns))):
         values = next(iter(levels.values()), None)
         if values is not None and values.dtype.kind in "iuUSO" and index.is_unique:
             levels["id"] = values

@@ -130,7 +130,7 @@ def file_states(inputs, others=()):
     states : dict of str to list of int
         By path.
     """
-    paths = [*inputs.paths, *others]
+    paths = list(inputs.paths) + list(others)
     for file in (inputs.highres, *inputs.images, *inputs.detection):
         paths += [getattr(file, name) for name in PATHS]
     files = {str(file_place(path)[0]) for path in paths if path is not None}

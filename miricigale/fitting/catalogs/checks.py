@@ -83,7 +83,9 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     fitter = fitter.for_photometry(photometry)
     filters = results.fitted_filters
     columns = flux_columns(filters)
-    require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
+    require_columns(
+        photometry, ["id"] + list(columns), "photometry", units=dict.fromkeys(columns, FNU)
+    )
     if not np.array_equal(read_ids(photometry), results.ids):
         raise argument_error("photometry", "of the objects of 'results', in order", "others")
     if results.redshift_fixed and options.get("redshift") is None:

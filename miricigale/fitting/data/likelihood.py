@@ -302,7 +302,7 @@ class PhotometryReader:
         """
         filters = self.fitted(table)
         columns = flux_columns(filters)
-        require_columns(table, ["id", *columns], "photometry")
+        require_columns(table, ["id"] + list(columns), "photometry")
         for name in columns:
             if getattr(table[name], "unit", None) is None:
                 got = "no unit: say it, as unit='uJy' of the fit or --flux-unit uJy of the command"

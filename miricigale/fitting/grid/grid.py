@@ -38,7 +38,7 @@ _MIN_VARIANCE = 1e-290
 _AXES = declared("miricigale.fitting", "columns.toml")["arrays"]
 #: These arrays, not a number or -1 in rows that were not fitted; ``joint`` are joint posteriors that were
 #: asked for, by two of the letters z, g, k and f.
-GridOutput = namedtuple("GridOutput", [*_AXES, "joint"])
+GridOutput = namedtuple("GridOutput", list(_AXES) + ["joint"])
 #: What the posterior between nodes begins with: draws on the nodes, redshift, galaxy, AGN model and fraction,
 #: shape (n_draws, 4); the posterior of redshift and AGN fraction, (nz, nf); whether both are of larger errors.
 Start = namedtuple("Start", "index zf larger_errors")

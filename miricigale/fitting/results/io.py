@@ -375,7 +375,7 @@ class FitResultsFiles:
     def _rows(self, rows):
         """Read the results of rows by number, in their order."""
         n_rows = [record["rows"] for record in self._records]
-        ends = np.cumsum([0, *n_rows])
+        ends = np.cumsum([0] + list(n_rows))
         of_part = np.searchsorted(ends, rows, side="right") - 1
         parts = []
         for i, path in enumerate(self.paths):

@@ -327,7 +327,7 @@ def estimate_band_errors(fluxes, prior):
         n_free = 4
 
     def minus_log_posterior(free_values):
-        values = np.array([*free_values, 0.0])[:4]
+        values = np.array(list(free_values) + [0.0])[:4]
         ln_factor, ln_part, logit_wrong, ln_zero = values
         wrong = expit(logit_wrong)
         log_right = np.log1p(-wrong)

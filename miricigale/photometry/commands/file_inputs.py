@@ -203,7 +203,7 @@ class Inputs:
         detection = pixels.detection
         if self.segmentation is None or part == ():
             if detection:
-                prior = chi_image([prior, *detection])
+                prior = chi_image([prior] + list(detection))
             return detected_prior(prior, catalog)
         if part is None:
             return read_prior(prior, segmentation=self.segmentation, catalog=catalog)

@@ -196,7 +196,7 @@ def curves_to_table(curves, meta):
     """Make the table of curves by filter name."""
     rows = [np.stack(curve.rows()) for curve in curves.values()]
     counts = [values.shape[1] for values in rows]
-    values = np.concatenate([np.empty((6, 0)), *rows], axis=1)
+    values = np.concatenate([np.empty((6, 0))] + list(rows), axis=1)
     flux, sigma, low, high, fraction, photon = values
     kinds = np.array([curve.kind for curve in curves.values()], str)
     columns = {

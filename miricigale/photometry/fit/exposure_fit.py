@@ -205,7 +205,7 @@ class ExposureFit:
             data = part.arrays.whitened(part.arrays.flux)
             # normal equations of this exposure, then summed over exposures by source
             square, projection, power, light = normal_matrix(
-                part.bank, part.inverse_sigma, [data, *white]
+                part.bank, part.inverse_sigma, [data] + list(white)
             )
             # from rows of the bank to sources of the joint fit
             gather = part.gather(n)
@@ -331,7 +331,7 @@ class ExposureFit:
             columns = part.sky_columns(self.order)
             white = list(map(part.arrays.whitened, columns))
             # normal equations of the changes on this exposure
-            square, projection, _, _ = normal_matrix(bank, part.inverse_sigma, [data, *white])
+            square, projection, _, _ = normal_matrix(bank, part.inverse_sigma, [data] + list(white))
             place = _selection(numbers, n_changes)
             squares = squares + place @ square @ place.T
             cross = cross + self._cross(part, bank, place, None)

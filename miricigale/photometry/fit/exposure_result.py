@@ -180,7 +180,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
         joint = (spread[0] + spread[1] + spread[2]).tocsr()
         joint.sort_indices()
         # the total first, as its name is
-        for name, term in zip(errors, [joint, *spread], strict=True):
+        for name, term in zip(errors, [joint] + list(spread), strict=True):
             errors[name][measured] = np.sqrt(np.maximum(term.diagonal()[measured], 0.0))
     # peaks of the last residual, for flags of their neighbors
     xy = np.concatenate([catalog.xy, new_xy])

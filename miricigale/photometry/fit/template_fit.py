@@ -273,7 +273,9 @@ class TemplateFit:
         white = list(map(self.arrays.whitened, self.columns))
         data = self.arrays.whitened(self.arrays.flux)
         # normal equations of the sources, and their products with the common parameters
-        matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
+        matrix, projection, power, light = normal_matrix(
+            bank, self.inverse_sigma, [data] + list(white)
+        )
         self.light = light / bank.full_light()[:, None]
         self.power = power
         diagonal = matrix.diagonal()

@@ -116,7 +116,7 @@ def reduce_files(
         inputs = {path.resolve() for path in paths}
         if any((products.folder / name).resolve() in inputs for name in names):
             raise argument_error("folder", "another one than that of the files", folder)
-        products.check_replaceable([*names, _TABLE, _PAGE])
+        products.check_replaceable(list(names) + [_TABLE, _PAGE])
         reduction = _Reduction(reducer, products, _settings(reducer), resume, integrations)
         rows = []
         members = {}
@@ -184,7 +184,7 @@ def _product_names(path, integrations):
         return names
     if band is None:
         return names
-    return [*names, _mosaic_name(str(band))]
+    return list(names) + [_mosaic_name(str(band))]
 
 
 def _mosaic_name(band):

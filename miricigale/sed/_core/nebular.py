@@ -46,7 +46,7 @@ def line_operator(wave, line_wave, width):
     multiplies the continuum at ``wave`` followed by the power of lines.
     """
     places = line_wave[:, None] * (1.0 + width * OFFSETS)
-    nodes = merge_nodes([wave, *places])
+    nodes = merge_nodes([wave] + list(places))
     rows = []
     columns = []
     data = []

@@ -40,7 +40,7 @@ def write_images(page, mosaics, patch):
     kind = {3: "color", 6: "colors"}.get(len(colors), "gray")
     prior = image(f"{of_patch('f160w', patch)}.fits")
     field = [mosaics[name] for name in colors]
-    figure = pictures.field_figure(field, prior, [*colors, config.highres.filter])
+    figure = pictures.field_figure(field, prior, list(colors) + [config.highres.filter])
     page.figure(kind, figure, bands=", ".join(map(band_label, colors)))
     chosen = three_bands(bands)
     unit = next(n for n, e in study_exposures(config).items() if e.filter == chosen[-1])

@@ -178,7 +178,9 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     bands = list(limits)
     sample = np.asarray(matched["selection"]) == 0
     effect = "zero_point_existing"
-    light = Perturbation({effect: zero_point}, seed).fluxes(effect, truth[["id", *bands]], bands)
+    light = Perturbation({effect: zero_point}, seed).fluxes(
+        effect, truth[["id"] + list(bands)], bands
+    )
     table = light[sample]
     depths = without_none(limits)
     if depths:

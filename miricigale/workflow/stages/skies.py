@@ -53,7 +53,7 @@ def fit_skies(context, unit):
     # of these skies all galaxies are drawn, of the others those with AGN
     n_complete = -(-n_skies // PER_WHOLE)
     skies, rows = other_skies(
-        truth[["id", *parameters]],
+        truth[["id"] + list(parameters)],
         model,
         bands[0],
         n_skies,
