@@ -122,6 +122,8 @@ class ModelGrid(Frozen):
         What the AGN fraction is a fraction of; see ``dust_luminosity`` and `fraction_span`.
     recipe : dict, optional
         `SEDModel.recipe` of the model that made the grid; empty if that is unknown.
+    preset : str, optional
+        `SEDModel.preset` of that model.
 
     Raises
     ------
@@ -160,6 +162,7 @@ class ModelGrid(Frozen):
     bounds: dict = field(default_factory=dict)
     frac_agn_definition: str = "dust"
     recipe: dict = field(default_factory=dict)
+    preset: str | None = None
 
     io_module = __name__
 
@@ -277,7 +280,7 @@ class ModelGrid(Frozen):
 
 def _write(grid, path, *, overwrite=False):
     tables = attributes(grid, _TABLES)
-    text = attributes(grid, ("filters", "meta") + _FACTS)
+    text = attributes(grid, ("filters", "meta", "preset") + _FACTS)
     text["descriptions"] = {
         name: {column: table[column].info.description for column in table.colnames}
         for name, table in tables.items()
@@ -304,6 +307,8 @@ def _read(path):
                 table[column] = u.Quantity(table[column], dtype=float)
                 table[column].info.description = description
         facts = subset(text, ("meta",) + _FACTS)
+        # files of earlier versions do not say it
+        facts["preset"] = text.get("preset")
         return ModelGrid(tuple(text["filters"]), **arrays, **tables, **facts)
 
 

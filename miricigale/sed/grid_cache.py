@@ -80,7 +80,7 @@ def cached_grid(model, axes, filters, make):
             grid = ModelGrid.read(path)
             os.utime(path)
             # the numbers are those of the file, the provenance is that of this model
-            return replace(grid, meta=model.meta, recipe=model.recipe)
+            return replace(grid, meta=model.meta, recipe=model.recipe, preset=model.preset)
         except (DataError, OSError) as err:
             _log.warning("cached grid not used: %s", err)
     grid = make(model, axes, filters)

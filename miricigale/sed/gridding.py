@@ -226,6 +226,7 @@ def model_grid(model, axes, filters):
         bounds={name: parameter.bounds for name, parameter in model.parameters.items()},
         frac_agn_definition=model.frac_agn_definition,
         recipe=model.recipe,
+        preset=model.preset,
         **nuclei,
     )
 

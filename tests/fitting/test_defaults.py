@@ -91,6 +91,8 @@ def test_models_bands_and_calibration_by_default():
         BayesFitter(model, BANDS, axes=SEDModel.survey_axes()),
         BayesFitter().for_bands(BANDS),
         BayesFitter(model).for_bands(BANDS),
+        # a grid that was made before, as one that was read is
+        BayesFitter(model.grid(SEDModel.survey_axes(), BANDS)),
     ]
     for fitter in fitters:
         assert fitter.grid_name == "survey"
@@ -112,6 +114,8 @@ def test_models_bands_and_calibration_by_default():
     ):
         fitter = BayesFitter(model, BANDS, **named | options)
         assert fitter.calibration is None
+    other = BayesFitter(model.grid(SEDModel.survey_axes() | {"age": [1.0]}, BANDS))
+    assert other.calibration is None
     assert set(BayesFitter(BANDS, calibration=None).model_errors.values()) == {0.1}
     changed = fitters[0].replace(model_error=0.2)
     assert changed.calibration is None

@@ -3,7 +3,7 @@
 import numpy as np
 
 from miricigale.filters import FilterSet, find_filter
-from miricigale.sed import SEDModel
+from miricigale.sed import ModelGrid, SEDModel
 from miricigale.sed.presets import GRIDS, grid_axes
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
@@ -60,12 +60,12 @@ def own_curves(filters):
 
 def axes_of(model, axes):
     """
-    Find the axes of a grid of a model, and the name of the grid.
+    Find the axes of a grid of a model, and the name of the grid; a grid that was made has the name of its axes.
 
     Parameters
     ----------
     model : object
-        `~miricigale.sed.SEDModel`, or anything else, whose ``axes`` are left alone.
+        `~miricigale.sed.SEDModel` or `~miricigale.sed.ModelGrid`, or anything else, whose ``axes`` are left alone.
     axes : dict, str or None
         Parameters to values, or the name of a grid of `~miricigale.sed.presets.GRIDS`; None for the model's own.
 
@@ -81,16 +81,23 @@ def axes_of(model, axes):
     ValueError
         If no axes were given for a model that has none of its own, or the name is that of another chain.
     """
+    if isinstance(model, ModelGrid):
+        return axes, _name_of(model.axes, model.preset, model.n_agn > 0)
     if not isinstance(model, SEDModel):
         return axes, None
     if axes is None:
         return model.named_axes(axes), model.preset
     if isinstance(axes, str):
         return model.named_axes(axes), axes
-    for name, (preset, _) in GRIDS.items():
-        if preset == model.preset and _are_same(axes, grid_axes(name, agn=model.has_agn)):
-            return axes, name
-    return axes, None
+    return axes, _name_of(axes, model.preset, model.has_agn)
+
+
+def _name_of(axes, preset, has_agn):
+    """Name of the grid with some axes of the model of a preset; None if it is none of ours."""
+    for name, (preset_of_grid, _) in GRIDS.items():
+        if preset_of_grid == preset and _are_same(axes, grid_axes(name, agn=has_agn)):
+            return name
+    return None
 
 
 def _are_same(axes, grid_axes_of_name):
