@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import itertools
 import re
 import runpy
 from pathlib import Path
@@ -68,6 +69,29 @@ def test_page_is_short_and_prints_no_truth_values(path):
     assert [line for line in code_of(text) if len(line) > 84] == []
     prompts = re.findall(r"^ *>>> .*\n(?: *\.\.\. .*\n)*( *(?:True|False)\n)", text, re.MULTILINE)
     assert prompts == []
+
+
+@pytest.mark.parametrize("path", PAGES, ids=name_of)
+def test_text_of_tables_stays_out_of_the_margins_of_columns(path):
+    # docutils draws no table where it does not
+    margins = []
+    lines = path.read_text(encoding="utf-8").split("\n")
+    for line, following in itertools.pairwise(lines):
+        if re.fullmatch(r" *=+( +=+)+", line):
+            margins = [match.start() for match in re.finditer(r"(?<==) ", line)]
+            continue
+        # a table ends at an empty line after a rule
+        if not line.strip():
+            margins = []
+        # a heading of several columns has a line of its own below
+        if re.fullmatch(r" *-+( +-+)+", line) or re.fullmatch(r" *-+( +-+)+", following):
+            continue
+        assert [line for k in margins if line[k : k + 1].strip()] == []
+
+
+def test_scripts_of_the_gallery_have_different_names():
+    stems = [path.stem for path in SCRIPTS]
+    assert len(set(stems)) == len(stems)
 
 
 @pytest.mark.parametrize("path", sorted((DOCS / "method").rglob("*.rst")), ids=name_of)
