@@ -216,7 +216,7 @@ def test_the_command_refuses_what_is_beyond_the_memory_and_measures_it_in_patche
     assert "--patches FOLDER" in capsys.readouterr().err
     for one in (["--redo"], ["--overlap", "5"], ["--patch-size", "300"]):
         assert main([*given, *one]) == 2
-        assert f"'{one[0]}' must be left out without --patches" in capsys.readouterr().err
+        assert f"{one[0]} must be left out without --patches" in capsys.readouterr().err
     given += ["--patches", str(run), "--threads", "1"]
     assert main([*given, "--page", "a.html"]) == 2
     assert "left out with --patches" in capsys.readouterr().err
