@@ -75,14 +75,20 @@ def _outcome(results):
     return f"{text} (not: {', '.join(reasons)})"
 
 
+#: Options of `~miricigale.fitting.fit_file`, whose module loads the kernels: a missing file is said without them.
+_OF_FILE = ("redshift", "pairs", "flux_unit", "resume", "progress_bar")
+
+
 def fit_options(args):
     """Return the options of fits of a catalog, as `~miricigale.fitting.catalogs.classes.fit_classes` has them."""
-    from miricigale.fitting import fit_catalog, fit_file
     from miricigale.fitting.catalogs.classes import fit_classes
+    from miricigale.fitting.catalogs.from_files import fit_catalog
 
-    options = filled(args, fit_classes, fit_catalog, fit_file)
-    # that of agn is of its injections
-    options.pop("seed", None)
+    options = filled(args, fit_classes, fit_catalog)
+    for name in _OF_FILE:
+        value = getattr(args, name)
+        if value is not None:
+            options[name] = value
     return options
 
 
@@ -131,7 +137,6 @@ def photometer_options(args):
 def photometry(args):
     """Measure images."""
     from miricigale.photometry import measure_files
-    from miricigale.workflow import measure_patches
 
     paths, prior = _image_paths(args)
     images = images_of(args, paths)
@@ -150,6 +155,8 @@ def photometry(args):
         options |= {"image": images, "highres": highres}
         table = measure_files(**options)
     else:
+        from miricigale.workflow import measure_patches
+
         refuse(args, ("page", "model", "residual"), "left out with --patches")
         page = args.patches / "index.html"
         options = filled(args, measure_files, measure_patches) | photometer_options(args)

@@ -23,7 +23,7 @@ def catalog(grid):
 def wider(catalog):
     """Bands that the grid lacks, by unit and by name, and columns that are none."""
     table = catalog.copy()
-    table["hst.f606w"], table["hst.f606w_err"] = table["band0"], table["band0_err"]
+    table["acs.f606w"], table["acs.f606w_err"] = table["band0"], table["band0_err"]
     table["miri.f560w"] = np.ones(6)
     table["mass"], table["mass_err"] = 1e10 * u.Msun, 1e9 * u.Msun
     table["sky"] = 1.0 * u.uJy
@@ -35,16 +35,16 @@ def wider(catalog):
 
 def test_bands_that_the_grid_lacks_are_named(grid, catalog, wider):
     fitter = node_fitter(grid)
-    text = r"are not fitted: hst\.f606w, miri\.f560w$"
+    text = r"are not fitted: acs\.f606w, miri\.f560w$"
     with pytest.warns(MiricigaleWarning, match=text) as record:
         results = fitter.fit(wider)
     # the line that called
     assert [one.filename for one in record] == [__file__]
-    assert results.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
-    with pytest.warns(MiricigaleWarning, match="hst.f606w") as record:
+    assert results.meta["fit"]["unused_bands"] == ["acs.f606w", "miri.f560w"]
+    with pytest.warns(MiricigaleWarning, match="acs.f606w") as record:
         samples = fitter.sample(wider, 2, seed=1)
     assert record[0].filename == __file__
-    assert samples.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
+    assert samples.meta["fit"]["unused_bands"] == ["acs.f606w", "miri.f560w"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         alone = fitter.fit(catalog)
@@ -52,17 +52,17 @@ def test_bands_that_the_grid_lacks_are_named(grid, catalog, wider):
         chosen = node_fitter(grid, ["band0", "band1", "band2"]).fit(wider)
     assert alone.meta["fit"]["unused_bands"] == []
     assert_array_equal(alone.chi2, results.chi2)
-    unused = ["band3", "band4", "band5", "hst.f606w", "miri.f560w"]
+    unused = ["band3", "band4", "band5", "acs.f606w", "miri.f560w"]
     assert chosen.meta["fit"]["unused_bands"] == unused
 
 
 def test_a_catalog_on_disk_is_warned_of_once(grid, wider, tmp_path):
     wider.write(tmp_path / "cat.fits")
-    with pytest.warns(MiricigaleWarning, match="hst.f606w") as record:
+    with pytest.warns(MiricigaleWarning, match="acs.f606w") as record:
         results = fit_file(node_fitter(grid), tmp_path / "cat.fits", tmp_path / "o", chunk_rows=2)
     assert [w.filename for w in record if issubclass(w.category, MiricigaleWarning)] == [__file__]
     for part in results.parts():
-        assert part.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
+        assert part.meta["fit"]["unused_bands"] == ["acs.f606w", "miri.f560w"]
 
 
 # -------------------------------------------------------------------------------- rows
