@@ -106,12 +106,17 @@ def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None,
         i, j = _elements(row_start, row_columns, members, inner, place)
         rows.append(members[i])
         columns.append(members[j])
+        # rows and columns of the block that hold elements which are wanted
+        block_rows, i_place = np.unique(i, return_inverse=True)
+        block_columns, j_place = np.unique(j, return_inverse=True)
         for middle, elements in zip(scaled_middles, values, strict=True):
-            block = inverse
-            if middle is not None:
-                # H M H of the block
-                block = inverse @ _dense(*middle, members, place) @ inverse
-            elements.append(block[i, j])
+            if middle is None:
+                elements.append(inverse[i, j])
+                continue
+            # H M H of these rows and columns
+            block = inverse[block_rows] @ _dense(*middle, members, place)
+            block = block @ inverse[:, block_columns]
+            elements.append(block[i_place, j_place])
         place[members] = -1
     rows = np.concatenate(rows)
     columns = np.concatenate(columns)
