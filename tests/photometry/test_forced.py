@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses, warned
 from helpers.light import gaussian_image, pixel_gaussian
-from helpers.mosaics import flagged
+from helpers.mosaics import flagged, stamps_of
 from helpers.results import assert_equal_values
 from helpers.scenes import catalog_at
 from miricigale.instrument import imager_wcs, north_up_wcs, pixel_area_map
@@ -289,6 +289,55 @@ def test_templates_that_did_not_move_are_taken_as_they_are(tools, monkeypatch):
     made.clear()
     list(bank.blocks())
     assert len(made) > len(changed)
+
+
+def test_changes_of_templates_are_whitened_and_spread_once(tools, monkeypatch):
+    from miricigale.photometry.detection.cutouts import Cutout
+    from miricigale.photometry.templates import normal_equations
+    from miricigale.photometry.templates.templates import BankSources, FineTemplates, TemplateBank
+
+    # in several blocks of each bank
+    monkeypatch.setattr("miricigale.photometry.templates.templates._PART", 500)
+    rng = np.random.default_rng(7)
+    n = 40
+    fine = FineTemplates(tools.kernel.array, tools.kernel.target)
+    poly = np.zeros((n, 2, 6))
+    poly[:, 0, 1] = poly[:, 1, 2] = 11 / 6
+    xy = rng.uniform(0, 150, (n, 2))
+    poly[:, :, 0] = xy * 11 / 6
+    bank = TemplateBank(fine, BankSources([None] * n, poly[:, :, 0], xy, poly), (150, 150))
+    owner = rng.integers(0, n, 2 * n)
+    corners = np.rint(poly[owner, ::-1, 0]).astype(int) - 8
+    cutouts = [Cutout(rng.normal(size=(17, 17)), tuple(corner)) for corner in corners]
+    changes = bank.at_resolution(owner, cutouts)
+    inverse_sigma = rng.uniform(0.5, 2.0, (150, 150)).astype(np.float32)
+    data = rng.normal(size=(150, 150)).astype(np.float32)
+    correlation = np.outer([0.3, 1.0, 0.3], [0.2, 1.0, 0.2])
+    counts = {id(bank): 0, id(changes): 0}
+    whitened = normal_equations._whitened
+
+    def count(own_bank, block, *args):
+        counts[id(own_bank)] += len(block.box)
+        return whitened(own_bank, block, *args)
+
+    monkeypatch.setattr(normal_equations, "_whitened", count)
+    cross, matrix, projection = normal_equations.change_matrices(
+        bank, changes, inverse_sigma, [data], correlation
+    )
+    assert counts == {id(bank): n, id(changes): 2 * n}
+    # dense products of whole images
+    white = stamps_of(bank, data.shape) * inverse_sigma
+    white_changes = stamps_of(changes, data.shape) * inverse_sigma
+    spread = [scipy.ndimage.convolve(w, correlation, mode="constant") for w in white_changes]
+    scale = np.sqrt(np.sum(white**2, axis=(1, 2)))
+    change_scale = np.sqrt(np.sum(white_changes**2, axis=(1, 2)))
+    expected = np.einsum("iyx,jyx->ij", white, spread)
+    assert_allclose((cross.toarray() - expected) / scale[:, None] / change_scale, 0.0, atol=1e-6)
+    expected = np.einsum("iyx,jyx->ij", white_changes, spread)
+    difference = (matrix.toarray() - expected) / change_scale[:, None] / change_scale
+    assert_allclose(difference, 0.0, atol=1e-6)
+    expected = np.einsum("iyx,yx->i", white_changes, data)
+    assert_allclose((projection[:, 0] - expected) / change_scale, 0.0, atol=1e-5)
 
 
 def test_sersic_templates(tools):

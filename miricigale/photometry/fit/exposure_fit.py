@@ -19,7 +19,7 @@ from miricigale.photometry.templates.free_templates import (
 )
 from miricigale.photometry.templates.normal_equations import (
     LinearFit,
-    cross_matrix,
+    change_matrices,
     normal_matrix,
     sandwich_matrix,
     stated_correlation,
@@ -331,10 +331,13 @@ class ExposureFit:
             columns = part.sky_columns(self.order)
             white = list(map(part.arrays.whitened, columns))
             # normal equations of the changes on this exposure
-            square, projection, _, _ = normal_matrix(bank, part.inverse_sigma, [data] + list(white))
+            products, square, projection = change_matrices(
+                part.bank, bank, part.inverse_sigma, [data] + list(white)
+            )
             place = _selection(numbers, n_changes)
+            gather = part.gather(len(self.xy))[self.rows]
             squares = squares + place @ square @ place.T
-            cross = cross + self._cross(part, bank, place, None)
+            cross = cross + gather @ products @ place.T
             rhs += place @ projection[:, 0]
             border = np.zeros((n_changes, len(self.fit.corner_rhs)))
             border[:, self.places[k]["sky"]] = place @ projection[:, 1:]
@@ -363,12 +366,6 @@ class ExposureFit:
         shown = np.flatnonzero(local >= 0)
         bank = part.bank.at_resolution(local[shown], [changes[j].cutout for j in shown])
         return bank, shown[bank.order]
-
-    def _cross(self, part, bank, place, correlation):
-        """Sum products of an exposure's templates and changes, by rows and changes of the joint fit."""
-        products = cross_matrix(part.bank, bank, part.inverse_sigma, correlation).tocsr()
-        gather = part.gather(len(self.xy))[self.rows]
-        return gather @ products @ place.T
 
     def noise_filling(self):
         """
@@ -410,10 +407,12 @@ class ExposureFit:
             bank, numbers = self.free.bank[k]
             place = _selection(numbers, n_changes)
             # and that of the changes
-            square, side = sandwich_matrix(bank, part.inverse_sigma, correlation, spread)
+            products, square, side = change_matrices(
+                part.bank, bank, part.inverse_sigma, spread, correlation
+            )
             squares = squares + place @ square @ place.T
             change_border[:, sky] = place @ side
-            cross = cross + self._cross(part, bank, place, correlation)
+            cross = cross + gather @ products @ place.T
         if self.free is None:
             return middle, border, corner
         basis = self.free.basis

@@ -8,9 +8,7 @@ import scipy.sparse
 from miricigale.photometry._core.solve import factorize
 from miricigale.photometry.templates.normal_equations import (
     LinearFit,
-    cross_matrix,
-    normal_matrix,
-    sandwich_matrix,
+    change_matrices,
 )
 from miricigale.photometry.templates.pieces import divided_galaxies
 from miricigale.photometry.templates.template_changes import TemplateChanges
@@ -112,11 +110,11 @@ class FreeTemplates:
         `~miricigale.photometry.templates.normal_equations.sandwich_matrix`.
         """
         inverse_sigma = fit.inverse_sigma
-        changes, change_border = sandwich_matrix(self.bank, inverse_sigma, correlation, images)
-        cross = cross_matrix(fit.bank, self.bank, inverse_sigma, correlation).tocsr()[fit.rows]
-        return joined_matrix(middle, cross, changes, self.basis), _right_side(
-            border, change_border, self.basis
+        cross, changes, change_border = change_matrices(
+            fit.bank, self.bank, inverse_sigma, images, correlation
         )
+        matrix = joined_matrix(middle, cross[fit.rows], changes, self.basis)
+        return matrix, _right_side(border, change_border, self.basis)
 
 
 def free_templates(fit, fitted):
@@ -158,8 +156,10 @@ def free_templates(fit, fitted):
     images = [fit.arrays.whitened(fit.arrays.flux)]
     for column in fit.columns:
         images.append(fit.arrays.whitened(column))
-    changes_matrix, projection, _, _ = normal_matrix(change_bank, fit.inverse_sigma, images)
-    cross = cross_matrix(bank, change_bank, fit.inverse_sigma).tocsr()[rows]
+    cross, changes_matrix, projection = change_matrices(
+        bank, change_bank, fit.inverse_sigma, images
+    )
+    cross = cross[rows]
     owner = owner[~fixed]
     # changes have unit width in units of the flux of their source
     prior = np.concatenate([np.zeros(len(rows)), scale[owner] ** -2.0])

@@ -227,12 +227,13 @@ def _products(bank, left_block, right_block, pairs):
     return out
 
 
-def _walk(bank, inverse_sigma, images, spread=None):
+def _walk(bank, inverse_sigma, images, spread=None, crossing=None):
     """
     Sum products of all pairs of the whitened stamps, and their projections on images.
 
     At most those blocks are in memory that can still overlap. ``spread`` is what is done to the right-hand block
-    of a pair; stamps grow by its ``lag``. Returns the matrix, (n, n), the projection, and the stamps' sums.
+    of a pair; stamps grow by its ``lag``. ``crossing`` (`_Crossing`) gets all right-hand blocks. Returns the
+    matrix, (n, n), the projection, and the stamps' sums.
     """
     n = len(bank.order)
     grow = 0 if spread is None else spread.lag
@@ -253,6 +254,8 @@ def _walk(bank, inverse_sigma, images, spread=None):
             mine = spread(white)
             diagonal_pairs = np.repeat(np.arange(len(block.box), dtype=np.int32), 2).reshape(-1, 2)
             diagonal[rows] = _products(bank, white, mine, diagonal_pairs)
+        if crossing is not None:
+            crossing.add(mine)
         live = [held for held in live if held.end + grow > block.box[0, 0]]
         live.append(white)
         for left_block in live:
@@ -342,43 +345,75 @@ class _Spread:
         return Block(block.first, box, start, values)
 
 
-def cross_matrix(bank, other_bank, inverse_sigma, correlation=None):
+def change_matrices(bank, change_bank, inverse_sigma, images=(), correlation=None):
     """
-    Build the matrix, (n, m), of products of the whitened stamps of two banks.
+    Build the normal equations of changes of templates: their products with the templates, and with each other.
 
-    With a ``correlation`` (as of `sandwich_matrix`) the other bank's stamps are convolved with it.
+    Parameters
+    ----------
+    bank, change_bank : `~miricigale.photometry.templates.templates.TemplateBank`
+        n templates and m changes on one image.
+    inverse_sigma, images
+        As for `normal_matrix`.
+    correlation : `~numpy.ndarray`, optional
+        As for `sandwich_matrix`: if given, the stamps of the changes are convolved with it.
+
+    Returns
+    -------
+    cross : `~scipy.sparse.csr_array`, shape (n, m)
+        Products of the whitened templates and changes.
+    matrix : `~scipy.sparse.csr_array`, shape (m, m)
+        Products of the whitened changes.
+    projection : `~numpy.ndarray`, shape (m, len(images))
+        Of the changes.
     """
-    rows = []
-    columns = []
-    values = []
     spread = None
     if correlation is not None:
-        spread = _Spread(correlation, other_bank)
-    waiting = bank.blocks()
-    live = []
-    for block in other_bank.blocks():
-        # both banks go down the image together
-        right_block = _whitened(other_bank, block, inverse_sigma)[0]
-        if spread is not None:
-            right_block = spread(right_block)
-        # of the first bank, those blocks only that this one and those after it can overlap
-        live = [held for held in live if held.end > right_block.box[0, 0]]
+        spread = _Spread(correlation, change_bank)
+    # both in one walk, in which each stamp is whitened and convolved once
+    crossing = _Crossing(bank, inverse_sigma)
+    matrix, projection, _ = _walk(change_bank, inverse_sigma, images, spread, crossing)
+    return crossing.matrix(len(change_bank.order)), matrix, projection
+
+
+class _Crossing:
+    """Sums products of the whitened stamps of a bank with blocks of another one, as both go down the image."""
+
+    def __init__(self, bank, inverse_sigma):
+        self._bank = bank
+        self._inverse_sigma = inverse_sigma
+        self._waiting = bank.blocks()
+        self._live = []
+        self._rows = []
+        self._columns = []
+        self._values = []
+
+    def add(self, right_block):
+        """Add the products with the stamps of a block, which follows those that were added before."""
+        bank = self._bank
+        # those blocks only that this one and those after it can overlap
+        live = [held for held in self._live if held.end > right_block.box[0, 0]]
         while not live or live[-1].box[0, 0] < right_block.end:
-            left_block = next(waiting, None)
+            left_block = next(self._waiting, None)
             if left_block is None:
                 break
-            live.append(_whitened(bank, left_block, inverse_sigma)[0])
+            live.append(_whitened(bank, left_block, self._inverse_sigma)[0])
+        self._live = live
         for left_block in live:
             pairs = cross_pairs(left_block.box, right_block.box)
             if len(pairs):
-                values.append(_products(bank, left_block, right_block, pairs))
-                rows.append(pairs[:, 0] + left_block.first)
-                columns.append(pairs[:, 1] + right_block.first)
-    shape = len(bank.order), len(other_bank.order)
-    if not values:
-        return scipy.sparse.csr_array(shape)
-    places = (np.concatenate(rows), np.concatenate(columns))
-    return scipy.sparse.coo_array((np.concatenate(values), places), shape=shape).tocsr()
+                self._values.append(_products(bank, left_block, right_block, pairs))
+                self._rows.append(pairs[:, 0] + left_block.first)
+                self._columns.append(pairs[:, 1] + right_block.first)
+
+    def matrix(self, n_columns):
+        """Return the products, (n, n_columns), as a `~scipy.sparse.csr_array`."""
+        shape = len(self._bank.order), n_columns
+        if not self._values:
+            return scipy.sparse.csr_array(shape)
+        places = (np.concatenate(self._rows), np.concatenate(self._columns))
+        values = np.concatenate(self._values)
+        return scipy.sparse.coo_array((values, places), shape=shape).tocsr()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
