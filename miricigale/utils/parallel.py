@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 import logging
 import multiprocessing
 import operator
@@ -22,6 +23,9 @@ from miricigale.utils.progress import progress
 
 #: Lets this thread set numbers of threads: one that did so keeps others from it since threadpoolctl 3.8.
 _take_over = getattr(threadpoolctl.OpenBLASController, "clear_controlling_thread", lambda **_: None)
+
+#: Most runs of items that threads are handed: a future for each of thousands of items costs as much as small ones.
+_MAX_RUNS = 128
 
 #: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
 _HEAVY = 100_000
@@ -160,6 +164,10 @@ def parallel_map(function, items, *, executor=None, progress_bar=False, desc=Non
     if executor is None:
         return [function(item) for item in progress(items, show=progress_bar, desc=desc)]
     check_that(hasattr(executor, "submit"), "executor", "a concurrent.futures.Executor", executor)
+    if isinstance(executor, ThreadPoolExecutor) and len(items) > _MAX_RUNS and not progress_bar:
+        runs = [items[run] for run in chunks(len(items), -(-len(items) // _MAX_RUNS))]
+        results = parallel_map(functools.partial(_apply, function), runs, executor=executor)
+        return list(itertools.chain.from_iterable(results))
     with _sent_once(function, executor) as call:
         futures = [executor.submit(*call, item) for item in items]
         try:
@@ -168,6 +176,11 @@ def parallel_map(function, items, *, executor=None, progress_bar=False, desc=Non
             for future in futures:
                 future.cancel()
             raise
+
+
+def _apply(function, items):
+    """Apply a function to each of some items."""
+    return [function(item) for item in items]
 
 
 @contextlib.contextmanager

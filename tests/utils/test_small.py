@@ -62,6 +62,24 @@ def test_parallel_map_gives_the_same_answer_in_order_and_passes_errors_on():
     refuses("'executor' must be a", parallel_map, math.sqrt, range(3), executor=2)
 
 
+def test_threads_are_handed_runs_of_many_items():
+    submitted = []
+
+    class Counting(ThreadPoolExecutor):
+        def submit(self, *args):
+            submitted.append(args)
+            return super().submit(*args)
+
+    with Counting(3) as executor:
+        for n in (100, 5000):
+            submitted.clear()
+            wanted = [math.sqrt(i) for i in range(n)]
+            assert parallel_map(math.sqrt, range(n), executor=executor) == wanted
+            assert len(submitted) <= 128
+        items = [*range(500), -1]
+        refuses(r"math domain|nonneg", parallel_map, math.sqrt, items, executor=executor)
+
+
 def test_chunks_cover_everything_once():
     pieces = [i for part in chunks(10, 4) for i in range(10)[part]]
     assert pieces == list(range(10))
