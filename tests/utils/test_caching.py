@@ -82,7 +82,12 @@ ELSEWHERE = {
     "utils.compilation._warn_of_no_cache",
 }
 #: Modules that keep what nobody else gets: a function of the caller, transforms within one call.
-PRIVATE = {"utils/caching.py", "utils/parallel.py", "photometry/templates/normal_equations.py"}
+PRIVATE = {
+    "utils/caching.py",
+    "utils/parallel.py",
+    "photometry/templates/normal_equations.py",
+    "photometry/shapes/shape_models.py",
+}
 
 
 def cached_functions():

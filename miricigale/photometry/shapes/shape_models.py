@@ -1,5 +1,7 @@
 """Profiles as an image of some PSF shows them."""
 
+import functools
+
 import numpy as np
 import scipy.fft
 
@@ -10,6 +12,9 @@ from miricigale.utils.missing_values import floats
 
 #: Size of the transform over that of the stamp.
 _PERIOD = 1.6
+
+#: Number of transforms of the PSF that are kept.
+_MAX_TRANSFORMS = 16
 
 #: Part of a PSF's light below which frequencies are left out.
 _PASSED = 1e-3
@@ -22,21 +27,12 @@ class ShapeModels:
         self._psf = floats(psf)
         #: Half-width of the PSF (pixels).
         self.reach = self._psf.shape[0] / 2
-        self._transforms = {}
+        # a few are kept: those of all sizes of stamps are larger than the plans
+        self._transform = functools.lru_cache(maxsize=_MAX_TRANSFORMS)(
+            functools.partial(_transform, self._psf)
+        )
         self._plans = {}
         self._responses = {}
-
-    def _transform(self, size):
-        if size not in self._transforms:
-            padded = np.zeros((size, size))
-            middle = self._psf.shape[0] // 2
-            half = min(middle, size // 2 - 1)
-            cut = self._psf[middle - half : middle + half + 1, middle - half : middle + half + 1]
-            padded[: 2 * half + 1, : 2 * half + 1] = cut
-            # the center on the first pixel
-            shifted = np.roll(padded, (-half, -half), axis=(0, 1))
-            self._transforms[size] = scipy.fft.rfft2(shifted)
-        return self._transforms[size]
 
     def _response(self, size):
         """Return the transform for light integrated over pixels; samples of the PSF are integrated already."""
@@ -100,6 +96,18 @@ class ShapeModels:
         spectra = scipy.fft.rfft2(padded) * self._response(size)
         convolved = scipy.fft.irfft2(spectra, s=(size, size), overwrite_x=True)
         return convolved[:, rims[0] : rims[0] + shape[0], rims[1] : rims[1] + shape[1]]
+
+
+def _transform(psf, size):
+    """Return the transform, `scipy.fft.rfft2`, of a PSF about the first pixel of a square."""
+    padded = np.zeros((size, size))
+    middle = psf.shape[0] // 2
+    half = min(middle, size // 2 - 1)
+    cut = psf[middle - half : middle + half + 1, middle - half : middle + half + 1]
+    padded[: 2 * half + 1, : 2 * half + 1] = cut
+    # the center on the first pixel
+    shifted = np.roll(padded, (-half, -half), axis=(0, 1))
+    return scipy.fft.rfft2(shifted)
 
 
 def _period(shape):
