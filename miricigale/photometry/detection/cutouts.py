@@ -35,6 +35,11 @@ class Cutout:
         object.__setattr__(self, "data", np.asarray(self.data, np.float32))
 
     @property
+    def shape(self):
+        """Shape of ``data``."""
+        return self.data.shape
+
+    @property
     def kind(self):
         """``"cutout"`` if any of it is the image itself, else ``"sersic"``."""
         if self.convolved or self.correction is not None:

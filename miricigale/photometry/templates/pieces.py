@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from miricigale.photometry.detection.cutouts import Cutout
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Galaxy:
@@ -33,8 +35,7 @@ class Galaxy:
         """
         if not change.fixed:
             return change
-        cutout = change.cutout
-        larger = dataclasses.replace(cutout, data=cutout.data / self.shares.max())
+        larger = Cutout(change.cutout.data / self.shares.max(), change.cutout.origin)
         return dataclasses.replace(change, cutout=larger)
 
     def signal(self, matrix):

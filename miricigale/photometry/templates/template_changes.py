@@ -1,11 +1,12 @@
 """How templates may change, as far as their shapes are not known."""
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 import scipy.ndimage
 
-from miricigale.photometry._core.shape_fits import draw_curves
+from miricigale.photometry._core.shape_fits import Plan, draw_curves
 from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
 from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.shapes.shape_models import ShapeModels
@@ -27,11 +28,49 @@ class Change:
     """How a template changes along one direction."""
 
     #: The change by one standard deviation on the fine grid, at the resolution of the image.
-    cutout: Cutout
+    cutout: "Cutout | DrawnCutout"
     light: float = 0.0  # How much light it adds.
     #: Whether it is no deviation but the mean's: what all templates that are possible have in the
     #: mean beyond the one that fits best.
     fixed: bool = False
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DrawnCutout:
+    """
+    A `~miricigale.photometry.detection.cutouts.Cutout` that keeps its transform alone.
+
+    Of thousands of sources the images of all changes are much larger.
+    """
+
+    plan: Plan
+    curve: np.ndarray  # As `~miricigale.photometry._core.shape_fits.draw_curves` takes it.
+    #: Place of its center on the square.
+    x: float
+    y: float
+    origin: tuple  # Fine pixel (y, x) of its corner.
+    # as those of a cutout at the resolution of the image
+    noise: ClassVar[float] = 0.0
+    convolved: ClassVar[bool] = True
+    correction: ClassVar[None] = None
+    galaxy: ClassVar[None] = None
+    kind: ClassVar[str] = "cutout"
+
+    @property
+    def shape(self):
+        """Shape of ``data``."""
+        size = self.plan.inner.shape[1]
+        return size, size
+
+    @property
+    def data(self):
+        """The image, which is drawn anew each time."""
+        return draw_curves(self.plan, self.curve[None], self.x, self.y, 0)[:, 0]
+
+    @property
+    def layers(self):
+        """The cutout alone."""
+        return (self,)
 
 
 class TemplateChanges:
@@ -123,9 +162,9 @@ class TemplateChanges:
             directions = directions[:-1]
         if not len(directions):
             return [], 0.0
-        images = draw_curves(plan, directions.astype(np.float32), x, y, 0).swapaxes(0, 1)
         origin = int(middle[1]) - half, int(middle[0]) - half
-        changes = [Change(Cutout(image, origin)) for image in images]
+        curves = directions.astype(np.float32)
+        changes = [Change(DrawnCutout(plan, curve, x, y, origin)) for curve in curves]
         if fixed:
             changes[-1] = dataclasses.replace(changes[-1], fixed=True)
         return changes, 0.0

@@ -102,7 +102,7 @@ class FineTemplates:
 
     def shape(self, cutout):
         """Return the shape of the transform for a cutout, rounded up so that many share it."""
-        sizes = np.add(cutout.data.shape, self._size(cutout)) - 1 + 2 * RIM
+        sizes = np.add(cutout.shape, self._size(cutout)) - 1 + 2 * RIM
         ny, nx = (-(-sizes // 16) * 16).tolist()
         return scipy.fft.next_fast_len(ny, True), scipy.fft.next_fast_len(nx, True)
 
@@ -113,14 +113,14 @@ class FineTemplates:
     def sides_of(self, cutout):
         """Return the first and last fine (x, y) that the light of a convolved cutout reaches."""
         first = self.corner(cutout) + RIM - 1.0
-        return first, first + np.add(cutout.data.shape, self._size(cutout))[::-1]
+        return first, first + np.add(cutout.shape, self._size(cutout))[::-1]
 
     def coefficients(self, group, shape, weights):
         """Convolve cutouts of one shape, returning an array of shape (n, *shape)."""
-        height, width = np.max([cutout.data.shape for cutout in group], axis=0) + RIM
+        height, width = np.max([cutout.shape for cutout in group], axis=0) + RIM
         stamps = np.zeros((len(group), height, width), np.float32)
         for stamp, cutout in zip(stamps, group, strict=True):
-            h, w = cutout.data.shape
+            h, w = cutout.shape
             stamp[RIM : RIM + h, RIM : RIM + w] = cutout.data
         transfer = self._transfers(shape, group[0].convolved, weights)
         return convolve_batch(stamps, transfer, shape)
