@@ -19,8 +19,9 @@ from miricigale.photometry.detection.cutouts import RIM, convolve_padded
 from miricigale.utils.caching import cached
 from miricigale.utils.parallel import parallel_map
 
-#: Pixels of the stamps that a thread works on at a time.
+#: Pixels of the stamps that a thread works on at a time, and how many times as many are in a block.
 _PART = 250_000
+_PARTS_OF_BLOCK = 16
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -343,13 +344,13 @@ class TemplateBank:
         return (self._weights @ self.fine.target.sum(axis=(1, 2)))[self.order]
 
     def blocks(self):
-        """Yield all templates in order, as `Block` of some tens of MB each."""
+        """Yield all templates in order, as `Block` of some 16 MB each."""
         if self._kept is not None:
             yield from self._kept
             return
         keep = 4.0 * self.start[-1] <= self.max_bytes
         blocks = []
-        for rows in _pieces(self.start, 40 * _PART):
+        for rows in _pieces(self.start, _PARTS_OF_BLOCK * _PART):
             block = self._make(rows.start, rows.stop)
             if keep:
                 blocks.append(block)
@@ -374,7 +375,8 @@ class TemplateBank:
             else:
                 layers += [(row, layer) for layer in cutout.layers]
             if source in self._same:
-                block.values[start[row] : start[row + 1]] = self._same[source]
+                # the other bank's block is freed with the last of its templates
+                block.values[start[row] : start[row + 1]] = self._same.pop(source)
                 needed[row] = False
         points = np.flatnonzero(is_point & needed)
         weights = self._weights[sources]
