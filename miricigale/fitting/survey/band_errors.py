@@ -1,5 +1,6 @@
 """Errors, zero points and shares of wrong fluxes of bands, from what the other bands predict."""
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,6 +8,7 @@ from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from miricigale.fitting.data.template_error import pivots
+from miricigale.utils.parallel import single_threaded
 from miricigale.utils.units import WAVE
 
 #: How many times their errors wrong fluxes scatter by.
@@ -437,15 +439,17 @@ def measure_bands(results, data, bands, template_error):
             pivots([band]).to_value(WAVE) / (1.0 + redshift),
             template_error,
         )
-    errors = {}
-    in_common = {}
-    for group in long_instruments(bands):
-        joined = PredictedFluxes.concatenate([samples[band] for band in group])
-        in_common |= dict.fromkeys(group, joined)
-    for band in bands:
-        fluxes = in_common.get(band, samples[band])
-        errors[band] = estimate_band_errors(fluxes, prior_of_band(band))
-    return relative_zero_points(errors)
+    groups = long_instruments(bands)
+    in_groups = list(itertools.chain.from_iterable(groups))
+    groups += [[band] for band in bands if band not in in_groups]
+    estimates = {}
+    # matrices of 4 x 4: threads of the linear algebra wait for each other longer than they work
+    with single_threaded():
+        for group in groups:
+            joined = PredictedFluxes.concatenate([samples[band] for band in group])
+            common = estimate_band_errors(joined, prior_of_band(group[0]))
+            estimates |= dict.fromkeys(group, common)
+    return relative_zero_points({band: estimates[band] for band in bands})
 
 
 def relative_zero_points(errors, reference=None):
