@@ -152,6 +152,15 @@ def _cross_products(agn, weighted, rows):
             rows[_CROSS + i] += t_0 * row_0[i] + t_1 * row_1[i] + t_2 * row_2[i] + t_3 * row_3[i]
 
 
+@njit(**PART)
+def _log_prior_above(tables):
+    """2 ln(prior) of all AGN fractions above 0, of which there is one at least."""
+    total = 0.0
+    for f in range(tables.of_frac.shape[1]):
+        total += tables.of_frac[at.PRIOR_FRAC, f]
+    return 2.0 * np.log(max(total, 1e-300))
+
+
 @njit(**KERNEL)
 def scan_nodes(tables, galaxies, objects, work, value, like, change):
     """
@@ -173,10 +182,7 @@ def scan_nodes(tables, galaxies, objects, work, value, like, change):
     if tables.of_frac.shape[1] > 0:
         low = np.float32(0.0 if tables.zero_frac == 1 else tables.of_frac[at.RATIO, 0])
         high = np.float32(min(tables.of_frac[at.RATIO, tables.of_frac.shape[1] - 1], 1e9))
-        total = 0.0
-        for f in range(tables.of_frac.shape[1]):
-            total += tables.of_frac[at.PRIOR_FRAC, f]
-        log_above = 2.0 * np.log(total)
+        log_above = _log_prior_above(tables)
     none = np.float32(0)
     zero = np.float32(tables.log_zero if tables.zero_frac == 1 else -1e30)
     rows = work.rows
@@ -312,7 +318,7 @@ def draw_nodes(value, like, less, of_redshift, index):
 
 
 @njit(**KERNEL)
-def draw_agn(tables, target, part, first, pairs, uniform, weights, index):
+def draw_agn(tables, target, part, first, pairs, uniform, weights, index, log_weight):
     """
     Draw AGN models and fractions of galaxies that were drawn.
 
@@ -332,8 +338,17 @@ def draw_agn(tables, target, part, first, pairs, uniform, weights, index):
         Scratch.
     index : `~numpy.ndarray` of int, shape (n, 4)
         Gets redshift, galaxy, AGN model (-1: none) and fraction.
+    log_weight : `~numpy.ndarray`, shape (n,)
+        Gets ln of the sum over AGN models and fractions, over the one value that `scan_nodes` has in its place.
     """
     n_frac = tables.of_frac.shape[1]
+    log_above = 0.0
+    least_ratio = 0.0
+    most_ratio = 0.0
+    if n_frac > 0:
+        log_above = _log_prior_above(tables)
+        least_ratio = 0.0 if tables.zero_frac == 1 else tables.of_frac[at.RATIO, 0]
+        most_ratio = min(tables.of_frac[at.RATIO, n_frac - 1], 1e9)
     n_agn = tables.agn.shape[1] if n_frac > 0 else 0
     n_options = 1 + n_agn * n_frac
     for i in range(len(pairs)):
@@ -349,6 +364,7 @@ def draw_agn(tables, target, part, first, pairs, uniform, weights, index):
         weights[0] = -1e300
         if tables.zero_frac == 1:
             weights[0] = part * max(p, 0.0) ** 2 / q + tables.log_zero
+        scanned = weights[0]
         dust = tables.of_galaxy[at.DUST, g]
         for k in range(n_agn):
             agn = tables.agn[first + z, k]
@@ -360,6 +376,11 @@ def draw_agn(tables, target, part, first, pairs, uniform, weights, index):
                 a += wa * target.flux[j]
                 b += wa * agn[j]
                 t += wa * galaxy[j]
+            least_x = least_ratio * dust
+            most_x = most_ratio * dust
+            x, r = best_mixture(p, q, t, a, b, least_x, most_x, at.NO_LIGHT)
+            if x > 0.0:
+                scanned = max(scanned, part * r + tables.of_agn[at.LOG_AGN, k] + log_above)
             for f in range(n_frac):
                 x = tables.of_frac[at.RATIO, f] * dust
                 r = max(p + x * a, 0.0) ** 2 / max(q + x * (2.0 * t + x * b), at.NO_LIGHT)
@@ -375,6 +396,7 @@ def draw_agn(tables, target, part, first, pairs, uniform, weights, index):
         for m in range(n_options):
             weights[m] = exponential(max(0.5 * (weights[m] - top), -700.0))
             total += weights[m]
+        log_weight[i] = 0.5 * (top - scanned) + np.log(total)
         chosen = 0
         reached = weights[0]
         while reached < uniform[i] * total and chosen + 1 < n_options:

@@ -10,6 +10,7 @@ from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting.catalogs.streaming import row_pieces
 from miricigale.fitting.data.likelihood import PhotometryReader, flux_columns
 from miricigale.fitting.data.template_error import TemplateError, pivots
+from miricigale.fitting.grid.node_fluxes import flux_moments
 from miricigale.fitting.posterior.priors import known_redshifts
 from miricigale.fitting.results.pulls import without_warnings
 from miricigale.fitting.survey.band_errors import (
@@ -286,10 +287,12 @@ def calibrate_sample(fitter, sample, *, name, density_nodes=None, executor=None)
         options["redshift_prior"] = (density_nodes, sample.density)
     predicting = on_nodes(fitter).replace(filters=sample.predicting, outliers=None)
     data = sample.photometry()
+    table = sample.table
     for _ in range(_TURNS):
         with without_warnings():
-            results = with_errors_of(predicting, calibration).fit(sample.table, **options)
-        errors = measure_bands(results, data, sample.bands, calibration.template_error)
+            moments = flux_moments(with_errors_of(predicting, calibration), table, **options)
+        error = calibration.template_error
+        errors = measure_bands(moments, moments.redshift, data, sample.bands, error)
         calibration = first.with_band_errors(errors)
     return calibration
 

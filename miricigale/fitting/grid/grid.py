@@ -40,8 +40,9 @@ _AXES = declared("miricigale.fitting", "columns.toml")["arrays"]
 #: asked for, by two of the letters z, g, k and f.
 GridOutput = namedtuple("GridOutput", list(_AXES) + ["joint"])
 #: What the posterior between nodes begins with: draws on the nodes, redshift, galaxy, AGN model and fraction,
-#: shape (n_draws, 4); the posterior of redshift and AGN fraction, (nz, nf); whether both are of larger errors.
-Start = namedtuple("Start", "index zf larger_errors")
+#: shape (n_draws, 4); the posterior of redshift and AGN fraction, (nz, nf); whether both are of larger errors; and
+#: ln of the weights that draws of another density need, (n_draws,), else None.
+Start = namedtuple("Start", "index zf larger_errors log_weight", defaults=(None,))
 #: What a fit says of an object: its row; `Target` and `Limits` (or None); 2 ln(prior) of galaxies, (nz, nG), or
 #: None where it is that of all objects; if bands may be wrong its data with stated errors, these errors and the
 #: broad ones, (nb,), else None; its `Start`; ln of the factor that keeps the sum of the priors with those of mass;

@@ -152,7 +152,7 @@ class NodeScan(Frozen):
         weights = np.empty(
             1 + self.engine.tables.agn.shape[1] * self.engine.tables.of_frac.shape[1]
         )
-        on_best = (pair, np.full(1, -1.0), weights, index)
+        on_best = (pair, np.full(1, -1.0), weights, index, np.empty(1))
         _core.draw_agn(self.engine.tables, target, 1.0, scan.first, *on_best)
         chi2 = self._chi2(scan, index[0])
         excess = chi2 / np.count_nonzero(scan.stated.weight[0])
@@ -163,7 +163,8 @@ class NodeScan(Frozen):
         pairs = np.empty((self.n_draws, 2), np.int64)
         _core.draw_nodes(value, like, less, of_redshift, pairs)
         index = np.empty((self.n_draws, 4), np.int64)
-        drawn = (pairs, self._uniform, weights, index)
+        log_weight = np.empty(self.n_draws)
+        drawn = (pairs, self._uniform, weights, index, log_weight)
         _core.draw_agn(self.engine.tables, target, 1.0 - less, scan.first, *drawn)
         prior = 0.5 * (target.log_prior - target.level)
         log_norm = 0.0
@@ -176,7 +177,7 @@ class NodeScan(Frozen):
         zero = 0.0
         if scan.wrong is None:
             zero = -0.5 * target.top
-        start = Start(index, of_redshift[:, None], less > 0.0)
+        start = Start(index, of_redshift[:, None], less > 0.0, log_weight)
         return ObjectOnNodes(scan.row, target, None, None, scan.wrong, start, log_norm, zero)
 
     def _chi2(self, scan, index):

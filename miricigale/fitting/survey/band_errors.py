@@ -170,7 +170,7 @@ def left_out_predictions(results):
 
     Parameters
     ----------
-    results : `~miricigale.fitting.FitResults`
+    results : `~miricigale.fitting.FitResults` or `~miricigale.fitting.grid.node_fluxes.FluxMoments`
         A fit.
 
     Returns
@@ -402,7 +402,7 @@ def prior_errors(band):
     )
 
 
-def measure_bands(results, data, bands, template_error):
+def measure_bands(results, redshift, data, bands, template_error):
     """
     Measure the errors of all bands from one fit without those of `long_instruments`.
 
@@ -410,8 +410,10 @@ def measure_bands(results, data, bands, template_error):
 
     Parameters
     ----------
-    results : `~miricigale.fitting.FitResults`
+    results : `~miricigale.fitting.FitResults` or `~miricigale.fitting.grid.node_fluxes.FluxMoments`
         Fit of the catalog, or of a part of it, at known or free redshifts, without the bands of long instruments.
+    redshift : `~numpy.ndarray`, shape (n,)
+        Its redshifts, which rest wavelengths are of.
     data : `~miricigale.fitting.data.likelihood.FitData`
         The same objects, with the columns ``bands``, without zero points.
     bands : list of str
@@ -426,7 +428,6 @@ def measure_bands(results, data, bands, template_error):
     """
     # each band is compared with what the others predict, at the redshift of the fit
     predicted, predicted_std = left_out_predictions(results)
-    redshift = results.mean("redshift").value
     measured = data.measured
     samples = {}
     for i, band in enumerate(bands):

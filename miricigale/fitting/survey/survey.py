@@ -446,7 +446,7 @@ def _measure(fitter, table, z, name, reference, priors, options):
         if turn > 0:
             if long:
                 fit = current_fitter.replace(filters=predicting).fit(table, **options)
-            errors = measure_bands(fit, data, bands, error)
+            errors = measure_bands(fit, fit.mean("redshift").value, data, bands, error)
             if reference is not None:
                 errors = relative_zero_points(errors, reference)
         current_fitter = with_calibration(fitter, current(error))
