@@ -1,15 +1,19 @@
 """Tables of rows that Arrow holds, as parquet files have them."""
 
 import io
+import json
+import re
 
+import numpy as np
 from astropy.table import Column, MaskedColumn, QTable, Table
 
 from miricigale.utils.column_units import in_units, silent_units
 from miricigale.utils.exceptions import CatalogWarning, warn
+from miricigale.utils.ids import is_id_name
 from miricigale.utils.optional_packages import require
 
 
-def arrow_table(rows, cls=QTable, *, where=None):
+def arrow_table(rows, cls=QTable, *, where=None, start=0, index_id=None):
     """
     Make a table of rows of a parquet file, as astropy does, with its units.
 
@@ -21,12 +25,17 @@ def arrow_table(rows, cls=QTable, *, where=None):
         Class of the table.
     where : str, optional
         Name of the file, for a warning about columns that are left out; none without it.
+    start : int, optional
+        Number of the first of these rows in the file.
+    index_id : str, optional
+        Column of an index of pandas that is ``id`` too (`index_of_ids`); by default that of these rows.
 
     Returns
     -------
     table : `~astropy.table.QTable`
         Missing numbers with a fraction are NaN, also those of columns without any value; other missing values are
-        masked. Columns of bytes, lists and structures are left out.
+        masked. Columns of bytes, lists and structures are left out. An index that pandas wrote is a column, and
+        ``id`` where `~miricigale.utils.frames.frame_columns` makes it so.
 
     Warns
     -----
@@ -34,7 +43,9 @@ def arrow_table(rows, cls=QTable, *, where=None):
         Of the columns that are left out.
     """
     pyarrow = require("pyarrow", extra="parquet")
-    rows = _plain_columns(rows, where)
+    if index_id is None:
+        index_id = index_of_ids(rows.schema, lambda name: rows.column(name))
+    rows = _plain_columns(_with_index(rows, start, index_id), where)
     metadata = dict(rows.schema.metadata or {})
     missing = {}
     for i, field in enumerate(rows.schema):
@@ -58,6 +69,69 @@ def arrow_table(rows, cls=QTable, *, where=None):
         if name in table.colnames and isinstance(table[name], Column):
             table[name] = MaskedColumn(table[name], mask=mask)
     return in_units(table, cls)
+
+
+def index_of_ids(schema, column):
+    """
+    Return the column of an index of pandas that holds ids under another name, as in frames in memory.
+
+    Parameters
+    ----------
+    schema : `pyarrow.Schema`
+        With the metadata that pandas wrote.
+    column : callable
+        Gives all values of a column by its name, a `pyarrow.ChunkedArray`.
+
+    Returns
+    -------
+    name : str
+        Empty if there is none: the only level of an index, without a name or of distinct whole numbers or texts,
+        in a file none of whose columns is called as ids are.
+    """
+    levels = _index_levels(schema)
+    if len(levels) != 1 or any(map(is_id_name, schema.names)):
+        return ""
+    level = levels[0]
+    if isinstance(level, dict):
+        name = level["name"]
+        counts = name is None and level["start"] == 0 and level["step"] == 1
+        return "" if counts or (name is not None and is_id_name(name)) else name or "id"
+    if level not in schema.names:
+        return ""
+    if re.fullmatch(_UNNAMED, level):
+        return level
+    types = require("pyarrow", extra="parquet").types
+    kind = schema.field(level).type
+    values = column(level)
+    of_ids = types.is_integer(kind) or types.is_string(kind) or types.is_large_string(kind)
+    distinct = of_ids and not values.null_count and len(values.unique()) == len(values)
+    return level if distinct else ""
+
+
+#: What pandas calls the column of an index without a name.
+_UNNAMED = r"__index_level_\d+__"
+
+
+def _index_levels(schema):
+    """Levels of an index of pandas: names of columns, and dicts of those that count from a start by a step."""
+    metadata = (schema.metadata or {}).get(b"pandas")
+    return json.loads(metadata).get("index_columns", []) if metadata else []
+
+
+def _with_index(rows, start, index_id):
+    """Rows with an index that counts, which pandas writes in the header alone, as a column, and with ids of it."""
+    pyarrow = require("pyarrow", extra="parquet")
+    for level in _index_levels(rows.schema):
+        if not isinstance(level, dict):
+            continue
+        name = level["name"] or index_id
+        if name and name not in rows.schema.names:
+            # of pieces too
+            numbers = level["start"] + level["step"] * np.arange(start, start + len(rows))
+            rows = rows.append_column(name, pyarrow.array(numbers))
+    if index_id and index_id != "id":
+        rows = rows.append_column("id", rows.column(index_id))
+    return rows
 
 
 def _plain_columns(rows, place):

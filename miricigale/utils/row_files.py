@@ -11,7 +11,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from miricigale.utils.arrow_tables import arrow_table
+from miricigale.utils.arrow_tables import arrow_table, index_of_ids
 from miricigale.utils.column_units import in_units, silent_units
 from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
@@ -200,10 +200,16 @@ class _ParquetRows(RowFile):
             self._file = parquet.ParquetFile(path, buffer_size=1 << 20)
             self.n_rows = self._file.metadata.num_rows
             check_names_differ(self._file.schema_arrow.names)
+            # of all rows, for a piece does not know whether its ids are distinct
+            self._index_id = index_of_ids(self._file.schema_arrow, self._whole_column)
             self._begin()
-            self.colnames = tuple(arrow_table(self._take(0), where=path.name).colnames)
+            table = arrow_table(self._take(0), where=path.name, index_id=self._index_id)
+            self.colnames = tuple(table.colnames)
         except (OSError, ValueError, NotImplementedError) as err:
             raise unreadable(path, "a catalog", err) from err
+
+    def _whole_column(self, name):
+        return self._file.read(columns=[name]).column(name)
 
     def _begin(self):
         self._batches = self._file.iter_batches(self.chunk_rows)
@@ -226,9 +232,9 @@ class _ParquetRows(RowFile):
                 self._begin()
             while self._at < rows.start:
                 self._take(min(self.chunk_rows, rows.start - self._at))
-            return in_units(
-                arrow_table(self._take(rows.stop - rows.start), Table), QTable, self._id_names
-            )
+            piece = self._take(rows.stop - rows.start)
+            table = arrow_table(piece, Table, start=rows.start, index_id=self._index_id)
+            return in_units(table, QTable, self._id_names)
 
 
 def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.table import MaskedColumn, QTable, Table
+from astropy.table import MaskedColumn, QTable, Table, vstack
 from astropy.utils.masked import Masked
 from numpy.testing import assert_array_equal
 
@@ -224,6 +224,39 @@ def test_frames_of_arrow_are_exact_and_name_what_they_lose():
     refuses("1 masked or empty, the first in row 1", read_ids, table)
     assert np.isnan(table["f"][1])
     assert np.isnan(table["none"]).all()
+
+
+@pytest.mark.parametrize("form", ["file", "pieces", "arrow"])
+def test_an_index_of_pandas_is_the_same_from_parquet_as_in_memory(tmp_path, form):
+    """What counts from a start stands in the header alone: pandas 3 makes it of any ids with equal steps."""
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    indices = {
+        "regular": pandas.RangeIndex(1001, 1005, name="object_id"),
+        "regular without a name": pandas.RangeIndex(7, 15, 2),
+        "regular of another name": pandas.RangeIndex(7, 11, name="gal"),
+        "count of rows": pandas.RangeIndex(4),
+        "numbers": pandas.Index([5, 9, 2, 7]),
+        "text": pandas.Index(["0007", "07", "a", "b"], name="gal"),
+        "repeated": pandas.Index([5, 5, 2, 7], name="field"),
+        "exact": pandas.Index([LARGE[1], LARGE[2], 3, 4], name="TARGETID"),
+        "levels": pandas.MultiIndex.from_arrays([[1, 1, 2, 2], [5, 6, 7, 8]], names=["t", "id"]),
+    }
+    for label, index in indices.items():
+        frame = pandas.DataFrame({"f": [1.0, 2.0, 3.0, 4.0]}, index=index)
+        path = tmp_path / "a.parquet"
+        frame.to_parquet(path)
+        if form == "arrow":
+            table = as_table(pytest.importorskip("pyarrow").Table.from_pandas(frame), "x")
+        elif form == "file":
+            table = read_table(path, wanted="a table")
+        else:
+            rows = open_rows(path, 3)
+            table = vstack([rows.chunk(0), rows.chunk(1)])
+        expected = as_table(frame, "x")
+        assert id_column(table.colnames, "x") == id_column(expected.colnames, "x"), label
+        for name in expected.colnames:
+            assert table[name].tolist() == expected[name].tolist(), label
 
 
 def test_ids_that_occur_twice_are_warned_of_with_the_first_three():
