@@ -6,6 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.evaluation import agn_fraction
+from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
@@ -99,7 +100,7 @@ def add_light(photometry, light, *, curves, seed):
         columns += [band, error_column(band)]
     require_columns(photometry, ["id"] + columns, "photometry", units=dict.fromkeys(columns, FNU))
     seed = check_seed(seed)
-    table = QTable(photometry, copy=True)
+    table = quantity_table(photometry, copy=True)
     ids = read_ids(table)
     for band, agn_flux in light.items():
         agn_flux = to_array(agn_flux, FNU, "light", ndim=1)

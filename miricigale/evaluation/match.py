@@ -3,10 +3,10 @@
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.table import QTable, Table
+from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.ids import ids_and_missing
+from miricigale.utils.ids import id_column, ids_and_missing
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import at_epoch
 from miricigale.utils.tables import (
@@ -57,7 +57,7 @@ def associate(first, second, *, radius):
     Parameters
     ----------
     first, second : `~astropy.coordinates.SkyCoord` or `~astropy.table.QTable`
-        Positions, or tables with ``sky`` and, if there is, ``id``.
+        Positions, or tables with ``sky`` and, if there are any, ids (`miricigale.utils.ids`).
     radius : `~astropy.units.Quantity`
         Largest separation.
 
@@ -116,8 +116,9 @@ def associate(first, second, *, radius):
         catalog = (first, second)[k]
         has_row = rows[k] >= 0
         columns[name] = (rows[k], f"Row of the {name} catalog, -1 for none")
-        if isinstance(catalog, Table) and "id" in catalog.colnames:
-            values, missing = ids_and_missing(catalog["id"], name)
+        id_name = id_column(getattr(catalog, "colnames", ()), name)
+        if id_name is not None:
+            values, missing = ids_and_missing(catalog[id_name], name)
             values = np.append(values, np.zeros(1, values.dtype))[rows[k]]
             missing = np.append(missing, True)[rows[k]]
             ids[f"{name}_id"] = (np.ma.MaskedArray(values, mask=missing | ~has_row), None)
@@ -256,11 +257,12 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     check_that(not isinstance(bands, str), "bands", "a list of filter names", repr(bands))
     bands = list(bands)
     units = dict.fromkeys([c for band in bands for c in (band, error_column(band))], FNU)
-    require_columns(truth, ["id", "sky"] + list(bands), "truth", units=dict.fromkeys(bands, FNU))
-    require_columns(measured, ["id", "sky"], "measured", units=units)
+    require_columns(truth, ["sky"] + bands, "truth", units=dict.fromkeys(bands, FNU))
+    require_columns(measured, ["sky"], "measured", units=units)
+    true_ids = read_ids(truth, "truth")
     index, separation = match_sky(measured["sky"], truth["sky"], radius=radius)
     matched = index >= 0
-    table = QTable({"id": truth["id"], "sky": truth["sky"]})
+    table = QTable({"id": true_ids, "sky": truth["sky"]})
     ids = read_ids(measured, "measured")
     if len(measured):
         table["measured_id"] = np.where(matched, ids[index], -1)

@@ -11,6 +11,7 @@ from miricigale.filters.band_names import find_filter, name_and_unit
 from miricigale.filters.catalog_files import catalog_messages
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
+from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, units_error, warn
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing_values import floats
@@ -30,6 +31,7 @@ _MAGNITUDE = re.compile(
     r"(?:(?:e|err|error|sigma|d)_)?(?:mag|m)_?(?:err|error)?_|.*_mag(?:_?err(?:or)?)?$|(?:ab)?mag(?:nitude)?$",
     re.IGNORECASE,
 )
+
 # columns that are the only band asked for
 _ALONE = ("flux", "flux_density", "fnu", "f_nu", "mag", "magnitude", "abmag")
 # after the name of a band: whether its flux is an upper limit
@@ -103,7 +105,7 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
         return table
     back = {theirs: ours for ours, theirs in names.items()}
     with silent_units():
-        out = QTable(table, copy=False)
+        out = quantity_table(table, copy=False)
         if back:
             out = QTable({back.get(name, name): out[name] for name in table.colnames}, copy=False)
     out.meta = table.meta

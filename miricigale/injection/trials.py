@@ -18,6 +18,7 @@ from miricigale.injection.population import (
 from miricigale.instrument.image import Image
 from miricigale.photometry import ForcedFlags, detect_sources
 from miricigale.photometry.images.arrays import nearest_values, pixel_scale
+from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
@@ -222,7 +223,7 @@ def injected_sources(injection, catalog, base, usable, wcs, number):
         rows = on_image[((number - 1) * n + np.arange(n)) % len(on_image)]
         # a source is injected once at a time
         rows = rows[: len(on_image)]
-        sources = QTable(catalog[rows], copy=True)
+        sources = quantity_table(catalog[rows], copy=True)
         _fill_prior_fluxes(sources, base, rng)
     else:
         limit = base.facts["limit"]

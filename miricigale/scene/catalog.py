@@ -7,6 +7,7 @@ from astropy.table import QTable, Table
 from miricigale.filters.photometry_table import as_photometry
 from miricigale.filters.surveys import flux_bands, is_band
 from miricigale.profiles import SERSIC_INDEX_RANGE
+from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.ids import id_column, likely_ids
 from miricigale.utils.missing_values import plain_floats, without_codes
@@ -163,7 +164,7 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
       2        5.0   point    16
     """
     check_that(isinstance(table, Table), argument, "a table", type(table).__name__)
-    catalog = QTable(table, copy=True)
+    catalog = quantity_table(table, copy=True)
     check_that(len(catalog), argument, "a table with rows", "none")
     ids = id_column(catalog.colnames, argument)
     if ids is None:

@@ -12,6 +12,7 @@ from miricigale.sed.chain import SIX, SKY, STELLAR, distinct
 from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.caching import cached
+from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn
 from miricigale.utils.named_values import convert_values, rows_of
 from miricigale.utils.options import check_that
@@ -341,7 +342,7 @@ class _Blocks:
 
 def flux_table(model, table, filters):
     """Fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
-    table = by_our_names(QTable(as_table(table, "table"), copy=False))
+    table = by_our_names(quantity_table(as_table(table, "table"), copy=False))
     _warn_of_slips(model, table.colnames)
     n = len(table)
     names = model.derived_columns()

@@ -4,7 +4,7 @@ import contextlib
 import warnings
 
 import numpy as np
-from astropy.table import Column, QTable
+from astropy.table import Column, QTable, Table
 from astropy.units import UnitsWarning, UnrecognizedUnit
 from astropy.utils.exceptions import AstropyUserWarning, AstropyWarning
 
@@ -58,6 +58,27 @@ def in_units(table, cls=QTable, id_names=()):
             column.unit = flux_unit(column.unit) or column.unit
     with silent_units():
         return cls(table, copy=False)
+
+
+def quantity_table(table, *, copy):
+    """
+    Return a table of a user with quantities for columns, whose whole ids stay so whatever their unit.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The table, which stays as it is.
+    copy : bool
+        Whether its values are copied.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+    """
+    if isinstance(table, QTable):
+        return QTable(table, copy=copy)
+    # astropy would make floats of integers with a unit
+    return in_units(Table(table, copy=copy))
 
 
 def _largest(column):

@@ -10,7 +10,7 @@ from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.frames import as_column, frame_columns, is_frame
-from miricigale.utils.ids import ids_and_missing
+from miricigale.utils.ids import id_column, ids_and_missing
 from miricigale.utils.options import check_least, check_that
 from miricigale.utils.units import ANGLE, flux_unit, to_array
 
@@ -255,12 +255,15 @@ def read_ids(table, argument="photometry"):
     """
     Ids of a catalog: integers, or text whether it came as such or as bytes (`miricigale.utils.ids`).
 
-    ``argument`` is what the table is called in messages. A `ValueError` names ids that are masked or
-    empty, for their objects could not be distinguished, numbers among text, several in a row, bytes that are
-    not UTF-8, and floats that are not exact.
+    Their column is that of `~miricigale.utils.ids.id_column`. ``argument`` is its name in messages.
+    A `ValueError` names ids that are masked or empty, for their objects could not be distinguished, numbers among
+    text, several in a row, bytes that are not UTF-8, and floats that are not exact.
     """
-    require_columns(table, ["id"], argument)
-    return _whole_ids(table["id"], argument)
+    require_columns(table, [], argument)
+    name = id_column(table.colnames, argument)
+    if name is None:
+        require_columns(table, ["id"], argument)
+    return _whole_ids(table[name], argument)
 
 
 def _whole_ids(column, argument):

@@ -12,6 +12,11 @@ from astropy.utils.masked import Masked
 from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses, warned
+from miricigale.evaluation import associate, match_truth
+from miricigale.filters import as_photometry
+from miricigale.photometry import ErrorModel
+from miricigale.photometry.detection.prior_catalog import read_catalog
+from miricigale.scene import check_catalog
 from miricigale.utils.exceptions import CatalogWarning
 from miricigale.utils.ids import counted_ids, id_column, ids_of_text, warn_of_duplicates
 from miricigale.utils.region_files import write_circles
@@ -257,6 +262,48 @@ def test_an_index_of_pandas_is_the_same_from_parquet_as_in_memory(tmp_path, form
         assert id_column(table.colnames, "x") == id_column(expected.colnames, "x"), label
         for name in expected.colnames:
             assert table[name].tolist() == expected[name].tolist(), label
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_ids_with_a_unit_are_whole_in_tables_of_astropy_too(masked):
+    """A QTable of a Table would make floats of them: three sources would be one."""
+    table = Table({"NUMBER": LARGE, "redshift": [0.5, 0.6, 0.7]}, masked=masked)
+    table["NUMBER"].unit = "count"
+    table["miri.f770w"] = [1.0, 1.0, 1.0] * u.uJy
+    sky = {"ra": [53.1, 53.2, 53.3], "dec": [-27.8] * 3, "profile": ["point"] * 3}
+    errors = ErrorModel.from_depths({"miri.f770w": 26.0})
+    noisy = errors.perturb(table, seed=1)
+    placed = table.copy()
+    for name, values in sky.items():
+        placed[name] = values
+    tables = [
+        as_photometry(table, ["miri.f770w"]),
+        noisy,
+        read_catalog(placed),
+        check_catalog(placed),
+    ]
+    for one in tables:
+        assert read_ids(one).tolist() == LARGE
+    assert len(set(noisy["miri.f770w"].value.tolist())) == 3
+    assert table["NUMBER"].unit == u.ct
+
+
+def test_tables_are_joined_by_ids_of_any_name():
+    rng = np.random.default_rng(1)
+    flux = np.linspace(1.0, 60.0, 60)
+    truth = QTable({"NUMBER": np.arange(60), "miri.f770w": flux * u.uJy})
+    measured = QTable({"object_id": np.arange(60)[::-1]})
+    measured["miri.f770w"] = (flux + rng.normal(0.0, 0.1, 60))[::-1] * u.uJy
+    model = ErrorModel.from_tables(truth, measured, bin_size=20)
+    # by their rows the fluxes would differ by some 30 uJy
+    assert 0.05 < model.sigma(30 * u.uJy, "miri.f770w").value < 0.2
+    sky = SkyCoord(np.arange(60.0), 0.0, unit="deg")
+    truth["sky"] = sky
+    measured["sky"] = sky[::-1]
+    table = match_truth(truth, measured, ["miri.f770w"])
+    assert table["id"].tolist() == table["measured_id"].tolist() == list(range(60))
+    table = associate(truth, measured, radius=1 * u.arcsec)
+    assert table["first_id"].tolist() == table["second_id"].tolist()
 
 
 def test_ids_that_occur_twice_are_warned_of_with_the_first_three():

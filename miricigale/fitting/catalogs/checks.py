@@ -13,6 +13,7 @@ from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.posterior.posterior import randomized_ranks
 from miricigale.fitting.results.pulls import without_warnings
 from miricigale.fitting.survey.survey import bands_in_catalog
+from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
@@ -102,7 +103,7 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     in_fit = np.isfinite(results.sigma) & results.fitted[:, None] & np.isfinite(error)
     redrawn = in_fit & ~results.limit
     noisy_flux = results.best_flux + noise * error
-    mock = QTable(photometry, copy=True)
+    mock = quantity_table(photometry, copy=True)
     for name in filters:
         i = results.filters.index(name)
         point = fitter.zero_points.get(name, 1.0)
@@ -338,7 +339,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     check_that(not (empty and len(photometry)), "bands", "measured for one object at least", empty)
     results = {}
     for group in groups:
-        blank = QTable(photometry, copy=True)
+        blank = quantity_table(photometry, copy=True)
         for name in group:
             # a band without flux and limit takes no part in the fit
             blank[name] = np.full(len(blank), np.nan) * FNU

@@ -4,7 +4,6 @@ import itertools
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
@@ -17,6 +16,7 @@ from miricigale.fitting.survey.band_errors import (
     prior_of_band,
     select_fluxes,
 )
+from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import places
 from miricigale.utils.options import check_names, check_that
@@ -415,7 +415,7 @@ def apply_zero_points(photometry, zero_points):
     factors = dict(zip(names, values, strict=True))
     columns = flux_columns(factors)
     require_columns(photometry, columns, "photometry", units=dict.fromkeys(columns, FNU))
-    out = QTable(photometry, copy=True)
+    out = quantity_table(photometry, copy=True)
     for name, factor in factors.items():
         for column in flux_columns([name]):
             out[column] = out[column] * factor

@@ -8,6 +8,7 @@ import numpy as np
 from miricigale.instrument import epoch_of
 from miricigale.photometry.images.arrays import nearest_values, sky_to_pixels
 from miricigale.photometry.images.fits_images import open_map
+from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, data_error, warn
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.options import check_data, check_that
@@ -195,7 +196,7 @@ def read_catalog(catalog, wcs=None, epoch=None):
         name = f"catalog {catalog}"
     if isinstance(catalog, SkyCoord):
         catalog = QTable({"sky": catalog.reshape(-1)})
-    table = QTable(as_table(catalog, "catalog"), copy=False)
+    table = quantity_table(as_table(catalog, "catalog"), copy=False)
     table["sky"] = as_positions(table, name, wcs, missing=True, epoch=epoch, motions=True)
     if "id" not in table.colnames:
         # labels are the ids of files, and in tables those of segments

@@ -5,13 +5,14 @@ import itertools
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.filters import as_photometry
 from miricigale.filters.band_names import known_filter
+from miricigale.utils.column_units import quantity_table
+from miricigale.utils.ids import id_column
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
-from miricigale.utils.tables import described_columns, error_column, require_columns
+from miricigale.utils.tables import described_columns, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, to_array
 
 #: What turns the median of absolute values into a standard deviation.
@@ -161,10 +162,11 @@ def common_bands(truth, measured):
 
 
 def same_rows(truth, measured):
-    """Return the rows of two tables that belong to the same source, by ``id`` or by place."""
-    if "id" in truth.colnames and "id" in measured.colnames:
+    """Return the rows of two tables that belong to the same source, by their ids or by place."""
+    names = id_column(truth.colnames, "truth"), id_column(measured.colnames, "measured")
+    if None not in names:
         _, rows, measured_rows = np.intersect1d(
-            np.asarray(truth["id"]), np.asarray(measured["id"]), return_indices=True
+            read_ids(truth, "truth"), read_ids(measured, "measured"), return_indices=True
         )
         return rows, measured_rows
     wanted = f"a table of {len(truth)} rows as 'truth', or ids in both"
@@ -186,7 +188,7 @@ def flux_table(photometry, filters, model_bands):
     wanted = f"a table with at least one of the columns {list(model_bands)}"
     check_that(filters, "photometry", wanted, f"columns {photometry.colnames}")
     require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
-    table = QTable(photometry, copy=True)
+    table = quantity_table(photometry, copy=True)
     for name in filters:
         table[name] = to_array(table[name], FNU, name) * FNU
     return table, filters

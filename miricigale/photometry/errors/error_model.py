@@ -24,11 +24,12 @@ from miricigale.photometry.errors.error_curves import (
 )
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.file_formats import read_write
+from miricigale.utils.ids import id_column
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import error_column, require_columns
+from miricigale.utils.tables import error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, ab_quantity, to_array
 
 #: 5-sigma AB depths of 15 bands of CANDELS/EGS like the paper's (after Stefanon 2017 and FIDEL): the
@@ -77,10 +78,11 @@ def _band(name):
 
 
 def add_noise(photometry, name, sigma, seed):
-    """Add noise of known errors, shape (n,), to the fluxes of a band in place; draws belong to ``id`` or row."""
-    keys = np.arange(len(photometry))
-    if "id" in photometry.colnames:
-        keys = photometry["id"]
+    """Add noise of known errors, shape (n,), to the fluxes of a band in place; draws belong to ids or rows."""
+    if id_column(photometry.colnames, "photometry") is None:
+        keys = np.arange(len(photometry))
+    else:
+        keys = read_ids(photometry)
     noise = np.empty(len(keys))
     for k, key in enumerate(keys):
         noise[k] = stream(seed, "photometry", name, str(key)).standard_normal()
@@ -405,7 +407,7 @@ class ErrorModel(Interactive):
         Parameters
         ----------
         photometry : `~astropy.table.QTable`
-            True fluxes, columns by filter name. Draws belong to the ``id`` if there is one,
+            True fluxes, columns by filter name. Draws belong to the ids if there are any,
             otherwise to the row, so that a cut in the table does not change them.
         seed : int
             Seed.
