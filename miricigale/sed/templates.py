@@ -22,7 +22,7 @@ from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import FNU, WAVE
 
-_SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii")
+_SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii", ".spec")
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
 #: Parameters that a grid has itself.
 _OF_GRIDS = frozenset({"redshift", "mass", "frac_agn"})
@@ -44,7 +44,8 @@ def read_spectra(path):
         no unit, of the column or in the comments of a text, as in ``# wave(um) flux(uJy)``), or
         several of them in a column of vectors; all others are left alone. That is how STScI distributes the atlas
         of Pickles (1998). In its model atmospheres (Castelli & Kurucz, PHOENIX) each column
-        ``g00`` to ``g55`` is one of another surface gravity: all that have light are read.
+        ``g00`` to ``g55`` is one of another surface gravity: all that have light are read. Files ``.spec`` are
+        those of optically thick atmospheres of Liu et al. 2026 (arXiv:2603.02317).
 
     Returns
     -------

@@ -8,7 +8,16 @@ from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from miricigale.fitting.grid.interpolation import InterpolatedModels
-from miricigale.sed import SED, ModelGrid, SEDModel, red_dot, red_dot_axes, red_dots, template_grid
+from miricigale.sed import (
+    SED,
+    ModelGrid,
+    SEDModel,
+    read_spectra,
+    red_dot,
+    red_dot_axes,
+    red_dots,
+    template_grid,
+)
 
 #: A red dot of one part and no lines.
 ENVELOPE = {"uv_to_optical": 0.0, "halpha_width": 0.0 * u.AA, "balmer_depth": 0.0}
@@ -82,6 +91,64 @@ def test_the_galaxy_has_its_slope_and_share(slope):
     assert np.all(sed.fnu[sed.wave <= 0.0912 * u.um] == 0)
 
 
+def test_gas_absorbs_the_part_that_it_covers():
+    """Of optically very thick gas the light that it does not cover is left."""
+    plain = red_dot(**ENVELOPE)
+    sed = red_dot(**ENVELOPE | {"balmer_depth": 50.0, "covering": 0.7})
+    ratio = sed.fnu_at([0.3, 0.36, 0.4] * u.um) / plain.fnu_at([0.3, 0.36, 0.4] * u.um)
+    assert_allclose(ratio, [0.3, 0.3, 1.0], rtol=2e-3)
+
+
+def test_lines_have_the_ratios_that_are_asked_for():
+    sed = red_dot(**ENVELOPE | {"halpha_width": 1000.0 * u.AA, "balmer_decrement": 3.0})
+    ratio = flux_of_line(sed, 0.65646, 0.015) / flux_of_line(sed, 0.48627, 0.015)
+    assert ratio == pytest.approx(3.0, rel=0.01)
+    wide, none = (red_dot(**GALAXY | {"oiii_width": width * u.AA}) for width in (1600.0, 0.0))
+    galaxy = red_dot(**GALAXY)
+    lines = [
+        flux_of_line(SED(sed.wave, sed.fnu - none.fnu), 0.4984, 0.02) for sed in (wide, galaxy)
+    ]
+    assert lines[0] / lines[1] == pytest.approx(2.0, rel=1e-6)
+
+
+def test_an_atmosphere_takes_the_place_of_the_black_body(tmp_path):
+    """A library's file of Planck's law (Angstrom, F_lambda, 0.2 to 4 um) gives what the black body gives."""
+    wave = np.arange(2000.0, 40000.0, 2.0)
+    planck = BlackBody(4500 * u.K)(wave * u.AA).value / wave**2
+    # an absorption line that is finer than the spectrum, of 10 A
+    line = 1.0 - (np.abs(wave - 8500.0) < 5.0)
+    np.savetxt(tmp_path / "t4500g-300z-1v02.spec", np.column_stack([wave, planck * line]))
+    atmospheres = read_spectra(tmp_path)
+    assert list(atmospheres) == ["t4500g-300z-1v02"]
+    sed = red_dot(atmosphere=atmospheres["t4500g-300z-1v02"], uv_to_optical=0.0)
+    black = red_dot(temperature=4500 * u.K, balmer_depth=0.0, uv_to_optical=0.0)
+    at = [0.3, 0.5, 0.7, 1.0, 3.0] * u.um
+    assert_allclose(sed.fnu_at(at).value, black.fnu_at(at).value, rtol=3e-3)
+    # Rayleigh-Jeans beyond its end
+    far = sed.fnu_at([10, 20] * u.um).value
+    assert far[1] / far[0] == pytest.approx(0.25, rel=0.02)
+    near = np.abs(sed.wave.value - 0.85) < 0.02
+    missing = np.trapezoid((black.fnu - sed.fnu).value[near], sed.wave.value[near])
+    assert missing == pytest.approx(0.001 * black.fnu_at(0.85 * u.um).value, rel=0.1)
+    refuses("'temperature' must be left out", red_dot, atmosphere=sed, temperature=4000 * u.K)
+    refuses("'atmosphere' must be an SED", red_dot, atmosphere="t4500")
+
+
+def test_atmospheres_are_an_axis():
+    wave = np.geomspace(0.1, 40.0, 2000) * u.um
+    both = {f"{t}": SED(wave, BlackBody(t * u.K)(wave) * u.sr) for t in (4000, 5000)}
+    spectra = red_dots({"uv_to_optical": [0.1, 0.4]}, atmospheres=both)
+    grid = template_grid(spectra, BANDS, redshift=[4.0, 5.0])
+    assert grid.axes["atmosphere"].tolist() == [0.0, 1.0]
+    assert grid.axes["uv_to_optical"].tolist() == [0.1, 0.4]
+    axes = {"temperature": [5000.0], "uv_to_optical": [0.4], "balmer_depth": [0.0]}
+    black = template_grid(red_dots(axes), BANDS, redshift=[4.0, 5.0])
+    row = grid.meta["templates"].index("5000, uv_to_optical 0.4")
+    assert_allclose(grid.galaxy[:, row], black.galaxy[:, 0], rtol=5e-3)
+    refuses("'atmospheres' must be one or more spectra", red_dots, atmospheres={})
+    refuses("'temperature' must be left out", red_dots, {"temperature": [4e3]}, atmospheres=both)
+
+
 def test_hot_dust_adds_to_the_infrared():
     """F_nu at 3 um is a share of that of the envelope at 1 um; the optical is as without dust."""
     plain, dusty = (red_dot(**ENVELOPE, hot_dust=share) for share in (0.0, 0.5))
@@ -93,6 +160,7 @@ def test_hot_dust_adds_to_the_infrared():
 def test_parameters_that_cannot_be_are_refused():
     refuses("'temperature' must be at least 1000 K, got 10", red_dot, temperature=10 * u.K)
     refuses("'hot_dust' must be at least 0, got -1", red_dot, hot_dust=-1)
+    refuses("'covering' must be 0 to 1, got 1.2", red_dot, covering=1.2)
     refuses("uv_slope", red_dot, uv_slope=np.nan)
     refuses("temperature", red_dot, temperature=4000, error=u.UnitsError)
     refuses("parameter of a red dot", red_dot, age=1, error=KeyError)
