@@ -19,6 +19,7 @@ from miricigale.psf import (
     read_psf,
     rotate_psf,
 )
+from miricigale.psf.resample import centered_psf
 from miricigale.utils.exceptions import DataError
 
 
@@ -212,3 +213,16 @@ MANY = [
 @pytest.mark.parametrize(("function", "args", "options", "match"), MANY)
 def test_what_makes_no_psf_is_named(function, args, options, match):
     refuses(match, function, *args, **options)
+
+
+@pytest.mark.parametrize("part", [0.4, 0.6])
+def test_a_core_is_brought_to_the_origin_from_less_than_half_way_to_the_edge(part):
+    # 60 cells of a quarter pixel to the edge, 1.65 arcsec
+    shift = 60 * part / 4
+    psf = psf_of(lambda x, y: np.exp(-0.5 * ((x - shift) ** 2 + y**2)), n=121)
+    if part > 0.5:
+        refuses("core stands near its center", centered_psf, psf, 0.01)
+        return
+    centered, offset = centered_psf(psf, 0.01)
+    assert_allclose(offset, (shift * 0.11, 0.0), atol=1e-3)
+    assert_allclose(centered.origin, (60 + 4 * shift, 60), atol=0.01)
