@@ -1,5 +1,7 @@
 """Effects at the amplitudes of flight: where charge goes, and what is published of it."""
 
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -83,6 +85,22 @@ def test_the_deficit_is_the_published_one(make_exposure, make_sky):
         assert less[:, 100:].mean() == pytest.approx(-lost * level, rel=0.02)
         assert not less[:, :100].any()
     refuses("'saturated' must be of shape", Latent, latent.rate, 1 * u.s, "SUB128", np.ones(3))
+
+
+def test_the_mean_rate_after_saturation_is_that_of_the_groups(make_block):
+    block = make_block(n_groups=20)
+    saturated = np.zeros(block.exposure.shape, bool)
+    saturated[:, 40:] = True
+    rate = np.zeros(block.exposure.shape) * u.electron / u.s
+    latent = Latent(rate, 10 * u.s, block.exposure.subarray, saturated)
+    block = dataclasses.replace(block, previous=(latent,))
+    effect = Persistence((0,), (1,), deficit=0.0184)
+    # charge of each group before it is summed up
+    charge = np.full((1, 20, *block.exposure.shape), 5.0 * block.group_time, np.float32)
+    mean = effect.apply(charge, block).mean(axis=(0, 1)) / block.group_time
+    expected = effect.expected(np.full(block.exposure.shape, 5.0), block)
+    assert_allclose(expected, mean, rtol=1e-5)
+    assert (expected[:, 40:] < 5.0 * (1 - 0.018)).all()
 
 
 def test_flight_is_a_set_that_others_replace():

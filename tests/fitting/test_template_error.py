@@ -130,6 +130,16 @@ def test_errors_of_models_and_of_bands_are_each_counted_once():
     refuses(text, measure_template_error, fit, model_error=other)
 
 
+def test_zero_points_multiply_fluxes_and_errors_once_more_each_time():
+    table = QTable({"id": [1], "miri.f770w": [2.0] * u.uJy, "miri.f770w_err": [0.1] * u.uJy})
+    points = QTable({"band": ["miri.f770w"], "factor": [1.25]})
+    twice = apply_zero_points(apply_zero_points(table, points), points)
+    assert_allclose(twice["miri.f770w"].value, [2.0 * 1.25**2])
+    assert_allclose(twice["miri.f770w_err"].value, [0.1 * 1.25**2])
+    assert_allclose(twice.meta["zero_points"]["miri.f770w"], 1.25**2)
+    assert table["miri.f770w"].value == [2.0]
+
+
 @pytest.mark.parametrize("interpolate", [0, 600])
 def test_errors_of_zero_points_know_what_models_take_up(interpolate):
     """Factors of photometry without any are 1 within their errors, though models follow the fluxes."""
