@@ -10,7 +10,8 @@ from scipy.stats import multivariate_normal, multivariate_t, qmc
 
 from helpers.grids import photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, _core
-from miricigale.fitting.grid.adaptive import quasi_random, redshift_peaks
+from miricigale.fitting.grid.peaks import redshift_peaks
+from miricigale.fitting.grid.points import quasi_random
 from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, draws_summary
 from miricigale.sed import ModelGrid
 

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.fitting import BayesFitter, GridSettings, MassFunction
-from miricigale.fitting.grid.adaptive import thinned
 from miricigale.fitting.grid.node_scan import NodeScan
+from miricigale.fitting.grid.placed_models import thinned
 from miricigale.sed import SEDModel
 
 BANDS = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "miri.f770w"]

@@ -45,7 +45,7 @@ ARGUMENTS = {
     "sed.components.attenuation._exponents": (WAVE, "calzetti"),
     "sed.components.agn._polar_grid": (WAVE, "smc"),
     "sed.foreground._table": ("G23", 3.1),
-    "fitting.grid.adaptive.quasi_random": (3, 6, 1),
+    "fitting.grid.points.quasi_random": (3, 6, 1),
     "fitting.grid.labels.places_in_cells": (3, 64),
     "fitting.survey.defaults._survey_calibration": (("miri.f770w",),),
     "fitting.posterior.priors._declared": (("delayed",), "f_burst", "absent_at_zero"),

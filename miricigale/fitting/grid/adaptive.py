@@ -12,14 +12,13 @@ objects: nothing depends on the id or place of an object in its catalog.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri, ndtri
-from scipy.stats import qmc
 
 from miricigale.fitting import _core
 from miricigale.fitting.grid.labels import labels_of_ranges
 from miricigale.fitting.grid.moves import move_places, systematic
+from miricigale.fitting.grid.placed_models import PlacedModels, places_to_values, thinned
+from miricigale.fitting.grid.points import quasi_random
 from miricigale.fitting.grid.proposals import MIN_WEIGHT, Places, fit_mixture
-from miricigale.utils.caching import cached
 
 #: Number of places in a round.
 ROUND_SIZE = 512
@@ -57,8 +56,6 @@ _MIN_FITTED_PLACES = 20
 _GUARD = 0.05
 #: Smallest share of each peak of the nodes.
 _MIN_PEAK_SHARE = 0.05
-#: Weight of a node's redshift, over the largest, below which there is a gap between peaks.
-_GAP = 2e-3
 #: Weight of a peak that counts.
 _PEAK = 0.005
 #: Effective number of points that the weights of a peak are flattened to for a fit, for each round so far.
@@ -82,97 +79,6 @@ _MAX_MODELS = 1536
 _HOPELESS = 0.5
 #: Number of places after which that is judged.
 _HOPELESS_TRIAL = 4096
-#: Distance that uniform numbers keep from 0 and 1.
-_END = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedModels:
-    """
-    Models between nodes with the weights of a posterior.
-
-    Parameters
-    ----------
-    place : `~numpy.ndarray`, shape (n, n_axes)
-        Places in the unit intervals of `~miricigale.fitting._core.Space`.
-    weight : `~numpy.ndarray`, shape (n,)
-        Weights; they sum to 1.
-    scale, variance, power : `~numpy.ndarray`, shape (n,)
-        Best scales and their variances, and AGN power for each solar mass formed.
-    log_likelihood : `~numpy.ndarray`, shape (n,)
-        Ln of the likelihoods, but for a constant.
-    uniform : `~numpy.ndarray`, shape (n,)
-        Quasi-random numbers for the scales' own errors.
-    log_evidence : float
-        Ln of the mean likelihood over the priors, but for the constant of the likelihoods.
-    converged : bool
-        Whether the effective number is what was asked for.
-    """
-
-    place: np.ndarray
-    weight: np.ndarray
-    scale: np.ndarray
-    variance: np.ndarray
-    power: np.ndarray
-    log_likelihood: np.ndarray
-    uniform: np.ndarray
-    log_evidence: float
-    converged: bool
-
-
-@cached(maxsize=8)
-def quasi_random(n_axes, log2_n, scramble):
-    """
-    Make the Sobol points of all objects.
-
-    Parameters
-    ----------
-    n_axes, log2_n : int
-        Axes of the space, and base-2 logarithm of the number n of points.
-    scramble : int
-        Seed of the scrambling.
-
-    Returns
-    -------
-    choice, uniform : `~numpy.ndarray`, shape (n,)
-        Uniform numbers, which choose a part of a mixture and the error of a scale.
-    normal : `~numpy.ndarray`, shape (n, n_axes)
-        Standard normal numbers.
-    spread : `~numpy.ndarray`, shape (n,)
-        What makes normal numbers those of a t distribution.
-    """
-    points = qmc.Sobol(n_axes + 3, seed=scramble).random_base2(log2_n)
-    points = np.clip(points, _END, 1.0 - _END)
-    normal = np.ascontiguousarray(ndtri(points[:, 3:]))
-    spread = np.sqrt(_core.FREEDOM / chdtri(_core.FREEDOM, points[:, 1]))
-    return points[:, 0].copy(), points[:, 2].copy(), normal, spread
-
-
-def redshift_peaks(redshift, posterior):
-    """
-    Find the peaks of a posterior on nodes of redshift, which nodes of hardly any weight separate.
-
-    Parameters
-    ----------
-    redshift, posterior : `~numpy.ndarray`, shape (nz,)
-        Nodes and their weights, which sum to 1.
-
-    Returns
-    -------
-    borders : `~numpy.ndarray`, shape (n_peaks - 1,)
-        Redshifts between them.
-    weights : `~numpy.ndarray`, shape (n_peaks,)
-        Their weights.
-    """
-    high = posterior > _GAP * posterior.max()
-    # a peak reaches to the next nodes
-    high = np.convolve(high, [1, 1, 1], "same") > 0
-    change = np.diff(high.astype(int), prepend=0, append=0)
-    first = np.flatnonzero(change == 1)
-    last = np.flatnonzero(change == -1) - 1
-    borders = 0.5 * (redshift[last[:-1]] + redshift[first[1:]])
-    weights = np.bincount(np.searchsorted(borders, redshift), posterior, minlength=first.size)
-    return borders, weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -593,52 +499,3 @@ class AdaptiveSampler:
         return self._placed(
             place, evaluated, np.concatenate(weight), uniform, sample, converged=False
         )
-
-
-def thinned(index, weight, always, most):
-    """
-    Keep some of many weights, with the sums that they had.
-
-    Weights above a level are kept. Of the others so many are taken, evenly in their order and in proportion to
-    them, that those left have this level for a weight (Fearnhead & Clifford 2003, J. R. Stat. Soc. B 65, 887).
-
-    Parameters
-    ----------
-    index : `~numpy.ndarray` of int, shape (n,)
-        What the weights are of; neighbors should be alike.
-    weight : `~numpy.ndarray`, shape (n,)
-        Weights above 0.
-    always : `~numpy.ndarray` of bool, shape (n,)
-        Those that are kept with their own weight in any case.
-    most : int
-        Number to keep of the others.
-
-    Returns
-    -------
-    index, weight : `~numpy.ndarray`
-        Those kept; all if there are not more than ``most``.
-    """
-    if len(weight) <= most:
-        return index, weight
-    descending = np.sort(weight)[::-1]
-    # the level if the k largest are kept
-    below = np.cumsum(descending[::-1])[::-1]
-    level = below[:most] / (most - np.arange(most))
-    n_kept = int(np.argmax(descending[:most] <= level))
-    level = level[n_kept]
-    large = (weight > level) | always
-    upto = np.cumsum(np.where(large, 0.0, weight)) / level
-    steps = np.floor(upto + 0.5)
-    taken = np.diff(steps, prepend=0.0) > 0
-    chosen = large | taken
-    return index[chosen], np.where(large, weight, level)[chosen]
-
-
-def places_to_values(space, axis, place):
-    """Convert places in the unit interval of an axis to cells and values: two arrays, shape (n,)."""
-    n = space.size[axis]
-    y = place * n
-    cell = np.minimum(y.astype(np.int64), n - 1)
-    low = space.low[axis, cell]
-    high = space.high[axis, cell]
-    return cell, low + (y - cell) * (high - low)

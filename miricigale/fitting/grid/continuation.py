@@ -7,11 +7,13 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from miricigale.fitting import _core
-from miricigale.fitting.grid.adaptive import AdaptiveSampler, places_to_values, redshift_peaks
+from miricigale.fitting.grid.adaptive import AdaptiveSampler
 from miricigale.fitting.grid.grid import GridEngine
 from miricigale.fitting.grid.interpolation import InterpolatedModels, grid_models
 from miricigale.fitting.grid.labels import LabelTable, log_weights
 from miricigale.fitting.grid.node_scan import NodeScan
+from miricigale.fitting.grid.peaks import redshift_peaks
+from miricigale.fitting.grid.placed_models import places_to_values
 from miricigale.fitting.posterior.priors import GridAxis
 from miricigale.utils.units import Frozen
 
