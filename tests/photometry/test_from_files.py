@@ -260,6 +260,29 @@ def test_sources_are_detected_on_several_images(files, tmp_path):
     assert found[1] < 0.1
 
 
+def test_coordinates_of_an_image_are_read_once(files, monkeypatch):
+    from miricigale.photometry import MosaicFile
+    from miricigale.photometry.commands.file_inputs import Inputs
+    from miricigale.photometry.images import mosaics
+
+    names = []
+    image_wcs = mosaics.image_wcs
+
+    def read(header, hdus):
+        names.append(Path(hdus.filename()).name)
+        return image_wcs(header, hdus)
+
+    monkeypatch.setattr(mosaics, "image_wcs", read)
+    paths = files.paths
+    psf = {"psf": paths["psf"], "psf_scale": COARSE * u.arcsec}
+    image = MosaicFile(paths["image"], weight=paths["weight"], filter=BAND, **psf)
+    highres = MosaicFile(paths["highres"], error=paths["highres-error"], psf=paths["highres-psf"])
+    inputs = Inputs.of(image, highres)
+    inputs.check()
+    inputs.read()
+    assert sorted(names) == ["image.fits", "prior.fits.gz"]
+
+
 def test_our_own_files_are_read(files, tmp_path):
     image = read_mosaic(files.paths["image"], weight=files.paths["weight"], filter="miri.f770w")
     write_image(image, tmp_path / "own.fits")

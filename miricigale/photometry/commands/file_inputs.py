@@ -16,7 +16,7 @@ from miricigale.instrument.image_planes import plane_data
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry.commands.kernel_files import can_be_modeled, matching_kernel
 from miricigale.photometry.images.fits_images import open_map
-from miricigale.photometry.images.mosaics import MosaicFile
+from miricigale.photometry.images.mosaics import MosaicFile, stated_filter
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import file_place
 from miricigale.utils.units import SURFACE_BRIGHTNESS
@@ -312,10 +312,11 @@ def _blank(shape, wcs):
 def _check_images(image, highres):
     """Refuse images that are not what they should be, or do not overlap."""
     wanted = image.filter
+    image_filter = None
+    if wanted is not None:
+        image_filter = stated_filter(image.path)
     # a swap shows in the filters that the headers state
-    image_filter = MosaicFile(image.path).header.filter
-    highres_filter = MosaicFile(highres.path).header.filter
-    if wanted is not None and image_filter not in (None, wanted) and highres_filter == wanted:
+    if image_filter not in (None, wanted) and stated_filter(highres.path) == wanted:
         msg = (
             f"'image' and 'highres' seem to be swapped: {highres.path} is the image in {wanted}, "
             f"{image.path} is in {image_filter}"

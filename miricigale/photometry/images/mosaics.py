@@ -233,10 +233,7 @@ class MosaicFile:
 
         # facts that the package's own files carry, then those of the header
         check_kind_of_exposure(get, self.path)
-        meta = {}
-        # of another program it may be no JSON
-        with contextlib.suppress(json.JSONDecodeError):
-            meta = json.loads(header.get("META", "{}"))
+        meta = _own_facts(header)
         name = filter_name(get) or meta.get("filter")
         good = self.filter is None or name in (None, self.filter)
         check_that(good, "filter", f"{name!r}, the filter in {self.path}", repr(self.filter))
@@ -414,7 +411,9 @@ class MosaicFile:
             path = getattr(self, kind)
             if path is None:
                 continue
-            whole_header = self.replace(section=None).header
+            whole_header = header
+            if self.section is not None:
+                whole_header = self.replace(section=None).header
             image = whole_header.shape, whole_header.wcs, self.path
             wanted = f"a map of the {kind.replace('_', ' ')}"
             with open_map(path, wanted, f"the {kind} of {self.path}", names, image) as hdu:
@@ -555,6 +554,23 @@ class MosaicHeader:
     exposure: bool
     keywords: dict  # Those of the photometric calibration.
     meta: dict  # What our own files carry, with ``filter`` and ``pa_aper`` (deg).
+
+
+def stated_filter(path):
+    """Return the filter that the header of an image names, None if it names none; coordinates are not read."""
+    with open_image(path, "an image") as (hdus, extension):
+        header = hdus[find_image(hdus, extension, path, ("SCI",), no_images=PLANES)].header
+        first = hdus[0].header
+        name = filter_name(lambda key: header.get(key, first.get(key)))
+        return name or _own_facts(header).get("filter")
+
+
+def _own_facts(header):
+    """Return the facts that the package's own files carry, by name."""
+    # of another program it may be no JSON
+    with contextlib.suppress(json.JSONDecodeError):
+        return json.loads(header.get("META", "{}"))
+    return {}
 
 
 def _unit_of(header):
