@@ -82,6 +82,32 @@ def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved, monkeyp
     assert_allclose(result.flux_err.value, full.flux_err.value[:81], rtol=0.05)
 
 
+def test_bands_that_show_new_sources_are_measured_with_these_alone(tools, crowd, monkeypatch):
+    from miricigale.photometry.fit import forced
+    from miricigale.photometry.fit.bands import measure_prior
+
+    counts = []
+    package = forced.package
+
+    def count(fit, *args):
+        counts.append(len(fit.bank.order))
+        return package(fit, *args)
+
+    monkeypatch.setattr(forced, "package", count)
+    photometer = ForcedPhotometer(tools.kernel, template="psf", second_pass=True)
+    catalog = QTable({"id": np.arange(81), "sky": crowd.sky})
+    name = "miri.f770w"
+    prior = measure_prior({name: crowd.image}, {name: photometer}, None, None, catalog)[name]
+    # errors and diagnostics are made of the last fit
+    assert counts == [81 + 52]
+    assert prior.meta["second_pass"]["fitted"]
+    direct = photometer.measure(crowd.image, catalog=catalog)
+    assert_array_equal(prior.sky[81:].ra.deg, direct.new_sources["sky"].ra.deg)
+    known = photometer.replace(second_pass=False).measure(crowd.image, catalog=prior.sky)
+    assert_array_equal(prior.flux.value, known.flux.value)
+    assert_array_equal(prior.flux_err.value, known.flux_err.value)
+
+
 def test_what_is_left_has_its_flux_and_place(tools, crowd, monkeypatch):
     """Two points that stand alone, and are not in the catalog, on the residual."""
     found, plain = [], residual_sources.residual_peaks

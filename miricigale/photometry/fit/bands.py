@@ -72,13 +72,22 @@ def measure_bands(images, kernels, templates, **options):
     """
     missing = sorted(set(images) ^ set(kernels))
     check_that(not missing, "kernels", "one for each image", f"not in both: {missing}")
+
+    def measure(name, image):
+        photometer = kernels[name]
+        if not isinstance(photometer, ForcedPhotometer):
+            photometer = ForcedPhotometer(photometer, **options)
+        return photometer.measure(image, templates=templates)
+
+    return _each_band(measure, images)
+
+
+def _each_band(measure, images):
+    """Call a function with name and image of each band: dict by name. Errors say of which band they are."""
     results = {}
     for name, image in images.items():
-        photometer = kernels[name]
         try:
-            if not isinstance(photometer, ForcedPhotometer):
-                photometer = ForcedPhotometer(photometer, **options)
-            results[name] = photometer.measure(image, templates=templates)
+            results[name] = measure(name, image)
         except (ValueError, TypeError) as err:
             err.add_note(f"in the band {name!r}")
             raise
@@ -141,7 +150,10 @@ def _measure_prior(images, photometers, highres, segmentation, catalog):
     if first.bare:
         # kernels are not alike
         templates = dataclasses.replace(templates, psf=None)
-    results = measure_bands(images, photometers, templates)
+    # bands that show sources which the catalog lacks are measured with those of all bands, and not before
+    results = _each_band(
+        lambda name, image: photometers[name]._measure_or_find(image, templates), images
+    )
     # sources that the bands have found, each once
     sky = SkyCoord([], [], unit="deg")
     for result in results.values():

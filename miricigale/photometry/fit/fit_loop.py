@@ -21,7 +21,7 @@ _ELSEWHERE = 3.0
 _FALSE_RATE = 0.1
 
 
-def fit_image(arrays, bank, settings, catalog, grid_wcs):
+def fit_image(arrays, bank, settings, catalog, grid_wcs, *, until_new=False):
     """
     Fit an image, and once more with second components and sources that the catalog lacks.
 
@@ -33,11 +33,13 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         The catalog; ``near_rows`` lists the bank's sources.
     grid_wcs : `~astropy.wcs.WCS`
         Of the grid on which templates are made.
+    until_new : bool, optional
+        Whether the work ends where sources that the catalog lacks are found: for their positions alone.
 
     Returns
     -------
     fit, diagnostics
-        The `TemplateFit` and its `Diagnostics`.
+        The `TemplateFit` and its `Diagnostics`; these are None where it ended with new sources.
     new_xy : `~numpy.ndarray`, shape (m, 2)
         Positions, in the catalog's frame, of sources that it lacks: the last of the fit's sources.
     """
@@ -65,6 +67,9 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         new_xy, evidence = _new_positions(fit, catalog)
     if len(new_xy) or len(double):
         new_xy = added.refined(double, new_xy)
+        if until_new and len(new_xy):
+            fit.evidence = evidence
+            return fit, None, new_xy
         fit = added.fit(double, new_xy)
         if choose:
             # sources that are poorly fitted also with the new sources next to them

@@ -14,7 +14,7 @@ from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.detection.prior_catalog import detected_prior, read_catalog, read_prior
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels, are_exposures
 from miricigale.photometry.fit.fit_loop import fit_image
-from miricigale.photometry.fit.result_table import CatalogRows, package
+from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package
 from miricigale.photometry.fit.stars import with_stars
 from miricigale.photometry.images.arrays import fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.images.flags import ForcedFlags
@@ -358,6 +358,31 @@ class ForcedPhotometer(Interactive):
             else:
                 result = photometer.measure(image, highres, segmentation, catalog)
             return stars.noted(result)
+        prior = None
+        if templates is None:
+            prior = highres, segmentation, catalog
+        return self._measured(image, arrays, sources, prior=prior)
+
+    def _measure_or_find(self, image, templates):
+        """
+        Measure as `measure` does with templates, or find sources that they lack: then for these alone.
+
+        Returns
+        -------
+        result : `ForcedPhotometryResult` or `~miricigale.photometry.fit.result_table.NewSources`
+        """
+        if are_exposures(image) or (self.psf_stars is not False and not self.bare):
+            return self.measure(image, templates=templates)
+        image = own_pixels(as_mosaic(image, "image"))
+        return self._measured(image, fit_arrays(image, "image"), templates, until_new=True)
+
+    def _measured(self, image, arrays, sources, *, prior=None, until_new=False):
+        """
+        Measure sources on an image, ``arrays`` being its pixels.
+
+        Their templates are made of the ``prior`` (high-resolution image, segments and catalog), or else they are
+        templates already. With ``until_new`` it is as `_measure_or_find`.
+        """
         # sources on or near the image, and their templates
         place = Placement.of(self, arrays, sources.sky)
         if len(sources.id) and not len(place.near_rows):
@@ -365,10 +390,11 @@ class ForcedPhotometer(Interactive):
                 f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
             )
             warn(msg, PhotometryWarning)
-        if templates is None:
-            templates = self._templates(highres, segmentation, catalog[place.near_rows])
+        if prior is None:
+            templates = sources[place.near_rows]
         else:
-            templates = templates[place.near_rows]
+            highres, segmentation, catalog = prior
+            templates = self._templates(highres, segmentation, catalog[place.near_rows])
         self._check_grid(templates)
         rows, templates = self._rows(sources, place, templates)
         # what the result says of its making
@@ -380,7 +406,12 @@ class ForcedPhotometer(Interactive):
             meta["repeated_pixels"] = image.meta["repeated_pixels"]
         with threads(self.n_threads) as executor, single_threaded():
             bank = place.bank(rows.near_rows, templates, executor)
-            fit, diagnostics, new_xy = fit_image(arrays, bank, self, rows, place.grid(templates))
+            grid = place.grid(templates)
+            fit, diagnostics, new_xy = fit_image(
+                arrays, bank, self, rows, grid, until_new=until_new
+            )
+            if diagnostics is None:
+                return NewSources.of(fit, new_xy, rows)
             result = package(fit, diagnostics, new_xy, rows, meta)
         if self.background_order is None:
             warn_of_background(result, self.mean_kernel)

@@ -8,6 +8,7 @@ import scipy.sparse
 from astropy.coordinates import SkyCoord
 from astropy.nddata import StdDevUncertainty
 from astropy.table import QTable
+from astropy.units import Quantity
 
 from miricigale.instrument.image import Image
 from miricigale.photometry.detection.residual_sources import unexplained_neighbors
@@ -89,6 +90,26 @@ class CatalogRows:
         )
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class NewSources:
+    """Sources that a catalog lacks, as a `~miricigale.photometry.ForcedPhotometryResult` has them."""
+
+    new_sources: QTable  # Their ``sky`` alone.
+    psf_fwhm: Quantity
+    meta: dict  # ``second_pass``, the evidence for them.
+
+    @classmethod
+    def of(cls, fit, xy, catalog):
+        """Make those at pixels (x, y), (m, 2), of a fit."""
+        sky = pixels_to_sky(xy, fit.arrays.wcs).transform_to(catalog.sky.frame)
+        return cls(QTable({"sky": sky}), _full_width(fit), {"second_pass": fit.evidence})
+
+
+def _full_width(fit):
+    """Return the full width at half maximum of a fit's PSF."""
+    return np.sqrt(8 * np.log(2)) * fit.psf_width * fit.scale * ANGLE
+
+
 def package(fit, diagnostics, new_xy, catalog, meta):
     """
     Make the `ForcedPhotometryResult` of a fit.
@@ -167,7 +188,7 @@ def package(fit, diagnostics, new_xy, catalog, meta):
         y=catalog.xy[:, 1].copy(),
         noise_correlation=diagnostics.correlation,
         new_sources=new,
-        psf_fwhm=np.sqrt(8 * np.log(2)) * fit.psf_width * fit.scale * ANGLE,
+        psf_fwhm=_full_width(fit),
         meta=provenance(
             **meta,
             pixel_scale=round(fit.scale, 6),
