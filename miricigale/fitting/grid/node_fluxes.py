@@ -106,7 +106,7 @@ class FluxMoments:
         template_error = engine.template_error[index[:, 0]] * flux
         total_variance = np.square(self.sigma[row]) + np.square(template_error)
         weight = 1.0 / total_variance
-        model = _models(engine, index)
+        model = model_fluxes(engine, index)
         norm = np.sum(weight * model * model, axis=1)
         scale = np.maximum(np.sum(weight * model * flux, axis=1) / norm, 0.0)
         scaled = scale[:, None] * model
@@ -124,7 +124,7 @@ class FluxMoments:
         self.sigma[row] = np.hypot(self.sigma[row], np.abs(template_error[best]))
 
 
-def _models(engine, index):
+def model_fluxes(engine, index):
     """Compute the fluxes in uJy of models of one solar mass formed, (n, nb)."""
     grid = engine.grid
     z, galaxy, agn, fraction = index.T
