@@ -259,7 +259,8 @@ def red_dot_axes():
     Axes of little red dots: parameters of `red_dot` over the range of published spectra, and redshifts of 2 to 10.
 
     Temperatures and widths of H alpha have the values of 5 to 95 and 16 to 84 % of the spectra of de Graaff et al.
-    2025 (arXiv:2511.21820); the galaxy has 2.5 to 80 % of the light of the envelope, in steps of a factor of two.
+    2025 (arXiv:2511.21820). Gas of an optical depth of 2 at the Balmer limit covers none, half or all of the
+    envelope. The galaxy has 2.5 to 80 % of the light of the envelope, in steps of a factor of two.
 
     Returns
     -------

@@ -179,7 +179,7 @@ def red_dots(axes=None, *, atmospheres=None):
     Returns
     -------
     spectra : dict of str to `SED`
-        By their values; 1296 of them by default.
+        By their values; 1944 of them by default.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def red_dots(axes=None, *, atmospheres=None):
     >>> from miricigale.sed import red_dot_axes, red_dots, template_grid
     >>> z = red_dot_axes()["redshift"]
     >>> template_grid(red_dots(), ["nircam.f150w", "nircam.f444w"], redshift=z)
-    <ModelGrid 66 redshifts x 1296 galaxies x 0 AGN x 1 fractions, 2 bands, 85,536 models>
+    <ModelGrid 66 redshifts x 1944 galaxies x 0 AGN x 1 fractions, 2 bands, 128,304 models>
     """
     if atmospheres is not None:
         check_that(len(atmospheres) > 0, "atmospheres", "one or more spectra by name", "none")
