@@ -248,7 +248,12 @@ def _of_text(path, unit):
 
 def _unit_beside_kind(comments, path):
     """Unit of a file of CIGALE's layout: Angstrom, unless a line says that its columns are in another one."""
-    about_columns = [text for text in comments if _ABOUT_COLUMNS.search(text)]
+    about_columns = []
+    for text in comments:
+        # a unit alone is that of the columns
+        is_unit = any(unit.fullmatch(text.strip(" ()[]")) for unit in _UNIT.values())
+        if is_unit or _ABOUT_COLUMNS.search(text):
+            about_columns.append(text)
     try:
         return unit_of_comments(about_columns, path)
     except DataError as err:

@@ -266,3 +266,16 @@ def test_csv_without_names_keeps_its_first_sample(tmp_path):
     # after the vertical edge that a filter begins with
     assert_allclose(curve.wave.value[1:], [7.0, 7.5, 8.0, 8.1])
     assert_allclose(curve.throughput, [0.0, 0.2, 1.0, 0.4, 0.0])
+
+
+@pytest.mark.parametrize("kind", ["photon", "energy"])
+@pytest.mark.parametrize(
+    ("line", "factor"), [("um", 1.0), ("[nm]", 1e3), ("a band at 7.7 um", 1e4)]
+)
+def test_a_unit_alone_in_a_line_counts_beside_the_kind_of_detector(tmp_path, kind, line, factor):
+    """CIGALE's layout is in Angstrom where only the description has a unit; before, "# um" counted for nothing."""
+    path = tmp_path / "mine.dat"
+    rows = [(7.0, 0.0), (7.5, 0.6), (8.0, 0.6), (8.5, 0.0)]
+    text = "".join(f"{wave * factor} {throughput}\n" for wave, throughput in rows)
+    path.write_text(f"# mine\n# {kind}\n# {line}\n{text}")
+    assert 7.6 < Filter.read(path).pivot.to_value(u.um) < 7.9
