@@ -18,7 +18,9 @@ from helpers.errors import refuses
 from miricigale.instrument import Image, pixel_area_map, read_image, write_image
 from miricigale.instrument.sky_axes import grid_angle, pixel_to_radec, radec_axes
 from miricigale.photometry import MosaicFile, read_mosaic
+from miricigale.photometry.commands.kernel_files import image_psf
 from miricigale.photometry.images.arrays import image_arrays
+from miricigale.psf import filter_psf, psf_image
 from miricigale.reduction import pixel_map, read_images
 from miricigale.reduction import write_image as write_jwst_image
 from miricigale.scene.sky import local_jacobian, pixel_positions
@@ -433,3 +435,29 @@ def test_units_of_brightness_in_capitals_and_words(write, text, jansky):
 def test_uncertainties_of_unknown_kind_are_refused():
     image = CCDData(noise(), unit="MJy/sr", wcs=tan(), uncertainty=UnknownUncertainty(plane(0.1)))
     refuses("a StdDevUncertainty, .* got UnknownUncertainty", image_arrays, image, "image")
+
+
+@pytest.mark.parametrize(
+    ("angles", "expected"),
+    [
+        ([10.0] * 4, 10.0),
+        ([359.8, 0.2, 359.9, 0.1], 359.8),
+        ([10.0, 10.0, 100.0, 100.0], [10.0, 100.0]),
+        ([10.0, 10.0, 10.0, 100.0], [10.0, 10.0, 10.0, 100.0]),
+    ],
+)
+def test_a_mosaic_of_visits_has_the_angles_of_all_of_them(write, angles, expected):
+    """The header of an _i2d of jwst has the angle of its first exposure, its extension HDRTAB those of all."""
+    keywords = {"TELESCOP": "JWST", "INSTRUME": "MIRI", "FILTER": "F770W", "PA_APER": angles[0]}
+    noise = np.random.default_rng(1).normal(0.0, 1.0, SHAPE)
+    path = write(noise, [("ERR", 1, np.ones(SHAPE))], primary=keywords)
+    with fits.open(path, mode="append") as hdus:
+        columns = [fits.Column("PA_APER", "D", array=angles)]
+        hdus.append(fits.BinTableHDU.from_columns(columns, name="HDRTAB"))
+    file = MosaicFile(path)
+    np.testing.assert_array_equal(file.header.pa_aper.value, expected)
+    assert file.read().meta["pa_aper"] == expected
+    psf = image_psf(file)
+    at = {"pixel_scale": 0.1 * u.arcsec, "shape": 41}
+    of_all = filter_psf("F770W", pa=expected * u.deg, pixel_scale=0.1 * u.arcsec)
+    np.testing.assert_allclose(psf_image(psf, **at), psf_image(of_all, **at), atol=1e-8)

@@ -46,6 +46,9 @@ from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 _log = logging.getLogger(__name__)
 
+#: Position angles that differ by less are one (deg).
+_SAME_ANGLE = 1.0
+
 #: A scale of the noise further from 1 than this factor is warned of.
 _ODD_SCALE = 10.0
 
@@ -222,6 +225,7 @@ class MosaicFile:
             first = hdus[0].header
             wcs = image_wcs(header, hdus)
             shape = plane_shape(hdus[index])
+            angles = _angles_of_exposures(hdus)
         check_data(wcs is not None, self.path, "has no celestial coordinates (WCS) in its header")
         if self.section is not None:
             wcs = cut_wcs(wcs, self.section, self.path)
@@ -237,10 +241,12 @@ class MosaicFile:
         name = filter_name(get) or meta.get("filter")
         good = self.filter is None or name in (None, self.filter)
         check_that(good, "filter", f"{name!r}, the filter in {self.path}", repr(self.filter))
-        # a mosaic of our own has a list of angles
+        # a mosaic of our own has a list of angles; in the header of jwst's stands that of the first exposure
+        if angles is None:
+            angles = get("PA_APER")
         values = {
             "filter": self.filter or name,
-            "pa_aper": get("PA_APER"),
+            "pa_aper": angles,
             "subarray": get("SUBARRAY"),
         }
         for key, value in values.items():
@@ -273,7 +279,7 @@ class MosaicFile:
         if header_angle is None:
             return angle
         difference = (angle - header_angle).to_value(u.deg)
-        if np.max(np.abs((difference + 180) % 360 - 180)) > 1:
+        if np.max(np.abs((difference + 180) % 360 - 180)) > _SAME_ANGLE:
             wanted = f"PA_APER of {self.path}, {np.round(header_angle.value, 2)} deg"
             raise argument_error("pa_aper", wanted, angle)
         return angle
@@ -571,6 +577,25 @@ def _own_facts(header):
     with contextlib.suppress(json.JSONDecodeError):
         return json.loads(header.get("META", "{}"))
     return {}
+
+
+def _angles_of_exposures(hdus):
+    """
+    Position angles (deg) of the exposures of a mosaic of jwst, from its extension HDRTAB, in their shares.
+
+    None without such a table, or if all are that of the header within a degree.
+    """
+    if "HDRTAB" not in hdus or "PA_APER" not in hdus["HDRTAB"].columns.names:
+        return None
+    angles = np.asarray(hdus["HDRTAB"].data["PA_APER"], dtype=float)
+    angles = np.round(angles[np.isfinite(angles)], 1)
+    if not angles.size:
+        return None
+    apart = (angles - angles[0] + 180.0) % 360.0 - 180.0
+    if np.max(np.abs(apart)) <= _SAME_ANGLE:
+        return None
+    values, counts = np.unique(angles, return_counts=True)
+    return np.repeat(values, counts // np.gcd.reduce(counts)).tolist()
 
 
 def _unit_of(header):
