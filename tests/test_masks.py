@@ -14,9 +14,21 @@ from astropy.coordinates import SkyCoord
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.utils.masked import Masked
 
-from miricigale import evaluation, filters, fitting, instrument, photometry, profiles, scene, sed
+from miricigale import (
+    evaluation,
+    filters,
+    fitting,
+    instrument,
+    photometry,
+    profiles,
+    psf,
+    scene,
+    sed,
+)
 from miricigale.fitting import MassFunction, TemplateError
+from miricigale.injection import CompletenessCurve
 from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.utils.missing_values import floats
 from miricigale.utils.positions import as_positions
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import as_table
@@ -66,6 +78,20 @@ LUMINOSITY = np.array([1e37, 3e37, 1e38, 2e38, 4e38]) * u.W
 MASS = np.array([1e9, 1e10, 2e10, 5e10, 1e11]) * u.Msun
 WAVE = np.array([4.0, 6.0, 7.0, 9.0, 12.0]) * u.um
 FLUX = np.array([1.0, 2.0, 4.0, 5.0, 7.0]) * u.uJy
+FOUND = np.array([0.0, 1.0, 0.0, 1.0, 1.0])
+ERRORS = photometry.ErrorModel.from_depths({"miri.f770w": 26.0})
+GALAXY = sed.SEDModel.yang2021(agn=False)
+LINE = sed.SED([1, 40] * u.um, [1, 2] * u.uJy)
+POINT = psf.gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=9 * u.arcsec)
+
+
+def _image(values):
+    """Five rows of the same values, masked as they are."""
+    if isinstance(values, Masked):
+        return Masked(np.tile(values.unmasked, (5, 1)), mask=np.tile(values.mask, (5, 1)))
+    if hasattr(values, "mask"):
+        return np.ma.MaskedArray(np.tile(values.data, (5, 1)), mask=np.tile(values.mask, (5, 1)))
+    return np.tile(floats(values), (5, 1))
 
 
 def _band():
@@ -124,6 +150,41 @@ FUNCTIONS = {
     "xray_obscured_fraction": (lambda x: evaluation.xray_obscured_fraction(x, 1.0), LUMINOSITY),
     "completeness": (lambda x: evaluation.completeness(x, np.array([0, 0, 1, 1, 1], bool), [0, 1, 3]), X),
     "half_complete": (lambda x: evaluation.half_complete(x, np.array([0, 0, 1, 1, 1], bool)), X),
+    "completeness found": (lambda x: evaluation.completeness(X, x, [0, 1, 3]), FOUND),
+    "half_complete found": (lambda x: evaluation.half_complete(X, x), FOUND),
+    "selection_quality": (lambda x: evaluation.selection_quality(x, FOUND > 0), FOUND),
+    "CompletenessCurve": (lambda x: CompletenessCurve.fit(np.tile(x, 3), np.tile([0, 0, 1, 1, 1], 3)), X + 24),
+    "CompletenessCurve recovered": (lambda x: CompletenessCurve.fit(X + 24, x), FOUND),
+    "red_dot_prior": (fitting.red_dot_prior, X),
+    "AGNPopulation": (lambda x: evaluation.AGNPopulation().probability(x, X), MASS),
+    "AGNPopulation redshift": (lambda x: evaluation.AGNPopulation().probability(MASS, x), X),
+    "ErrorModel": (lambda x: ERRORS.sigma(x, "miri.f770w"), FLUX),
+    "ErrorModel.perturb": (lambda x: ERRORS.perturb(QTable({"id": np.arange(5), "miri.f770w": x}), seed=1), FLUX),
+    "fluxes": (lambda x: GALAXY.fluxes(
+        {"redshift": np.ones(5), "age": x, "mass": np.full(5, 1e10)}, ["acs.f606w"]), X),
+    "grid": (lambda x: GALAXY.grid({"redshift": [1.0], "age": x}, ["acs.f606w"]).galaxy, X),
+    "template_grid": (
+        lambda x: sed.template_grid({"a": LINE}, ["miri.f770w"], redshift=x).galaxy,
+        X),
+    "band_extinction": (lambda x: sed.band_extinction(["acs.f606w"], x), X / 10),
+    "deredden": (
+        lambda x: sed.deredden(QTable({"acs.f606w": FLUX, "acs.f606w_err": FLUX}), x, ["acs.f606w"]),
+        X / 10),
+    "linearize": (lambda x: instrument.miri_detector().linearize(x), 1e4 * X),
+    "delinearize": (lambda x: instrument.miri_detector().delinearize(x), 1e4 * X),
+    "pixel_to_v2v3": (lambda x: instrument.pixel_to_v2v3(x, 100 * X), 100 * X),
+    "v2v3_to_sky": (lambda x: instrument.v2v3_to_sky(x, X, np.eye(3)), X),
+    "background_spectrum": (instrument.background_spectrum, WAVE),
+    "ellipse_to_pixels": (
+        lambda x: profiles.ellipse_to_pixels(np.eye(2), radius=x, axis_ratio=0.5, position_angle=0.3), X),
+    "encircled_energy": (lambda x: psf.encircled_energy(POINT, x), X << u.arcsec),
+    "aperture_correction": (lambda x: photometry.aperture_correction(POINT, x), X << u.arcsec),
+    "weight_scale": (lambda x: photometry.weight_scale(_image(x), np.ones((5, 5))), X),
+    "weight_scale weight": (lambda x: photometry.weight_scale(np.eye(5), _image(x)), X),
+    "make_psf": (lambda x: psf.make_psf(_image(x), pixel_scale=0.1 * u.arcsec, enclosed=1.0).data, X),
+    "MatchingKernel": (lambda x: psf.MatchingKernel(_image(x), 0.1 * u.arcsec).array, X),
+    "Cutout": (lambda x: scene.Cutout(_image(x), pixel_scale=0.1 * u.arcsec).data, X),
+    "deconvolve": (lambda x: scene.deconvolve(_image(x), np.eye(3)), X),
     "sersic_bn": (profiles.sersic_bn, X),
     "sersic_enclosed_fraction": (lambda x: profiles.sersic_enclosed_fraction(x, 1.0), X),
     "sersic_radius": (lambda x: profiles.sersic_radius(x, 1.0), X / 3),
@@ -231,3 +292,14 @@ def test_positions_and_redshifts_behind_a_mask_are_missing(kind):
     masked = SkyCoord(X * u.deg, Masked(X * u.deg, mask=mask))
     sky = as_positions(QTable({"sky": masked}), "catalog", missing=True)
     assert np.isnan(sky.dec.deg).tolist() == mask.tolist()
+
+
+def test_positions_behind_a_mask_have_no_color_excess():
+    class Map:
+        def query(self, sky):
+            return np.full(sky.shape, 0.01)
+
+    mask = np.arange(X.size) == HIDDEN
+    sky = SkyCoord(X * u.deg, Masked(X * u.deg, mask=mask))
+    with pytest.raises(ValueError, match="'sky' must be positions with a color excess, got 1 of 5"):
+        sed.color_excess(sky, Map())

@@ -34,6 +34,11 @@ def _plain_values(values, name, dtype):
     else:
         n_masked = int(np.count_nonzero(mask))
     check_that(mask is None, name, "without masked values", f"{n_masked} of them")
+    if dtype is bool:
+        # NaN would be true
+        numbers = floats(values)
+        n_missing = int(np.count_nonzero(np.isnan(numbers)))
+        check_that(n_missing == 0, name, "without NaN", f"{n_missing} of them")
     return np.asarray(values, dtype)
 
 

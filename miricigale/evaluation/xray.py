@@ -153,7 +153,9 @@ def completeness(values, found, edges):
     25.0 26.0   3       1  0.33
     """
     values, detected = one_by_one(values=values, found=found)
-    detected = detected > 0
+    # of others it is not known
+    values = values[np.isfinite(detected)]
+    detected = detected[np.isfinite(detected)] > 0
     edges = floats(edges)
     if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
         raise argument_error("edges", "ascending", edges)
@@ -190,7 +192,7 @@ def half_complete(values, found):
         A quantity on a scale on which completeness rises evenly: magnitudes with a minus, or the
         logarithm of a flux. Sources without a finite one are left out.
     found : array-like of bool, shape (n,)
-        Whether each source was found.
+        Whether each source was found; those of which it is masked are left out.
 
     Returns
     -------
@@ -208,10 +210,9 @@ def half_complete(values, found):
     1.00
     """
     values, detected = one_by_one(values=values, found=found)
-    detected = detected > 0
-    good = np.isfinite(values)
+    good = np.isfinite(values) & np.isfinite(detected)
     values = values[good]
-    detected = detected[good]
+    detected = detected[good] > 0
     if not detected.any() or detected.all():
         return np.nan
     scale = max(float(values.std()), 1e-6)

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, log_ndtr, logit, ndtr, ndtri
 
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 
 #: Least numbers of sources that were recovered, and that were not, from which a curve is fitted.
@@ -83,10 +84,12 @@ class CompletenessCurve:
         Raises
         ------
         ValueError
-            If the two differ in length, or a magnitude is not finite.
+            If the two differ in length, or a magnitude is not finite or one of them masked.
         """
-        magnitude = np.asarray(magnitude, float)
-        recovered = np.asarray(recovered, bool)
+        magnitude = floats(magnitude)
+        is_recovered = floats(recovered)
+        check_that(np.isfinite(is_recovered).all(), "recovered", "true or false", "masked or NaN")
+        recovered = is_recovered != 0
         wanted = f"one for each of {magnitude.size} magnitudes"
         check_that(recovered.shape == magnitude.shape, "recovered", wanted, recovered.size)
         check_that(np.isfinite(magnitude).all(), "magnitude", "finite", "NaN or infinite ones")
@@ -118,7 +121,7 @@ class CompletenessCurve:
 
     def __call__(self, magnitude):
         """Return the share of sources of a magnitude that are recovered."""
-        flux = _relative_flux(np.asarray(magnitude, float), self.middle)
+        flux = _relative_flux(floats(magnitude), self.middle)
         return self.plateau * ndtr((flux - 1.0) / self.width)
 
 

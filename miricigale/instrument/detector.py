@@ -9,6 +9,7 @@ from miricigale.instrument.published_tables import filter_row, imager_filter, ta
 from miricigale.instrument.siaf import aperture, imager_columns
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_least, check_positive, check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import frozen_array
@@ -153,7 +154,7 @@ class DetectorProperties:
         linear : `~numpy.ndarray`
             Linear DN above the bias, float64. Negative signals are left as they are.
         """
-        dn = np.asarray(dn, dtype=float)
+        dn = floats(dn)
         return np.where(dn > 0, poly.polyval(dn, self.nonlinearity), dn)
 
     def delinearize(self, dn):
@@ -172,7 +173,7 @@ class DetectorProperties:
             Measured DN above the bias, float64; `linearize` gives ``dn`` back to 1e-6 DN
             below twice the full well.
         """
-        linear = np.asarray(dn, dtype=float)
+        linear = floats(dn)
         top = 2 * self.full_well / self.gain
         target = np.clip(linear, 0, top)
         measured = target.copy()

@@ -14,6 +14,7 @@ from astropy.coordinates.matrix_utilities import rotation_matrix
 
 from miricigale.instrument.published_tables import table
 from miricigale.utils.caching import cached
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names
 
 _ARCSEC = np.pi / 180 / 3600
@@ -172,8 +173,8 @@ def pixel_to_v2v3(x, y, *, subarray="FULL"):
     """
     full = aperture("FULL")
     part = aperture(subarray)
-    x = np.asarray(x, dtype=float) + part.origin[0] - full.reference[0]
-    y = np.asarray(y, dtype=float) + part.origin[1] - full.reference[1]
+    x = floats(x) + part.origin[0] - full.reference[0]
+    y = floats(y) + part.origin[1] - full.reference[1]
     x_ideal, y_ideal = _ideal(x, y)
     angle = np.radians(full.v3_ideal_y_angle)
     cos = np.cos(angle)
@@ -262,7 +263,7 @@ def v2v3_to_sky(v2, v3, matrix):
     >>> print(f"{ra:.3f} {dec:.3f}")
     53.109 -27.819
     """
-    vector = unit_vector(np.asarray(v2) * _ARCSEC, np.asarray(v3) * _ARCSEC)
+    vector = unit_vector(floats(v2) * _ARCSEC, floats(v3) * _ARCSEC)
     vector = np.tensordot(matrix, vector, axes=1)
     ra, dec = vector_angles(vector)
     return np.degrees(ra) % 360, np.degrees(dec)

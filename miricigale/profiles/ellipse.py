@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from miricigale.utils.missing_values import floats
+
 
 def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     """
@@ -34,7 +36,9 @@ def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     >>> print(f"{a:.1f} pixels, ratio {ratio:.1f}, {np.degrees(theta):.0f} deg from +x")
     5.0 pixels, ratio 0.4, -60 deg from +x
     """
-    direction = np.pi / 2 - np.asarray(position_angle, dtype=float)
+    direction = np.pi / 2 - floats(position_angle)
+    radius = floats(radius)
+    axis_ratio = floats(axis_ratio)
     jacobian = np.asarray(jacobian, dtype=float)
     radius, axis_ratio, direction = np.broadcast_arrays(radius, axis_ratio, direction)
     cos = np.cos(direction)

@@ -13,6 +13,7 @@ from miricigale.psf import _core
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.files import write_fits
+from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, check_count, positive, to_array
@@ -405,7 +406,7 @@ def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, *
     >>> print(f"{psf.fwhm:.3f}, {psf.enclosed:.2f}")
     0.424 arcsec, 0.95
     """
-    data = np.array(data, dtype=float)
+    data = np.array(floats(data))
     if data.ndim != 2 or not np.all(np.isfinite(data)) or not data.sum() > 0:
         raise argument_error("data", "a finite 2D array with a positive sum", f"{data.shape}")
     total = float(data.sum())
@@ -484,7 +485,11 @@ def as_psf(psf, argument="psf"):
         axis = np.arange(-np.ceil(reach * cells), np.ceil(reach * cells) + 1) / cells
         data = model(*np.meshgrid(axis, axis))
     else:
-        data = np.asarray(getattr(psf, "array", psf))
+        values = getattr(psf, "array", psf)
+        data = np.asarray(values)
+        if hasattr(values, "mask"):
+            # masked pixels are refused below
+            data = floats(values)
     wanted = "a PSF or model of photutils, an astropy kernel or a 2D array"
     check_that(data.ndim == 2 and data.dtype.kind in "iuf", argument, wanted, type(psf).__name__)
     data = data.astype(float)

@@ -9,6 +9,7 @@ from scipy.fft import fftshift, ifftshift, irfft2, next_fast_len, rfft2
 
 from miricigale.psf import _core
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_positive, check_that
 
 _log = logging.getLogger(__name__)
@@ -33,7 +34,7 @@ _ERROR = 0.02
 
 def checked_square(value, name, *, odd=True):
     """An array as floats, checked: square, odd, finite; ``name`` is the argument's."""
-    value = np.asarray(value, dtype=float)
+    value = floats(value)
     if value.ndim != 2 or value.shape[0] != value.shape[1] or (odd and value.shape[0] % 2 == 0):
         if odd:
             wanted = "square with an odd number of pixels"

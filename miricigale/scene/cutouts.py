@@ -10,6 +10,7 @@ from astropy.nddata import NDData
 
 from miricigale.scene.sky import local_jacobian
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, Frozen, frozen_array, frozen_quantity, positive
 
@@ -67,7 +68,7 @@ class Cutout(Frozen):
     center: tuple | None = None
 
     def __post_init__(self):
-        data = frozen_array(np.asarray(self.data, dtype=float))
+        data = frozen_array(floats(self.data))
         if data.ndim != 2 or not np.all(np.isfinite(data)) or not data.sum() > 0:
             raise argument_error("data", "a finite 2D array with a positive sum", data.shape)
         scale = positive(self.pixel_scale, ANGLE, "pixel_scale") * ANGLE

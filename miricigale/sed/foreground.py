@@ -10,6 +10,7 @@ from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.missing_values import floats, mask_of
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import error_column, require_columns
@@ -274,9 +275,11 @@ def color_excess(sky, dust_map, *, scale=1.0):
     """
     if not hasattr(dust_map, "query"):
         raise argument_error("dust_map", "a map with a method query(sky)", type(dust_map).__name__)
-    ebv = np.asarray(dust_map.query(sky), dtype=float) * scale
+    ebv = floats(dust_map.query(sky)) * scale
     check_that(ebv.shape == sky.shape, "dust_map", f"numbers of shape {sky.shape}", ebv.shape)
-    bad = np.count_nonzero(~(np.isfinite(ebv) & (ebv >= 0)))
+    # maps take what stands behind the mask of a position
+    placed = ~np.any([mask_of(sky.ra), mask_of(sky.dec)], axis=0)
+    bad = np.count_nonzero(~(placed & np.isfinite(ebv) & (ebv >= 0)))
     check_that(not bad, "sky", "positions with a color excess", f"{bad} of {ebv.size} without")
     return ebv * u.mag
 

@@ -101,7 +101,7 @@ def red_dot_prior(redshift):
     >>> red_dot_prior([2.0, 4.0, 6.0, 8.0, 10.0]).round(2)
     array([0.01, 0.38, 0.43, 0.15, 0.03])
     """
-    z = np.asarray(redshift, dtype=float)
+    z = floats(redshift)
     if z.ndim != 1 or z.size < 2 or not (z[0] >= 0 and np.all(np.diff(z) > 0)):
         raise argument_error("redshift", "two or more, ascending from 0 or more", f"{redshift}")
     deviation = (np.log1p(z) - np.log1p(_RED_DOT_REDSHIFT)) / _RED_DOT_WIDTH

@@ -4,6 +4,7 @@ import numpy as np
 from astropy.stats import mad_std
 
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.units import FNU
 
@@ -52,8 +53,8 @@ def weight_scale(data, weight, *, mask=None):
     >>> round(weight_scale(data, weight), 2)
     0.59
     """
-    data = np.asarray(data, float)
-    weight = np.asarray(weight, float)
+    data = floats(data)
+    weight = floats(weight)
     if data.ndim != 2 or data.shape != weight.shape:
         raise argument_error("weight", f"of the image's shape {data.shape}", weight.shape)
     usable = np.isfinite(data) & np.isfinite(weight) & (weight > 0)
