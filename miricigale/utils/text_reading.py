@@ -169,11 +169,14 @@ def first_bytes(path):
 
 
 def check_text(path):
-    """Refuse text that would take far more memory than the file has bytes."""
+    """Refuse text in UTF-16, and text that would take far more memory than the file has bytes."""
     size = os.stat(path).st_size
     with open(path, "rb") as stream:
-        # arrays of columns in ECSV: each number takes a byte or more
         head = stream.read(_PIECE)
+        # as spreadsheets call "Unicode text"
+        if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+            raise ValueError("it is text in UTF-16: save it in UTF-8")
+        # arrays of columns in ECSV: each number takes a byte or more
         for shape in re.findall(rb"subtype: *'?\w+\[([\d, null]*)\]", head):
             if math.prod(map(int, re.findall(rb"\d+", shape))) > size:
                 msg = f"it declares arrays of {shape.decode()} numbers, and has {size} bytes"

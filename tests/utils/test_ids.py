@@ -191,6 +191,13 @@ def test_numbers_of_text_files_are_exact(tmp_path, rows, expected):
     assert read_table(path, wanted="a table", id_names=["mine"])["mine"].tolist() == expected
 
 
+def test_text_in_utf_16_is_refused_in_a_sentence(tmp_path):
+    path = tmp_path / "excel.csv"
+    path.write_text("id,f\n1,1\n", encoding="utf-16")
+    refuses("excel.csv .* text in UTF-16: save it in UTF-8", read_table, path, wanted="a table",
+            error=OSError)  # fmt: skip
+
+
 def test_a_blank_id_of_a_text_file_is_refused_and_the_others_stay_exact(tmp_path):
     path = tmp_path / "b.csv"
     path.write_text(f"id,f\n{LARGE[0]},1\n,2\n{LARGE[2]},3\n")
