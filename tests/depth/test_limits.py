@@ -309,3 +309,14 @@ def test_four_equal_exposures_halve_the_noise(name):
     one = sensitivity(name, time, n_sigma=0.01)
     four = sensitivity(name, 4 * time, n_sigma=0.01, n_dithers=4)
     assert_quantity_allclose(four, one / 2, rtol=2e-3)
+
+
+def test_noise_power_of_wide_correlations_is_that_of_the_sum_over_pairs():
+    # rho of two pixels is that of white noise smoothed by a Gaussian: one of sqrt(2) times the width
+    weights = np.ones((5, 5))
+    y, x = np.indices(weights.shape).reshape(2, -1)
+    square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
+    for width in (0.8, 2.5):
+        assert_allclose(
+            noise_power(weights, width), np.exp(-square / (4 * width**2)).sum(), rtol=0.01
+        )

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from helpers.grids import make_grid
+from miricigale.fitting import FitFlags
 from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.fitting.posterior.priors import density_log_prior, grid_priors
 
@@ -88,3 +89,15 @@ def test_a_density_of_one_node_is_no_information():
 
 def test_a_density_that_misses_the_nodes_is_refused():
     refuses("not all 0", weights_of, NODES["steps"], tau=scipy.stats.uniform(20, 1))
+
+
+def test_redshifts_that_no_model_has_get_no_prior():
+    z = np.array([1.0, 2.0, 3.0])
+    flags = np.zeros(2, dtype=int)
+    # of the second object all lies where models are not allowed
+    density = np.array([[1.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
+    nodes = np.array([1.0, 1.5, 2.5, 3.0])
+    log_prior = density_log_prior((nodes, density), z, np.array([True, True, False]), flags)
+    assert_allclose(np.exp(log_prior[0]), [0.25, 0.5, 0.0])
+    assert np.isneginf(log_prior[:, 2]).all()
+    assert flags.tolist() == [0, int(FitFlags.NO_MODEL)]

@@ -8,6 +8,7 @@ from scipy.stats import norm
 from helpers.errors import refuses
 from miricigale.instrument import DQ, miri_detector
 from miricigale.reduction import DetectorMaps, fit_groups, reference_channels, reference_drift
+from miricigale.reduction._core.pixel import LEAK, own_charge
 
 DT, GAIN, READ, BIAS = 2.775, 4.0, 6.0, 11000.0
 OPTIONS = {"group_time": DT, "gain": GAIN, "read_noise": READ, "bias": BIAS}
@@ -407,3 +408,18 @@ def test_jumps_and_slopes_are_those_of_the_plain_form(n_int, n_group):
         assert bool(flags & DQ.SATURATED) == (min(lengths) < n_group)
         assert fit.n_jump[y, x] == len(found)
     assert n_found > 100
+
+
+def test_charge_leaks_from_the_same_difference_alone():
+    # row, column, integration, difference and size of jumps of two neighbors
+    jumps = np.array(
+        [
+            [0, 0, 0, 3, 100.0],
+            [0, 0, 1, 4, 80.0],
+            [0, 1, 0, 3, 10.0],
+            [0, 1, 1, 3, 20.0],
+            [0, 1, 1, 5, 30.0],
+        ]
+    )
+    own = own_charge(jumps, nx=8, n_diff=6)
+    assert_allclose(own, [100.0 - LEAK * 10.0, 80.0, 10.0 - LEAK * 100.0, 20.0, 30.0])

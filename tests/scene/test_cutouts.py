@@ -160,3 +160,9 @@ def test_stamps_and_their_copies_cannot_be_changed():
         assert repr(other) == repr(cutout)
         assert other.center == cutout.center
         assert not other.data.flags.writeable
+
+
+def test_half_of_the_light_of_a_gaussian_is_within_1_18_sigma_in_arcsec():
+    stamp = gaussian_stamp(0.3, 0.3, 0.05)
+    wanted = np.sqrt(2 * np.log(2)) * 0.3
+    assert stamp.half_light_radius.to_value(u.arcsec) == pytest.approx(wanted, rel=0.02)
