@@ -16,9 +16,9 @@ from miricigale.fitting._core.structs import BLOCK, KERNEL, PART
 from miricigale.fitting._core.workspace import aligned
 from miricigale.utils.compilation import njit
 
-#: Value of a model that may not be used, and above which one may.
+#: Value of a model that may not be used, and ln of a prior below which there is none.
 _NOWHERE = np.float32(-1e30)
-_USABLE = np.float32(-1e29)
+_NONE = -1e200
 _TINY = np.float32(1e-30)
 #: Largest power of an AGN over that of its unit, so that its square is a number in single precision.
 _MOST_POWER = 1e15
@@ -37,9 +37,7 @@ class ScannedObjects(NamedTuple):
     """The data of n objects at nz redshifts; see `Target`."""
 
     first: np.ndarray  # int64 (n,): first redshift of the grid
-    band: np.ndarray  # int64 (n, n_padded): used bands
-    n_used: np.ndarray  # int64 (n,): their number, with those of weight 0 that fill it up
-    root: np.ndarray  # float32 (n, nz, n_padded): roots of their weights, the largest being 1
+    root: np.ndarray  # float32 (n, nz, n_padded): roots of the weights, the largest being 1
     data: np.ndarray  # float32 (n, nz, n_padded): flux over sigma, of norm 1
     norm: np.ndarray  # float64 (n, nz): |F|^2_w
     unit: np.ndarray  # float64 (n, nz): |F| over the largest root
@@ -78,12 +76,11 @@ def _weigh_agn(tables, objects, o, z, z_grid, work):
     """Put AGN models in units of the errors of an object, with their products."""
     root = objects.root[o, z]
     data = objects.data[o, z]
-    band = objects.band[o]
     for k in range(work.agn.shape[0]):
         a = np.float32(0)
         b = np.float32(0)
-        for j in range(objects.n_used[o]):
-            t = tables.agn32[z_grid, k, band[j]] * root[j]
+        for j in range(tables.agn32.shape[2]):
+            t = tables.agn32[z_grid, k, j] * root[j]
             work.agn[k, j] = t
             a += t * data[j]
             b += t * t
@@ -120,14 +117,13 @@ def _mass_priors(galaxies, z, start, log_unit, rows):
 
 
 @njit(**PART)
-def _products(tables, z, start, n_used, of_bands, weighted, rows):
+def _products(tables, z, start, root, data, weighted, rows):
     """Products of galaxies with data and with themselves, and their fluxes over errors."""
-    band, root, data = of_bands
     for i in range(BLOCK):
         rows[_P + i] = np.float32(0)
         rows[_Q + i] = np.float32(0)
-    for j in range(n_used):
-        flux = tables.galaxy32[z, band[j], start : start + BLOCK]
+    for j in range(tables.galaxy32.shape[1]):
+        flux = tables.galaxy32[z, j, start : start + BLOCK]
         out = weighted[j]
         size = root[j]
         d = data[j]
@@ -139,11 +135,11 @@ def _products(tables, z, start, n_used, of_bands, weighted, rows):
 
 
 @njit(**PART)
-def _cross_products(agn, n_used, weighted, rows):
+def _cross_products(agn, weighted, rows):
     """Products of an AGN model with galaxies, `TOGETHER` bands at a time."""
     for i in range(BLOCK):
         rows[_CROSS + i] = np.float32(0)
-    for j in range(0, n_used, TOGETHER):
+    for j in range(0, agn.size, TOGETHER):
         row_0 = weighted[j]
         row_1 = weighted[j + 1]
         row_2 = weighted[j + 2]
@@ -166,24 +162,18 @@ def _log_prior_above(tables):
 
 
 @njit(**KERNEL)
-def scan_nodes(tables, galaxies, objects, chosen, work, value, like, change, top):
+def scan_nodes(tables, galaxies, objects, work, value, like, change):
     """
     Evaluate all galaxies without AGN, and with each AGN model at its best fraction, for several objects.
 
     Parameters
     ----------
-    tables, galaxies, objects : `Tables`, `ScannedGalaxies`, `ScannedObjects`
+    tables, galaxies, objects, work : `Tables`, `ScannedGalaxies`, `ScannedObjects`, `ScanWork`
         The models and n objects.
-    chosen : `~numpy.ndarray` of bool, shape (n, nz)
-        Redshifts whose models are evaluated.
-    work : `ScanWork`
-        Scratch.
     value, like : `~numpy.ndarray` of float32, shape (n, nz, n_padded)
         Get 2 ln(posterior) of the best model of each galaxy, and the 2 ln(likelihood) in it.
     change : `~numpy.ndarray`, shape (n, nz)
         Gets ln of the sum of the galaxies' priors with that of mass.
-    top : `~numpy.ndarray` of float32, shape (n, nz)
-        Gets the largest values.
     """
     n_agn = work.agn.shape[0]
     low = np.float32(0)
@@ -199,10 +189,11 @@ def scan_nodes(tables, galaxies, objects, chosen, work, value, like, change, top
     for z in range(objects.root.shape[1]):
         for o in range(objects.root.shape[0]):
             z_grid = objects.first[o] + z
-            if not chosen[o, z]:
+            if objects.log_prior[o, z] < _NONE:
+                value[o, z, :] = _NOWHERE
+                like[o, z, :] = 0.0
+                change[o, z] = 0.0
                 continue
-            n_used = objects.n_used[o]
-            best = _NOWHERE
             _weigh_agn(tables, objects, o, z, z_grid, work)
             norm = np.float32(objects.norm[o, z])
             level = np.float32(objects.level[o, z])
@@ -211,8 +202,8 @@ def scan_nodes(tables, galaxies, objects, chosen, work, value, like, change, top
             after = 0.0
             for block in range(tables.tiles.shape[1]):
                 start = block * BLOCK
-                of_bands = objects.band[o], objects.root[o, z], objects.data[o, z]
-                _products(tables, z_grid, start, n_used, of_bands, work.weighted, rows)
+                of_object = objects.root[o, z], objects.data[o, z]
+                _products(tables, z_grid, start, *of_object, work.weighted, rows)
                 for i in range(BLOCK):
                     p = max(rows[_P + i], none)
                     q = max(rows[_Q + i], _TINY)
@@ -224,7 +215,7 @@ def scan_nodes(tables, galaxies, objects, chosen, work, value, like, change, top
                 after += _mass_priors(galaxies, z_grid, start, log_unit, rows)
                 dust = galaxies.dust[z_grid, start : start + BLOCK]
                 for k in range(n_agn):
-                    _cross_products(work.agn[k], n_used, work.weighted, rows)
+                    _cross_products(work.agn[k], work.weighted, rows)
                     a = work.agn_pq[k, 0]
                     b = work.agn_pq[k, 1]
                     log_agn = np.float32(tables.of_agn[at.LOG_AGN, k] + log_above)
@@ -252,14 +243,11 @@ def scan_nodes(tables, galaxies, objects, chosen, work, value, like, change, top
                 for i in range(BLOCK):
                     out[i] = (rows[_SCORE + i] + level) + (rows[_PRIOR + i] + of_z)
                     out_like[i] = rows[_BEST + i] + level
-                for i in range(BLOCK):
-                    best = max(best, out[i])
-            top[o, z] = best
             change[o, z] = np.log(max(after, 1e-300)) + galaxies.most_mass[z_grid]
 
 
 @njit(**KERNEL)
-def draw_nodes(value, like, top, less, of_redshift, index):
+def draw_nodes(value, like, less, of_redshift, index):
     """
     Draw galaxies in proportion to the posterior of their best models.
 
@@ -267,8 +255,6 @@ def draw_nodes(value, like, top, less, of_redshift, index):
     ----------
     value, like : `~numpy.ndarray` of float32, shape (nz, n_padded)
         What `scan_nodes` returned for an object.
-    top : `~numpy.ndarray` of float32, shape (nz,)
-        Largest values, -1e30 of redshifts that were not scanned; becomes that of what is drawn from.
     less : float
         Part of the 2 ln(likelihood) that is taken away: 0 for the posterior itself.
     of_redshift : `~numpy.ndarray`, shape (nz,)
@@ -283,28 +269,19 @@ def draw_nodes(value, like, top, less, of_redshift, index):
     """
     n_z, n_galaxies = value.shape
     factor = np.float32(less)
-    highest = _NOWHERE
+    top = np.float32(-3e38)
     for z in range(n_z):
-        if top[z] < _USABLE:
-            continue
-        of_z = _NOWHERE
-        if factor > np.float32(0):
-            for g in range(n_galaxies):
-                of_z = max(of_z, value[z, g] - factor * like[z, g])
-            top[z] = of_z
-        highest = max(highest, top[z])
-    if highest < _USABLE:
+        for g in range(n_galaxies):
+            top = max(top, value[z, g] - factor * like[z, g])
+    if top < np.float32(-1e29):
         return False
     half = np.float32(0.5)
     far = np.float32(-_FAR)
     whole = 0.0
     for z in range(n_z):
-        of_redshift[z] = 0.0
-        if half * (top[z] - highest) < far:
-            continue
         total = np.float32(0)
         for g in range(n_galaxies):
-            v = half * (value[z, g] - factor * like[z, g] - highest)
+            v = half * (value[z, g] - factor * like[z, g] - top)
             total += exponential(max(v, far))
         of_redshift[z] = total
         whole += total
@@ -314,11 +291,11 @@ def draw_nodes(value, like, top, less, of_redshift, index):
     draw = 0
     for z in range(n_z):
         last = upto + of_redshift[z]
-        if of_redshift[z] > 0.0 and draw < n and (draw + 0.5) * step <= last:
+        if draw < n and (draw + 0.5) * step <= last:
             reached = upto
             index[draw, 0] = z
             for g in range(n_galaxies):
-                v = half * (value[z, g] - factor * like[z, g] - highest)
+                v = half * (value[z, g] - factor * like[z, g] - top)
                 if v > far:
                     reached += exponential(v)
                     while draw < n and (draw + 0.5) * step <= reached:

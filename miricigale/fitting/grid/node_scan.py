@@ -19,10 +19,6 @@ _NOWHERE = np.float32(-1e30)
 _USABLE = np.float32(-1e29)
 #: Least ln of a prior of mass below the largest one.
 _LEAST_LOG = -1e4
-#: Every so many redshifts are scanned first.
-_STRIDE = 2
-#: 2 ln(posterior) below the largest one, where errors are right, above which those next to a redshift are too.
-_MAX_BELOW = 80.0
 #: Fractional part of the golden ratio, whose multiples are quasi-random.
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
@@ -134,35 +130,21 @@ class NodeScan(Frozen):
         n_agn = tables.agn.shape[1]
         value = np.empty((n, n_z, n_padded), np.float32)
         like = np.empty((n, n_z, n_padded), np.float32)
-        change = np.zeros((n, n_z))
-        top = np.full((n, n_z), _NOWHERE)
+        change = np.empty((n, n_z))
         scanned = _scanned_objects(objects, n_bands)
         work = _core.make_scan_work(n_bands, n_agn)
-        of_objects = (tables, self._galaxies, scanned)
-        allowed = scanned.log_prior > -1e200
-        chosen = allowed & (np.arange(n_z) % _STRIDE == 0)
-        _core.scan_nodes(*of_objects, chosen, work, value, like, change, top)
-        bands = np.array([scan.target.bands.size for scan in objects])
-        rest = allowed & ~chosen & _near_best(top, scanned.norm + scanned.level, bands)
-        _core.scan_nodes(*of_objects, rest, work, value, like, change, top)
-        chosen |= rest
+        _core.scan_nodes(tables, self._galaxies, scanned, work, value, like, change)
         for i, scan in enumerate(objects):
-            _fill_in(change[i], chosen[i])
-            known = self._known(scan, value[i], like[i], change[i], top[i])
+            known = self._known(scan, value[i], like[i], change[i])
             if known is not None:
                 each(known)
 
-    def _known(self, scan, value, like, change, top):
+    def _known(self, scan, value, like, change):
         """`ObjectOnNodes` of an object; None if no model is possible."""
         target = scan.target
         of_redshift = np.empty(target.log_prior.size)
-        rows = np.flatnonzero(top > _USABLE)
-        if not rows.size:
-            return None
         # the model of the highest likelihood
-        usable = np.where(value[rows] > _USABLE, like[rows], _NOWHERE)
-        place = np.unravel_index(np.argmax(usable), usable.shape)
-        best = (rows[place[0]], place[1])
+        best = np.unravel_index(np.argmax(np.where(value > _USABLE, like, _NOWHERE)), value.shape)
         pair = np.array([best], np.int64)
         index = np.empty((1, 4), np.int64)
         if not (target.norm[0] > 0.0 and value[best] > _USABLE):
@@ -179,7 +161,7 @@ class NodeScan(Frozen):
             # the posterior of data with larger errors
             less = 1.0 - 1.0 / excess
         pairs = np.empty((self.n_draws, 2), np.int64)
-        _core.draw_nodes(value, like, top, less, of_redshift, pairs)
+        _core.draw_nodes(value, like, less, of_redshift, pairs)
         index = np.empty((self.n_draws, 4), np.int64)
         log_weight = np.empty(self.n_draws)
         drawn = (pairs, self._uniform, weights, index, log_weight)
@@ -261,51 +243,10 @@ def _at_node(target, node):
     )
 
 
-def _near_best(top, most, n_bands):
-    """
-    Find the redshifts next to scanned ones whose best model is not much worse than the best of all.
-
-    Parameters
-    ----------
-    top : `~numpy.ndarray`, shape (n, nz)
-        2 ln(posterior) of the best models, `_NOWHERE` of redshifts that are not scanned.
-    most : `~numpy.ndarray`, shape (n, nz)
-        2 ln(likelihood) of models with the fluxes of the data.
-    n_bands : `~numpy.ndarray` of int, shape (n,)
-        Numbers of bands.
-
-    Returns
-    -------
-    near : `~numpy.ndarray` of bool, shape (n, nz)
-    """
-    best = top.argmax(axis=1)[:, None]
-    highest = np.take_along_axis(top, best, axis=1)
-    # draws are of larger errors where these are too small, and chi2 counts less
-    excess = (np.take_along_axis(most, best, axis=1) - highest) / np.maximum(n_bands, 1)[:, None]
-    near = top > highest - _MAX_BELOW * np.maximum(excess, 1.0)
-    # of either side
-    reached = np.zeros_like(near)
-    n_z = top.shape[1]
-    for step in range(1, _STRIDE):
-        reached[:, step:] |= near[:, : n_z - step]
-        reached[:, : n_z - step] |= near[:, step:]
-    return reached
-
-
-def _fill_in(change, scanned):
-    """Fill the changes of redshifts that are not scanned from those that are."""
-    rows = np.flatnonzero(scanned)
-    if rows.size:
-        all_rows = np.arange(change.size)
-        change[:] = np.interp(all_rows, rows, change[rows])
-
-
 def _scanned_objects(objects, n_bands):
     """`_core.ScannedObjects` of `_Scanned`, with so many bands, padded."""
     n = len(objects)
     n_z = objects[0].target.log_prior.size
-    band = np.zeros((n, n_bands), np.int64)
-    n_used = np.empty(n, np.int64)
     root = np.zeros((n, n_z, n_bands), np.float32)
     data = np.zeros((n, n_z, n_bands), np.float32)
     norm = np.empty((n, n_z))
@@ -314,11 +255,8 @@ def _scanned_objects(objects, n_bands):
     level = np.empty((n, n_z))
     for i, scan in enumerate(objects):
         target = scan.target
-        count = target.bands.size
-        band[i, :count] = target.bands
-        n_used[i] = -(-count // _core.TOGETHER) * _core.TOGETHER
-        root[i, :, :count] = target.root32
-        data[i, :, :count] = target.data32
+        root[i][:, target.bands] = target.root32
+        data[i][:, target.bands] = target.data32
         norm[i] = target.norm
         largest = target.weight.max(axis=1)
         unit[i] = np.sqrt(target.norm / np.maximum(largest, 1e-300))
@@ -326,4 +264,4 @@ def _scanned_objects(objects, n_bands):
         log_prior[i][target.log_prior < -1e200] = -1e300
         level[i] = target.level
     first = np.array([scan.first for scan in objects], np.int64)
-    return _core.ScannedObjects(first, band, n_used, root, data, norm, unit, log_prior, level)
+    return _core.ScannedObjects(first, root, data, norm, unit, log_prior, level)
