@@ -11,7 +11,6 @@ model that can matter are listed by their bounds (`pairs`, down to those of `flo
 """
 
 from miricigale.fitting._core.allocation import allocate_places, make_group_sets
-from miricigale.fitting._core.climbing import climb_places, make_climb_work
 from miricigale.fitting._core.evaluate import sum_up
 from miricigale.fitting._core.histogram import (
     N_SHARE,
@@ -26,7 +25,6 @@ from miricigale.fitting._core.importance import (
     Parts,
     add_density,
     add_local_parts,
-    add_normal_parts,
     add_widest,
     evaluate_places,
     fit_parts,

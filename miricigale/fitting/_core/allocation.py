@@ -15,10 +15,6 @@ GroupSets = namedtuple("GroupSets", "start group")
 _MIN_RATE = 0.05
 #: Weight above which a set of groups has to have an effective number of its own.
 _MIN_COUNTED_WEIGHT = 0.02
-#: Error of the weight of a set, as a part of all weight, for which no larger effective number is needed.
-_MAX_WEIGHT_ERROR = 0.01
-#: Smallest effective number that is needed of a set.
-_MIN_NEEDED = 10.0
 #: Smallest part of the places in each group that has weight.
 _MIN_SHARE = 0.03
 
@@ -46,7 +42,7 @@ def allocate_places(weight, group, sets, goal, least_each, min_weight, sums, wan
     sets : `GroupSets`
         Sets of groups that have an effective number of their own where they count.
     goal, least_each : float
-        Effective numbers that are wanted in all, and of each set; less of one of little weight.
+        Effective numbers that are wanted in all, and of each set.
     min_weight : float
         Weight of a group above which it has a share of the places in any case.
     sums : `~numpy.ndarray`, shape (3, n_groups)
@@ -58,8 +54,8 @@ def allocate_places(weight, group, sets, goal, least_each, min_weight, sums, wan
     -------
     effective : float
         Effective number of all weights (Kish 1965).
-    least_part : float
-        Smallest part that a set that counts has of what is wanted of each.
+    enough : bool
+        Whether that and those of the sets that count are as wanted.
     """
     of_weight = sums[0]
     of_square = sums[1]
@@ -80,7 +76,7 @@ def allocate_places(weight, group, sets, goal, least_each, min_weight, sums, wan
         total += of_weight[j]
         square += of_square[j]
     effective = total * total / square
-    least_part = 1e300
+    enough = effective >= goal
     # efficiencies take the place of the numbers
     rate = count
     cost = 0.0
@@ -99,14 +95,11 @@ def allocate_places(weight, group, sets, goal, least_each, min_weight, sums, wan
             set_square += of_square[sets.group[k]]
         if set_weight <= _MIN_COUNTED_WEIGHT * total:
             continue
-        # of little weight a small number says how much it is
-        needed = (set_weight / total / _MAX_WEIGHT_ERROR) ** 2
-        needed = min(max(needed, _MIN_NEEDED), least_each)
-        set_effective = set_weight * set_weight / set_square
-        least_part = min(least_part, set_effective / needed)
+        if set_weight * set_weight < least_each * set_square:
+            enough = False
         for k in range(sets.start[m], sets.start[m + 1]):
             j = sets.group[k]
-            wanted[j] = max(wanted[j], needed * of_weight[j] / set_weight / rate[j])
+            wanted[j] = max(wanted[j], least_each * of_weight[j] / set_weight / rate[j])
     n_wanted = 0.0
     for j in range(n_groups):
         n_wanted += wanted[j]
@@ -114,4 +107,4 @@ def allocate_places(weight, group, sets, goal, least_each, min_weight, sums, wan
     for j in range(n_groups):
         if of_weight[j] > min_weight * total:
             wanted[j] = max(wanted[j], _MIN_SHARE * n_wanted)
-    return effective, least_part
+    return effective, enough

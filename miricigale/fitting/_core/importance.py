@@ -11,7 +11,6 @@ import math
 from collections import namedtuple
 
 from miricigale.fitting._core.functions import exponential
-from miricigale.fitting._core.limits import normal_below
 from miricigale.fitting._core.population import NEVER, _evaluate
 from miricigale.fitting._core.structs import KERNEL, PART
 from miricigale.utils.compilation import njit
@@ -42,17 +41,14 @@ _LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 @njit(**PART)
 def _to_unit(space, labels, label, y, x):
     """Put the place of scores ``y`` in the unit intervals of a `Space`; returns -ln of the proposal's density."""
-    for c in range(len(x)):
-        x[c] = normal_below(y[c])
     log = 0.0
-    share = 1.0
     for c in range(len(x)):
         first = labels.first[label, c]
         share_below = labels.below[c]
         last = first + labels.count[label, c] - 1
         start = share_below[first]
         range_share = share_below[last + 1] - start
-        t = start + range_share * x[c]
+        t = start + range_share * 0.5 * math.erfc(-y[c] * _ROOT_HALF)
         low = first
         high = last
         while low < high:
@@ -67,35 +63,8 @@ def _to_unit(space, labels, label, y, x):
             part = (t - share_below[low]) / cell_share
         part = min(max(part, _INSIDE), 1.0 - _INSIDE)
         x[c] = (low + part) / space.size[c]
-        share *= range_share
-        log -= labels.log_share[c, low]
-    return log + math.log(share)
-
-
-@njit(**PART)
-def _evaluate_place(space, labels, target, label, y, x, work):
-    """
-    Evaluate the posterior of an object at scores ``y`` of a label, whose place is put in ``x``.
-
-    Returned are ln of what a density in the unit interval is multiplied by, ln of the prior and of the likelihood,
-    the scale and its variance.
-    """
-    log = _to_unit(space, labels, label, y, x)
-    prior, like, scale, variance = _evaluate(space, target, x, work)
-    for a in range(labels.n_active[label]):
-        score = y[labels.axes[label, a]]
-        log -= 0.5 * score * score + _LOG_ROOT_TWO_PI
-    return log, prior, like, scale, variance
-
-
-@njit(**PART)
-def place_value(space, labels, target, label, y, x, work):
-    """Ln of the posterior at scores, as `evaluate_places` returns it, and the best scale."""
-    log, prior, like, scale, _ = _evaluate_place(space, labels, target, label, y, x, work)
-    value = NEVER
-    if prior > 0.5 * NEVER:
-        value = log + prior + like
-    return value, scale
+        log += math.log(range_share) - labels.log_share[c, low]
+    return log
 
 
 @njit(**KERNEL)
@@ -120,9 +89,11 @@ def evaluate_places(space, labels, target, label, y, x, evaluated, work):
         Scratch.
     """
     for i in range(len(y)):
-        log, prior, like, scale, variance = _evaluate_place(
-            space, labels, target, label[i], y[i], x[i], work
-        )
+        log = _to_unit(space, labels, label[i], y[i], x[i])
+        prior, like, scale, variance = _evaluate(space, target, x[i], work)
+        for a in range(labels.n_active[label[i]]):
+            score = y[i, labels.axes[label[i], a]]
+            log -= 0.5 * score * score + _LOG_ROOT_TWO_PI
         evaluated[i, 0] = NEVER
         if prior > 0.5 * NEVER:
             evaluated[i, 0] = log + prior + like
@@ -290,24 +261,6 @@ def add_widest(labels, parts, places, mean, cov, cov_active):
             for b in range(a + 1):
                 cov_active[a, b] = cov[axes[a], axes[b]]
         _set_part(labels, parts, p, label, cov_active)
-
-
-@njit(**KERNEL)
-def add_normal_parts(labels, parts, places, label, y, cov, wide, cov_active):
-    """
-    Set parts, at ``places`` of the mixture, of n normal distributions.
-
-    ``label``, (n,), ``y``, (n, n_axes), and ``cov``, (n, n_axes, n_axes), are their labels, scores, and
-    covariances in the active axes; ``wide`` is what widths are multiplied by.
-    """
-    for i in range(len(places)):
-        p = places[i]
-        axes = labels.axes[label[i]]
-        for a in range(labels.n_active[label[i]]):
-            parts.mean[p, a] = y[i, axes[a]]
-            for b in range(a + 1):
-                cov_active[a, b] = wide * wide * cov[i, a, b]
-        _set_part(labels, parts, p, label[i], cov_active)
 
 
 @njit(**PART)

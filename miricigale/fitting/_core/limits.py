@@ -80,15 +80,6 @@ def _mills(u):
 
 
 @njit(**PART)
-def normal_below(x):
-    """Part of the standard normal distribution below x, to 1e-11 of it or of what is above."""
-    real = type(x)
-    half = real(0.5)
-    tail = half * _mills(x) * exponential(max(-half * x * x, real(-80.0)))
-    return tail if x < real(0.0) else real(1.0) - tail
-
-
-@njit(**PART)
 def _limit(u):
     """
     What one limit adds at u, in the precision of u.

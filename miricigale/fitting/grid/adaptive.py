@@ -3,11 +3,10 @@ Posteriors of single objects between the nodes of a grid, by adaptive importance
 
 Places are drawn from a mixture of t distributions, weighed by the posterior over the mean of all mixtures so
 far, and the next mixture is fitted to them (adaptive multiple importance sampling: Cornuet et al. 2012, Scand.
-J. Stat. 39, 798). The first one is fitted to draws from the posterior on the nodes, and has normal
-distributions around the peaks that these climb to. Results rest on places drawn afterwards, from parts that do
-not depend on them: recycled weights are biased (Marin, Pudlo & Sedki 2019, Bernoulli 25, 2714), which takes
-from what has little weight. Points are quasi-random, and the same for all objects: nothing depends on the id or
-place of an object in its catalog.
+J. Stat. 39, 798). The first one is fitted to draws from the posterior on the nodes. Results rest on places
+drawn afterwards, from parts that do not depend on them: recycled weights are biased (Marin, Pudlo & Sedki 2019,
+Bernoulli 25, 2714), which takes from what has little weight. Points are quasi-random, and the same for all
+objects: nothing depends on the id or place of an object in its catalog.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +16,6 @@ import numpy as np
 from miricigale.fitting import _core
 from miricigale.fitting.grid.labels import labels_of_ranges
 from miricigale.fitting.grid.moves import move_places, systematic
-from miricigale.fitting.grid.peaks import find_peaks
 from miricigale.fitting.grid.placed_models import PlacedModels, places_to_values, thinned
 from miricigale.fitting.grid.points import quasi_random
 from miricigale.fitting.grid.proposals import MIN_WEIGHT, Places, fit_mixture
@@ -32,14 +30,14 @@ _MAX_PLACES_EACH = 80
 _MIN_MAX_PLACES = 1 << 14
 #: Largest number of rounds whose places mixtures are fitted to before results are collected.
 _ADAPTING_ROUNDS = 6
+#: The same where labels are pursued.
+_PURSUING_ROUNDS = 16
 #: Effective number, over that wanted in all, at which these rounds end.
 _FIRST_GOAL = 0.3
 #: Number of places after which a mixture is judged; it doubles each time.
 _N_TRIAL = 2048
 #: Effective number wanted over that reached, up to which a judged mixture is kept.
-_MAX_SHORTAGE = 3.5
-#: The same in each label and peak that counts.
-_MAX_SHORTAGE_EACH = 6.0
+_MAX_SHORTAGE = 1.5
 #: A mixture is given up only if this many times the places of its trial may follow.
 _TRIAL_GROWTH = 2
 #: Effective number of a peak of redshift or a label that counts, as a part of that wanted in all.
@@ -48,11 +46,10 @@ _EFFECTIVE_PART = 0.05
 _MIN_EFFECTIVE = 30
 #: Smallest number of places with weights that results rest on.
 _MIN_RESULT_PLACES = 2048
-#: Least share of what has a peak of the posterior at first, and share that is divided as the draws are.
-_MIN_FIRST_SHARE = 0.02
-_DRAWN_SHARE = 0.1
-#: Number of narrow parts before results are collected.
-_N_FIRST_LOCAL = 8
+#: Part of the draws to begin with above which a label in a peak is pursued.
+_MIN_PURSUED = 0.01
+#: Share of the places that it has until its shape is found.
+_PURSUED_SHARE = 0.06
 #: Smallest number of places that parts are fitted to.
 _MIN_FITTED_PLACES = 20
 #: Share of a mixture that is divided evenly among the labels, whatever their weight.
@@ -99,10 +96,8 @@ class WeightedPlaces:
         Ln of the mean of the posterior over the density of the proposal.
     effective : float
         Effective number of the weights.
-    least_part : float
-        Smallest part that labels, peaks, and components that count have of the number that each needs.
     enough : bool
-        Whether there is enough, in all and in each label, peak and component that counts.
+        Whether it is, in all and in each label, peak and component that counts.
     wanted : `~numpy.ndarray`, shape (n_labels * n_peaks,)
         Numbers of places wanted in labels and peaks.
     """
@@ -111,7 +106,6 @@ class WeightedPlaces:
     weight: np.ndarray
     log_mean: float
     effective: float
-    least_part: float
     enough: bool
     wanted: np.ndarray
 
@@ -134,9 +128,15 @@ class AdaptiveSampler:
         Effective number that is wanted.
     scramble : int
         Seed of the quasi-random points.
+    pursue : bool
+        Whether each label of the draws to begin with is followed until its shape is found, whatever weight it
+        seems to have before that: where errors are small, the label in which a good model is found first would
+        take all places from the others.
     """
 
-    def __init__(self, space, labels, work, target, borders, peaks, *, wanted, scramble=1):
+    def __init__(
+        self, space, labels, work, target, borders, peaks, *, wanted, scramble=1, pursue=False
+    ):
         self.space = space
         self.labels = labels
         self.work = work
@@ -148,10 +148,13 @@ class AdaptiveSampler:
         parts = [table[members].ravel() for members in labels_of_ranges(labels)]
         # each label, each peak, and each range of a component
         self.sets = _core.make_group_sets([*table, *table.T, *parts])
+        self.pursue = pursue
         self.scramble = scramble
         n_axes = len(space.size)
         max_places = max(_MAX_PLACES_EACH * wanted, _MIN_MAX_PLACES)
         self.n_rounds = _ADAPTING_ROUNDS
+        if pursue:
+            self.n_rounds = _PURSUING_ROUNDS
         # at least those that parts are fitted to, and a first try
         max_places = max(max_places, self.n_rounds * ROUND_SIZE + _N_TRIAL)
         self.max_places = max_places
@@ -182,10 +185,8 @@ class AdaptiveSampler:
         models : `PlacedModels` or None
             None if no place has a probability above 0.
         """
-        draws = (label, score, peak)
-        of_object = (self.space, self.labels, self.target, self.work)
-        self.normal = find_peaks(*of_object, draws, len(self.peaks))
-        share = self._first_share(self._groups(label, peak))
+        share = np.bincount(self._groups(label, peak), minlength=self.n_groups)
+        self.pursued = (share > _MIN_PURSUED * share.sum()) & self.pursue
         parts = self._fit(Places(label, score, peak, np.ones(len(label))))
         adapted = self._adapt(parts, share)
         if adapted is None:
@@ -219,7 +220,7 @@ class AdaptiveSampler:
         mixtures = []
         ends = []
         total = np.zeros((1, self.n_rounds * ROUND_SIZE))
-        for _ in range(self.n_rounds):
+        for turn in range(self.n_rounds):
             mixture = parts.shared(self._guarded(share))
             mixtures.append(mixture)
             new = self._add_round(mixture, ROUND_SIZE)
@@ -235,10 +236,11 @@ class AdaptiveSampler:
                 return None
             n_flat = min(_MAX_FLAT, _FLAT_EACH * len(mixtures))
             places = self._places(n_flat)
-            share = sample.wanted
-            if sample.effective >= _FIRST_GOAL * self.wanted:
+            share = self._pursuing(sample.wanted)
+            good = sample.effective >= _FIRST_GOAL * self.wanted or turn + 1 >= _ADAPTING_ROUNDS
+            if good and not self.pursued.any():
                 break
-            parts = self._fit(places, n_local=_N_FIRST_LOCAL)
+            parts = self._fit(places)
         return self._fit(places, n_local=_N_LOCAL), share
 
     def _collect(self, parts, share, n_trial):
@@ -268,9 +270,6 @@ class AdaptiveSampler:
             n = self.n - first
             sample = replace(sample, enough=sample.enough and n >= _MIN_RESULT_PLACES)
             many_more = self.wanted > _MAX_SHORTAGE * sample.effective
-            # the shape of a label or a peak is not met
-            many_more |= sample.least_part * _MAX_SHORTAGE_EACH < 1.0
-            many_more |= sample.effective > self.wanted
             may_follow = self.max_places - self.n > _TRIAL_GROWTH * n
             if sample.enough or (many_more and n >= n_trial and may_follow):
                 break
@@ -296,30 +295,35 @@ class AdaptiveSampler:
         """
         Select `Places` for a fit of parts.
 
-        Weights of each peak are made flat enough to say what its shape is: to an effective number of ``n_flat``.
+        Weights of each peak are made flat enough to say what its shape is, or those of each label that has weight:
+        to an effective number of ``n_flat``.
         """
         rows = slice(0, self.n)
         log = self.evaluated[rows, 0] - np.log(self.density[rows])
         weight = np.exp(np.maximum(log - log.max(), -700.0))
+        group = self.peak[rows]
+        chosen = range(len(self.peaks))
+        if self.pursue:
+            group = self._groups(self.label[rows], self.peak[rows])
+            share = np.bincount(group, weight, minlength=self.n_groups)
+            chosen = np.flatnonzero(self.pursued | (share > MIN_WEIGHT * share.sum()))
         return Places(
             label=self.label[rows],
             score=self.score[rows],
             peak=self.peak[rows],
-            flat=self._flatten(log, n_flat),
+            flat=self._flatten(log, group, chosen, n_flat),
             weight=weight,
             log_target=self.evaluated[rows, 0],
         )
 
     def _fit(self, places, n_local=0):
         """Fit parts to places: `FittedParts`."""
-        return fit_mixture(self.labels, len(self.peaks), places, self.normal, n_local)
+        return fit_mixture(self.labels, len(self.peaks), places, n_local)
 
-    def _first_share(self, group):
-        """Shares of labels and peaks by the integrals of the peaks; what draws have, by ``group``, has some."""
-        count = np.bincount(group, minlength=self.n_groups)
-        share = self.normal.shares(self.n_groups, len(self.peaks))
-        share = np.maximum(share, _MIN_FIRST_SHARE * (share > 0))
-        return share + _DRAWN_SHARE * count / count.sum()
+    def _pursuing(self, share):
+        """Raise the shares of labels whose shape is still to be found, whatever their weight."""
+        min_share = _PURSUED_SHARE * share.sum()
+        return np.where(self.pursued, np.maximum(share, min_share), share)
 
     def _weigh(self, rows):
         """Weigh places by the posterior over the density of the proposal; None if none is possible."""
@@ -329,9 +333,8 @@ class AdaptiveSampler:
             return None
         weight = np.exp(np.maximum(log - top, -700.0))
         log_mean = top + np.log(weight.mean())
-        effective, least_part, wanted = self._wanted(weight, rows)
-        enough = effective >= self.wanted and least_part >= 1.0
-        return WeightedPlaces(rows, weight, log_mean, effective, least_part, enough, wanted)
+        effective, enough, wanted = self._wanted(weight, rows)
+        return WeightedPlaces(rows, weight, log_mean, effective, enough, wanted)
 
     def _add_round(self, mixture, size):
         """Draw places of a mixture and evaluate them; returned are their ends for `_core.add_density`."""
@@ -368,18 +371,17 @@ class AdaptiveSampler:
 
     def _wanted(self, weight, rows):
         """
-        Compute the effective number of weights, and the places wanted in each label and peak.
+        Compute the effective number of weights, whether it is enough, and places wanted in each label and peak.
 
-        Between them is the smallest part that labels, peaks, and components that count have of what each needs.
+        Labels, peaks, and components that count have enough of their own.
         """
         group = self._groups(self.label[rows], self.peak[rows])
         least_each = max(_EFFECTIVE_PART * self.wanted, _MIN_EFFECTIVE)
         limits = (float(self.wanted), float(least_each), MIN_WEIGHT)
         sums = np.empty((3, self.n_groups))
         wanted = np.empty(self.n_groups)
-        of_weights = (weight, group, self.sets, *limits, sums, wanted)
-        effective, least_part = _core.allocate_places(*of_weights)
-        return effective, least_part, wanted
+        effective, enough = _core.allocate_places(weight, group, self.sets, *limits, sums, wanted)
+        return effective, bool(enough), wanted
 
     def _guarded(self, share):
         """Raise shares of labels and peaks, so that each label, and each peak of the nodes, has some."""
@@ -393,16 +395,22 @@ class AdaptiveSampler:
         even_share = share.sum(axis=0) / len(share)
         return ((1.0 - _GUARD) * share + _GUARD * even_share).ravel()
 
-    def _flatten(self, log, n_flat):
-        """Flatten weights for a fit, in each peak of redshift enough to show its shape."""
+    def _flatten(self, log, group, chosen, n_flat):
+        """
+        Flatten weights for a fit, in each of some groups enough to show its shape.
+
+        A label whose own weights need not be made flat is no longer pursued: its weight can be believed.
+        """
         flat = np.zeros(self.n)
-        for j in range(len(self.peaks)):
-            rows = np.flatnonzero(self.peak[: self.n] == j)
+        for j in chosen:
+            rows = np.flatnonzero(group == j)
             if rows.size < _MIN_FITTED_PLACES:
                 continue
             flat_weight = np.empty(rows.size)
-            _core.flatten(log[rows], min(float(n_flat), 0.5 * rows.size), flat_weight)
+            power, _ = _core.flatten(log[rows], min(float(n_flat), 0.5 * rows.size), flat_weight)
             flat[rows] = flat_weight / flat_weight.sum()
+            if self.pursue and power == 1.0 and min(n_flat, 0.5 * rows.size) >= _MAX_FLAT:
+                self.pursued[j] = False
         return flat
 
     def _models(self, sample):

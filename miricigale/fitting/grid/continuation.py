@@ -244,7 +244,9 @@ class Continuation(Frozen):
             labels = self.labels
             borders, weights = redshift_peaks(self.engine.grid.redshift, start.zf.sum(axis=1))
         given = self.space, labels.kernel, self._work(), one, borders, weights
-        sampler = AdaptiveSampler(*given, wanted=n_effective, scramble=self.scramble)
+        sampler = AdaptiveSampler(
+            *given, wanted=n_effective, scramble=self.scramble, pursue=start.larger_errors
+        )
         label, score = labels.of_nodes(self._cells_of(start.index))
         peak = np.searchsorted(borders, self.engine.grid.redshift[start.index[:, 0]])
         models = sampler.run(label, score, peak)

@@ -42,7 +42,7 @@ GridOutput = namedtuple("GridOutput", list(_AXES) + ["joint"])
 #: What the posterior between nodes begins with: draws on the nodes, redshift, galaxy, AGN model and fraction,
 #: shape (n_draws, 4); the posterior of redshift and AGN fraction, (nz, nf); whether both are of larger errors; and
 #: ln of the weights that draws of another density need, (n_draws,), else None.
-Start = namedtuple("Start", "index zf larger_errors log_weight", defaults=(False, None))
+Start = namedtuple("Start", "index zf larger_errors log_weight", defaults=(None,))
 #: What a fit says of an object: its row; `Target` and `Limits` (or None); 2 ln(prior) of galaxies, (nz, nG), or
 #: None where it is that of all objects; if bands may be wrong its data with stated errors, these errors and the
 #: broad ones, (nb,), else None; its `Start`; ln of the factor that keeps the sum of the priors with those of mass;
@@ -315,7 +315,7 @@ class GridEngine(Frozen):
                     wrong = None
                     if broad is not None:
                         wrong = (stated, sigma[i], broad[i])
-                    start = Start(out.draw_index[i], out.zf[i])
+                    start = Start(out.draw_index[i], out.zf[i], False)
                     excess = out.chi2[i] / np.isfinite(sigma[i]).sum()
                     if excess > _MAX_EXCESS:
                         # errors at which the best model on nodes fits
@@ -367,7 +367,7 @@ class GridEngine(Frozen):
         arguments = (tables, self._scales, self._request, target, limits)
         if not (target.norm[0] > 0.0 and _core.sum_up(*arguments, *workspace, single=single)):
             return None
-        return Start(np.array(sums.draws.index), sums.zf / sums.zf.sum())
+        return Start(np.array(sums.draws.index), sums.zf / sums.zf.sum(), True)
 
     def _of_masses(self, target, space):
         """

@@ -20,18 +20,12 @@ _WIDE_SHARE = 0.2
 _WIDE_SQUARE = 1.4
 #: Factor by which widths of fitted parts are enlarged.
 _WIDER = 1.1
-#: The same of the normal distributions of peaks.
-_WIDER_PEAK = 1.15
-#: Share of these.
-_PEAK_SHARE = 0.3
 #: Share of narrow parts where weights are large.
 _LOCAL_SHARE = 0.5
 #: Smallest weight of the groups that have narrow parts.
-_MIN_LOCAL_WEIGHT = 0.005
-#: Number of places, those of the largest weights, that narrow parts are fitted to.
-_MAX_LOCAL_PLACES = 500
+_MIN_LOCAL_WEIGHT = 0.03
 #: Number of places that a narrow part is fitted to.
-_N_NEAR = 80
+_N_NEAR = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,18 +83,13 @@ class FittedParts:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """
-    Places of one label in one peak of redshift: their rows, and its parts.
-
-    These are fitted, wide, of peaks of the posterior, and narrow.
-    """
+    """Places of one label in one peak: their rows, and its parts, which are fitted, wide and narrow."""
 
     label: int
     peak: int
     rows: np.ndarray
     first: int
     n_fitted: int
-    peaks: np.ndarray
     n_local: int
 
     @property
@@ -111,34 +100,14 @@ class _Group:
     @property
     def last(self):
         """Index of the part after its own."""
-        return self.first + self.n_base + self.n_local
-
-    @property
-    def n_base(self):
-        """Number of its parts without the narrow ones."""
-        return self.n_fitted + 1 + self.peaks.size
-
-    def set_shares(self, share, of_peaks):
-        """Set shares of its parts, of which those that are fitted have theirs, but for the narrow ones."""
-        wide_share = _WIDE_SHARE
-        peak_share = 0.0
-        if self.peaks.size:
-            peak_share = _PEAK_SHARE
-            if not self.n_fitted:
-                peak_share = 1.0 - _WIDE_SHARE
-        elif not self.n_fitted:
-            wide_share = 1.0
-        share[self.first : self.wide] *= 1.0 - wide_share - peak_share
-        share[self.wide] = wide_share
-        share[self.wide + 1 : self.first + self.n_base] = peak_share * of_peaks
+        return self.wide + 1 + self.n_local
 
 
-def fit_mixture(labels, n_peaks, places, peaks, n_local=0):
+def fit_mixture(labels, n_peaks, places, n_local=0):
     """
     Fit a mixture to places.
 
-    Each label with weight in a peak of redshift has parts of its own, and the normal distributions of the peaks of
-    the posterior there. Each label has a wide part in each peak of redshift.
+    Each label with weight in a peak has parts of its own, and each label has a wide one in each peak.
 
     Parameters
     ----------
@@ -148,8 +117,6 @@ def fit_mixture(labels, n_peaks, places, peaks, n_local=0):
         Number of peaks of redshift.
     places : `Places`
         The places.
-    peaks : `~miricigale.fitting.grid.peaks.NormalPeaks`
-        Peaks of the posterior.
     n_local : int, optional
         Number of narrow parts for each label and peak that counts, which needs weights.
 
@@ -157,7 +124,7 @@ def fit_mixture(labels, n_peaks, places, peaks, n_local=0):
     -------
     parts : `FittedParts`
     """
-    groups = _groups(labels, n_peaks, places, peaks, n_local)
+    groups = _groups(labels, n_peaks, places, n_local)
     n_labels = len(labels.n_active)
     n_axes = places.score.shape[1]
     start = np.zeros(n_labels + 1, np.int64)
@@ -180,18 +147,15 @@ def fit_mixture(labels, n_peaks, places, peaks, n_local=0):
     for peak, (mean, cov) in moments.items():
         wide = np.array([group.wide for group in groups if group.peak == peak])
         _core.add_widest(labels, parts, wide, mean, _WIDE_SQUARE * cov, scratch)
-    _add_peaks(labels, parts, groups, peaks, scratch)
     for group in groups:
         if group.n_fitted:
             _fit_group(labels, parts, group, places, moments[group.peak])
-        of_peaks = peaks.weights(group.peaks)
-        group.set_shares(parts.share, of_peaks)
         if group.n_local:
             _add_local_parts(labels, parts, group, places)
     return FittedParts(parts, np.array(index))
 
 
-def _groups(labels, n_peaks, places, peaks, n_local):
+def _groups(labels, n_peaks, places, n_local):
     """List the labels in peaks that places have weight in: `_Group`, by label."""
     n_labels = len(labels.n_active)
     index = places.label * n_peaks + places.peak
@@ -202,15 +166,14 @@ def _groups(labels, n_peaks, places, peaks, n_local):
         share = np.bincount(index, places.weight, minlength=n_groups).reshape(flat.shape)
         share = share / share.sum()
     of_peak = flat.sum(axis=0)
-    redshift_peaks = np.flatnonzero(of_peak > 0)
-    of_normal = peaks.label * n_peaks + peaks.peak
+    peaks = np.flatnonzero(of_peak > 0)
     # whole numbers of few bits are sorted by counting them
     order = np.argsort(index.astype(np.min_scalar_type(n_groups)), kind="stable")
     ends = np.concatenate([[0], np.cumsum(np.bincount(index, minlength=n_groups))])
     groups = []
     first = 0
     for label in range(n_labels):
-        for peak in redshift_peaks:
+        for peak in peaks:
             k = label * n_peaks + peak
             rows = order[ends[k] : ends[k + 1]]
             n_fitted = 0
@@ -220,8 +183,7 @@ def _groups(labels, n_peaks, places, peaks, n_local):
             n_narrow = n_local
             if share[label, peak] < _MIN_LOCAL_WEIGHT or rows.size < _N_NEAR:
                 n_narrow = 0
-            normal = np.flatnonzero(of_normal == k)
-            group = _Group(label, peak, rows, first, n_fitted, normal, n_narrow)
+            group = _Group(label, peak, rows, first, n_fitted, n_narrow)
             groups.append(group)
             first = group.last
     return groups
@@ -246,7 +208,7 @@ def _moments_of_peaks(places):
 
 
 def _fit_group(labels, parts, group, places, moments):
-    """Fit parts to the places of a group."""
+    """Fit parts to the places of a group, and let its wide one have a share."""
     n_axes = places.score.shape[1]
     rows = group.rows[places.flat[group.rows] > 0]
     n = group.n_fitted
@@ -271,18 +233,8 @@ def _fit_group(labels, parts, group, places, moments):
         cov,
         scratch,
     )
-
-
-def _add_peaks(labels, parts, groups, peaks, scratch):
-    """Set the parts of the peaks of all groups."""
-    rows = np.concatenate([group.peaks for group in groups])
-    if not rows.size:
-        return
-    places = []
-    for group in groups:
-        places.append(np.arange(group.wide + 1, group.first + group.n_base))
-    of_peaks = (peaks.label[rows], peaks.score[rows], peaks.cov[rows])
-    _core.add_normal_parts(labels, parts, np.concatenate(places), *of_peaks, _WIDER_PEAK, scratch)
+    parts.share[group.first : group.wide] *= 1.0 - _WIDE_SHARE
+    parts.share[group.wide] = _WIDE_SHARE
 
 
 def _add_local_parts(labels, parts, group, places):
@@ -290,12 +242,6 @@ def _add_local_parts(labels, parts, group, places):
     n_axes = places.score.shape[1]
     rows = group.rows
     weight = places.weight[rows]
-    if rows.size > _MAX_LOCAL_PLACES:
-        # places of hardly any weight say nothing; in their order, which neighbors in memory follow
-        heavy = np.argpartition(weight, -_MAX_LOCAL_PLACES)[-_MAX_LOCAL_PLACES:]
-        heavy.sort()
-        rows = rows[heavy]
-        weight = weight[heavy]
     log = places.log_target[rows]
     target = np.exp(np.maximum(log - log.max(), -700.0))
     scratch = (
@@ -306,7 +252,7 @@ def _add_local_parts(labels, parts, group, places):
         np.empty((n_axes, n_axes)),
     )
     points = (places.score[rows], weight / weight.sum(), target)
-    counts = (group.first, group.n_base, group.n_local)
+    counts = (group.first, group.n_fitted + 1, group.n_local)
     _core.add_local_parts(labels, parts, *counts, _LOCAL_SHARE, _N_NEAR, _WIDER, points, scratch)
 
 
