@@ -1,5 +1,7 @@
 """Adaptive importance sampling between nodes, against closed forms and sums over many models of the prior."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -181,6 +183,14 @@ def test_names_and_places_in_a_catalog_are_no_matter(fitter, table, results):
             assert_array_equal(getattr(results, name)[mine], getattr(others, name)[theirs])
         for name in results.axes:
             assert_array_equal(results.pdf[name][mine], others.pdf[name][theirs])
+
+
+def test_workers_do_not_matter(fitter, table, results):
+    """Objects fitted by several threads, one at a time, have the same bytes."""
+    with ThreadPoolExecutor(3) as executor:
+        others = fitter.fit(table, chunk_size=1, executor=executor)
+    for name in ("moments", "quantiles", "axis_moments", "axis_quantiles", "pdf_2d", "flags"):
+        assert_array_equal(getattr(results, name), getattr(others, name))
 
 
 def test_what_is_not_converged_is_flagged(grid, table, monkeypatch):

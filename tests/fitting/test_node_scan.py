@@ -59,6 +59,16 @@ def test_draws_follow_the_sums_over_nodes(engine, objects):
         assert_array_equal(start.index[:, 2] < 0, start.index[:, 3] == 0)
 
 
+def test_sharp_peaks_are_at_their_node(engine, objects):
+    """Errors of 1 % leave the true redshift alone, which a scan of every other one may pass over."""
+    flux, _, log_prior = objects
+    scanned = {}
+    scan = NodeScan(engine, 64)
+    scan.fit(flux, 0.01 * flux, log_prior, lambda known: scanned.update({known.row: known}))
+    for i, node in enumerate((2, 5, 7)):
+        assert_array_equal(scanned[i].start.index[:, 0], node)
+
+
 def test_evidence_has_the_same_prior_of_mass(engine, objects):
     sums = []
     engine.fit(*objects, each=lambda known: sums.append((known.log_norm, known.zero)))
