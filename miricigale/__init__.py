@@ -17,4 +17,4 @@ except ImportError:  # a source tree that was never built
 __citation__ = "See CITATION.cff; the method repeats Yang et al. 2021, ApJ 908, 144."
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__all__ = ["__citation__", "__version__"] + list(__all__)
+__all__ = ["__citation__", "__version__", *__all__]

@@ -86,7 +86,8 @@ def fit_options(args):
 
     options = filled(args, fit_classes, fit_catalog)
     for name in _OF_FILE:
-        value = getattr(args, name)
+        # not all are options of agn
+        value = getattr(args, name, None)
         if value is not None:
             options[name] = value
     return options

@@ -236,7 +236,7 @@ def test_several_bands_are_measured_in_one_call(files, tmp_path, capsys):
     assert len(list((folder / "out-sources").iterdir())) == 2
     # an option given once for two images, and one filter twice
     assert main([*command, *more[:2]]) == 2
-    assert "'--weight' must be given for each of 2 images" in capsys.readouterr().err
+    assert "--filter must be given for each of 2 images" in capsys.readouterr().err
     assert main([*command, *more[:2], "--filter", BAND, *more[4:], "--overwrite"]) == 2
     assert "--image must be of different filters" in capsys.readouterr().err
 

@@ -312,7 +312,7 @@ def test_model_psfs_of_a_nircam_prior(field, tmp_path):
 
     named = {"INSTRUME": "NIRCAM", "FILTER": "F444W", "PUPIL": "CLEAR"}
     path = edited(field, tmp_path, "prior", drawn_anew, **named)
-    message = r"'highres_pa_aper' must be given, .* \(or 'highres_psf'\)"
+    message = r"'highres_pa_aper' must be given \(or 'highres_psf'\), for the header"
     refuses(message, fluxes, field, highres=path)
     found = fluxes(field, highres=path, highres_pa_aper=40 * u.deg, page=tmp_path / "page.html")
     assert "FWHM of the PSF (arcsec)" in (tmp_path / "page.html").read_text()
