@@ -14,7 +14,8 @@ from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.model import PSFGrid
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
-from miricigale.utils.options import check_choice
+from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.positions import plain_positions
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -75,6 +76,9 @@ class KernelField:
         if not isinstance(self.sky, SkyCoord) or self.sky.shape != (len(kernels),):
             wanted = f"a SkyCoord of shape ({len(kernels)},), a place for each kernel"
             raise argument_error("sky", wanted, self.sky)
+        place = plain_positions(self.sky).spherical
+        bad = int(np.count_nonzero(~(np.isfinite(place.lon) & np.isfinite(place.lat))))
+        check_that(not bad, "sky", "finite", f"{bad} positions that are masked or NaN")
         check_choice(self.method, "method", ("linear", "nearest"))
         # which refuses what is not alike
         object.__setattr__(self, "_mean", MatchingKernel.blend(kernels))
@@ -144,13 +148,17 @@ class KernelField:
         Returns
         -------
         weights : `~numpy.ndarray`, shape (n, k)
-            Not negative; each row has the sum 1.
+            Not negative; each row has the sum 1, or is NaN where the position is masked or NaN.
         """
+        sky = plain_positions(sky)
         weights = np.zeros((len(sky), len(self)))
         rows = np.arange(len(sky))
         if self.method == "nearest" or len(self) == 1:
-            if len(sky):
-                weights[rows, self._tree.query(self._unit(sky))[1]] = 1.0
+            unit = self._unit(sky)
+            placed = np.isfinite(unit).all(axis=1)
+            weights[~placed] = np.nan
+            if placed.any():
+                weights[rows[placed], self._tree.query(unit[placed])[1]] = 1.0
             return weights
         at = self._plane(sky)
         inside = np.zeros(len(sky), bool)

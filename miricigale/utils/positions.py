@@ -75,6 +75,30 @@ def as_position(value, argument):
     return SkyCoord(position.ra, position.dec)
 
 
+def plain_positions(sky):
+    """
+    Positions without a mask.
+
+    Parameters
+    ----------
+    sky : `~astropy.coordinates.SkyCoord`
+        Masked or not.
+
+    Returns
+    -------
+    sky : `~astropy.coordinates.SkyCoord`
+        Itself if nothing is masked; else directions alone, NaN where they are masked.
+    """
+    place = sky.spherical
+    hidden = mask_of(place.lon) | mask_of(place.lat)
+    if not hidden.any():
+        return sky
+    lon = np.where(hidden, np.nan, getattr(place.lon, "unmasked", place.lon).to_value(u.deg))
+    lat = np.where(hidden, np.nan, getattr(place.lat, "unmasked", place.lat).to_value(u.deg))
+    directions = UnitSphericalRepresentation(lon * u.deg, lat * u.deg)
+    return SkyCoord(sky.frame.replicate_without_data().realize_frame(directions))
+
+
 def at_epoch(sky, epoch, argument):
     """
     Positions at the time of an image, by the proper motions that they carry.

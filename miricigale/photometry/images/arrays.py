@@ -12,6 +12,7 @@ from miricigale.instrument import ImageFacts, north_up_wcs, pixel_area_map
 from miricigale.photometry.images.sky_noise import mask_filled
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
+from miricigale.utils.positions import plain_positions
 from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, to_array
 
 #: uJy per MJy.
@@ -180,8 +181,8 @@ def pixels_to_sky(xy, wcs):
 
 
 def sky_to_pixels(sky, wcs):
-    """Return the pixels (x, y), shape (n, 2), of coordinates."""
-    return np.stack(wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
+    """Return the pixels (x, y), shape (n, 2), of coordinates; NaN where they are masked."""
+    return np.stack(wcs.world_to_pixel(plain_positions(sky)), axis=-1).reshape(-1, 2)
 
 
 def same_grid(first, second):
