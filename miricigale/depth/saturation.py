@@ -79,7 +79,7 @@ class SaturationForecast:
         Parameters
         ----------
         rate : `~numpy.ndarray`, shape (ny, nx)
-            Electrons per second; NaN where a pixel does not count.
+            Electrons per second; masked or NaN where a pixel does not count.
         exposure : `~miricigale.instrument.Exposure`
             What is exposed.
         limit : float
@@ -91,6 +91,7 @@ class SaturationForecast:
         -------
         forecast : `SaturationForecast`
         """
+        rate = floats(rate)
         step = exposure.group_time.to_value(u.s)
         group = saturation_group(rate, limit, step)
         good = rate[np.isfinite(rate)]

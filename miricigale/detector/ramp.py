@@ -13,6 +13,7 @@ from miricigale.detector.effects.order import checked_effects
 from miricigale.instrument import DQ, STEPS, DetectorProperties, ExposureHistory
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.missing_values import mask_of
 from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.units import DN
@@ -98,7 +99,11 @@ class Ramp(Interactive, NDData):
         header=None,
         meta=None,
     ):
-        data = np.asarray(data)
+        if hasattr(data, "mask"):
+            bad = int(np.count_nonzero(mask_of(data)))
+            wanted = "without a mask ('group_dq' says what is wrong with groups)"
+            check_that(not bad, "data", wanted, f"{bad} masked values")
+        data = np.asarray(getattr(data, "unmasked", data))
         shape = (exposure.n_integrations, exposure.n_groups) + exposure.shape
         check_that(data.shape == shape, "data", f"of the exposure's shape {shape}", data.shape)
         if data.dtype not in (np.uint16, np.float32):

@@ -7,6 +7,7 @@ from miricigale.psf.miri import miri_psf
 from miricigale.psf.model import SHARED, InstrumentPSF, PSFGrid
 from miricigale.psf.resample import alike
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
 from miricigale.utils.options import check_that
 
@@ -44,7 +45,7 @@ def psf_grid(psfs, positions):
     0.331 arcsec
     """
     psfs = list(psfs)
-    positions = np.asarray(positions, dtype=float)
+    positions = floats(positions)
     if positions.ndim != 2 or positions.shape != (len(psfs), 2):
         raise argument_error("positions", f"of shape ({len(psfs)}, 2)", positions.shape)
     columns = np.unique(positions[:, 0])
@@ -144,7 +145,7 @@ def grid_weights(grid, x, y):
     >>> grid_weights(grid, [50], [0])
     array([[0.5, 0.5, 0. , 0. ]])
     """
-    x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
+    x, y = np.broadcast_arrays(np.atleast_1d(floats(x)), floats(y))
     positions = np.asarray(grid.grid_xypos, dtype=float)
     if len(positions) == 1:
         return np.ones((x.size, 1))

@@ -4,12 +4,13 @@ import numpy as np
 from scipy.signal import fftconvolve, oaconvolve
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 
 
 def convolved(image, array):
     """Image of the same shape, convolved with an array and zero outside of it."""
-    image = np.asarray(image, dtype=float)
+    image = floats(image)
     check_that(image.ndim == 2, "image", "2D", f"shape {image.shape}")
     bad = int(np.count_nonzero(~np.isfinite(image)))
     check_that(not bad, "image", "finite", f"{bad} pixels that are NaN or infinite")
@@ -29,7 +30,7 @@ def blended(kernels, weights=None):
     if weights is None:
         w = np.ones(n)
     else:
-        w = np.asarray(weights, dtype=float)
+        w = floats(weights)
     if w.shape != (n,) or np.any(w < 0) or not w.sum() > 0:
         raise argument_error("weights", f"{n} non-negative numbers, not all 0", weights)
     forms = {(k.pixel_scale, *(np.shape(getattr(k, name)) for name in names)) for k in kernels}

@@ -17,6 +17,7 @@ from miricigale.psf.wiener import checked_square, choose, energy_error, energy_r
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
@@ -338,7 +339,17 @@ class MatchingKernel(Interactive):
         -------
         kernel : `MatchingKernel`
             With the automatic regularization; that of points on an image stays one of points.
+
+        Raises
+        ------
+        ValueError
+            If a pixel is masked or not finite.
         """
+        source = floats(source)
+        target = floats(target)
+        for name, values in (("source", source), ("target", target)):
+            bad = int(np.count_nonzero(~np.isfinite(values)))
+            check_that(not bad, name, "finite", f"{bad} pixels that are masked, NaN or infinite")
         if np.count_nonzero(self.array) == 1:
             return dataclasses.replace(self, source=target, target=target)
         mu, array, figures = choose("auto", wiener(source, target), source, target, 1e-3)

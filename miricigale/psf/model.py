@@ -108,6 +108,9 @@ class InstrumentPSF(ImagePSF):
         check_that(frame in FRAMES, "frame", f"one of {FRAMES}", repr(frame))
         cells = check_count(oversampling, "oversampling")
         scale = positive(pixel_scale, ANGLE, "pixel_scale")
+        if hasattr(data, "mask"):
+            # masked pixels are refused as NaN is
+            data = floats(data)
         super().__init__(data, oversampling=cells, origin=origin, meta=dict(meta or {}))
         if frame == "sky":
             turn = float(to_array(angle, u.deg, "angle", finite=True))

@@ -24,6 +24,7 @@ from miricigale.reduction.images.images import (
 )
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 
 # pixels of the boxes by which the variance that gives weights is smoothed
@@ -273,7 +274,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     pixfrac : float, optional
         Side of the drops in input pixels, 0-1.
     weights : list of `~numpy.ndarray`, optional
-        Weight of each pixel; by default `weight_map`.
+        Weight of each pixel, none where it is masked or NaN; by default `weight_map`.
     pixel_maps : list of (x, y), optional
         Results of `pixel_map`, if they are there already. Pixels whose place is not finite have no weight.
     variances : list of dict of str to `~numpy.ndarray`, optional
@@ -331,7 +332,8 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     if weights is None:
         weights = [weight_map(im) for im in images]
     else:
-        weights = list(weights)
+        weights = [floats(weight) for weight in weights]
+        weights = [np.where(np.isnan(weight), 0.0, weight) for weight in weights]
     # drizzle works in float32: weights near one
     medians = [np.median(w[w > 0]) for w in weights if np.any(w > 0)]
     if medians:
@@ -364,7 +366,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
         if part is None or not weight.any():
             continue
         parts = [np.square(np.asarray(sigma(im), float))]
-        parts += [image_variances[name] for name in names]
+        parts += [floats(image_variances[name]) for name in names]
         parts = [np.where(weight > 0, plane, 0.0).astype(np.float32) for plane in parts]
         add_image(sink, im, weight, (x, y), wcs, pixfrac, data2=parts)
         touched = sink.out_wht[part] > before[part]

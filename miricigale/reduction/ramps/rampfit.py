@@ -23,6 +23,7 @@ from miricigale.reduction._core.pixel import own_charge
 from miricigale.reduction.ramps.showers import find_showers
 from miricigale.reduction.references.reference_maps import read_variance
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats, without_mask
 from miricigale.utils.options import check_positive, check_that
 from miricigale.utils.parallel import chunks, parallel_map, threads
 from miricigale.utils.units import check_count
@@ -213,7 +214,11 @@ def fit_groups(
     >>> print(f"{fit.rate[2, 3]:.2f} DN/s, jump in group {fit.jumps['group'][0]}")
     5.00 DN/s, jump in group 12
     """
+    data, hidden = without_mask(data)
     data = np.asarray(data)
+    is_rounded = data.dtype.kind in "iu"
+    if hidden is not None:
+        data = np.where(hidden, np.nan, data)
     check_that(data.ndim == 4, "data", "of four dimensions", f"shape {data.shape}")
     _n_int, n_group, ny, nx = data.shape
     if last_group is None:
@@ -254,7 +259,7 @@ def fit_groups(
     group_dq = _read_only(group_dq)
 
     data = _read_only(data)
-    variance = read_variance(read_noise, n_frames, rounded=data.dtype.kind in "iu")
+    variance = read_variance(read_noise, n_frames, rounded=is_rounded)
     out = tuple(np.full((ny, nx), np.nan, np.float32) for _ in range(3))
     out += tuple(np.zeros((ny, nx), kind) for kind in (np.int16, np.int16, np.int64))
     rise = (n_frames - 1) / (2 * n_frames)
@@ -299,7 +304,7 @@ def _read_only(array):
 
 def _map(values, name, usable, *, above=-np.inf, floor=-np.inf, infinite=False):
     """One value (1, 1), or one for each pixel, that is in range wherever it is used."""
-    values = np.array(values, float, ndmin=2, order="C")
+    values = np.array(floats(values), ndmin=2, order="C")
     if values.shape not in ((1, 1), usable.shape):
         raise argument_error(name, f"one number or of shape {usable.shape}", values.shape)
     good = (values > above) & (values >= floor) & (np.isfinite(values) | infinite)
@@ -324,7 +329,7 @@ def _map(values, name, usable, *, above=-np.inf, floor=-np.inf, infinite=False):
 
 def _drift(values, shape):
     """Drift of the read-out as (n_int, n_group, rows, channels)."""
-    values = np.asarray(values, float)
+    values = floats(values)
     if values.ndim <= 2:
         values = np.broadcast_to(values, shape[:2])[:, :, None, None]
     fits = values.ndim == 4 and values.shape[:2] == shape[:2] and values.shape[2] in (1, shape[2])
@@ -338,6 +343,8 @@ def _groups(values, name, shape, *, n_least=0):
     """Maps of groups and integrations, float32; what is not finite there is taken as zero."""
     if values is None:
         return _read_only(np.zeros((1, 0, 1, 1), np.float32))
+    if hasattr(values, "mask"):
+        values = floats(values)
     values = np.asarray(values, np.float32)
     if values.ndim != 4 or values.shape[2:] != shape[2:] or values.shape[1] < n_least:
         wanted = f"of shape (n, {n_least} or more, {shape[2]}, {shape[3]})"

@@ -5,6 +5,7 @@ import numpy as np
 from miricigale.instrument import DQ, field_mask
 from miricigale.reduction.images.images import flag_pixels, plain_flags, with_data
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
 
@@ -62,7 +63,7 @@ def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
     inside = field_mask(subarray=subarray)
     if rate.shape != inside.shape:
         raise argument_error("rate", f"of shape {inside.shape} for {subarray!r}", rate.shape)
-    flat = np.broadcast_to(np.asarray(flat, np.float32), rate.shape)
+    flat = np.broadcast_to(floats(flat).astype(np.float32), rate.shape)
     scale = np.float32(rate.unit.to(RATE) * conversion) / flat
     out = with_data(
         rate,
