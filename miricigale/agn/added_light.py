@@ -8,6 +8,7 @@ from astropy.table import QTable
 from miricigale.evaluation import agn_fraction
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, read_ids, require_columns
@@ -48,6 +49,8 @@ class NoiseCurve:
         curve : `NoiseCurve` or None
             None without any flux.
         """
+        flux = floats(flux)
+        error = floats(error)
         good = np.isfinite(flux) & np.isfinite(error) & (error > 0)
         if not good.any():
             return None
@@ -106,8 +109,8 @@ def add_light(photometry, light, *, curves, seed):
         agn_flux = to_array(agn_flux, FNU, "light", ndim=1)
         if not np.all(np.isfinite(agn_flux) & (agn_flux >= 0)):
             raise argument_error("light", f"finite and 0 or more in {band}", "others")
-        flux = table[band].to_value(FNU)
-        error = table[error_column(band)].to_value(FNU)
+        flux = to_array(table[band], FNU, band)
+        error = to_array(table[error_column(band)], FNU, error_column(band))
         changed = np.isfinite(flux) & np.isfinite(error) & (error > 0) & (agn_flux > 0)
         if f"{band}_limit" in table.colnames:
             changed &= ~np.asarray(table[f"{band}_limit"], bool)

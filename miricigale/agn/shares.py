@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import check_count
@@ -44,8 +45,8 @@ class ShareDraws:
 
 def _check_table(table, prior):
     """Weights of the bins for each object, which sum to 1, and the prior of the fractions."""
-    table = np.asarray(table, float)
-    prior = np.asarray(prior, float)
+    table = floats(table)
+    prior = floats(prior)
     check_that(table.ndim == 4, "table", "of shape (n, n_z, n_frac, n_lum)", f"shape {table.shape}")
     wanted = f"{table.shape[2]} weights, one for each bin of the AGN fraction"
     check_that(prior.shape == table.shape[2:3], "prior", wanted, f"shape {prior.shape}")

@@ -13,6 +13,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_columns
+from miricigale.utils.units import to_array
 
 _CGS = u.erg / u.s / u.cm**2
 #: Share of the X-rays that absorption leaves in Yang et al. 2021.
@@ -118,6 +119,8 @@ def xray_luminosity_at(flux, redshift):
     3.5e+42 erg / s
     """
     unit = u.erg / u.s
+    received = unit / u.cm**2
+    flux = to_array(flux, received, "flux") * received
     return (flux / xray_flux(1 * unit, redshift, transmission=_TRANSMISSION)).to(u.one) * unit
 
 

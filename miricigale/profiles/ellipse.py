@@ -39,7 +39,7 @@ def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     direction = np.pi / 2 - floats(position_angle)
     radius = floats(radius)
     axis_ratio = floats(axis_ratio)
-    jacobian = np.asarray(jacobian, dtype=float)
+    jacobian = floats(jacobian)
     radius, axis_ratio, direction = np.broadcast_arrays(radius, axis_ratio, direction)
     cos = np.cos(direction)
     sin = np.sin(direction)

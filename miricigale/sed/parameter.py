@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.missing_values import without_mask
 from miricigale.utils.options import check_that
 
 
@@ -140,13 +141,13 @@ class Parameter:
         """
         if isinstance(values, (list, tuple)) and any(hasattr(v, "unit") for v in values):
             values = self._quantity(values, "a mixture")
-        mask = getattr(values, "mask", None)
-        converted = self.convert(getattr(values, "unmasked", values))
+        values, mask = without_mask(values)
+        converted = self.convert(values)
         array = np.atleast_1d(np.asarray(np.ma.getdata(converted)))
         check_that(array.ndim == 1, self.name, "of one dimension", f"shape {array.shape}")
         check_that(array.dtype.kind in "iuf", self.name, "numbers", f"values of type {array.dtype}")
         out = array.astype(float)
-        if mask is not None and np.any(mask):
+        if mask is not None:
             out[np.broadcast_to(mask, out.shape)] = np.nan
         return out
 

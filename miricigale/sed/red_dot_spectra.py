@@ -8,6 +8,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from miricigale.sed.presets import red_dot_axes
 from miricigale.sed.spectrum import SED
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.units import FNU, WAVE, to_array
 
@@ -203,7 +204,7 @@ def red_dots(axes=None, *, atmospheres=None):
         axes = dict(axes)
     axes.pop("redshift", None)
     check_names(axes, "parameter of a red dot", _PARAMETERS)
-    values = [np.atleast_1d(np.asarray(axis, dtype=float)).tolist() for axis in axes.values()]
+    values = [np.atleast_1d(floats(axis)).tolist() for axis in axes.values()]
     out = {}
     for point in product(*values):
         chosen = dict(zip(axes, point, strict=True))

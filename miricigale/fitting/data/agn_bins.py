@@ -92,7 +92,9 @@ class AGNBins:
         place : tuple of `~numpy.ndarray` of int, shape (n,)
             Bin of each axis. Without an AGN the luminosity is in the first.
         """
-        frac_agn = np.asarray(frac_agn, float)
+        redshift = floats(redshift)
+        frac_agn = floats(frac_agn)
+        luminosity = floats(luminosity)
         n_z = len(self.redshift) - 1
         z_bin = np.searchsorted(self.redshift, redshift, side="right") - 1
         z_bin = np.where((z_bin < 0) | (z_bin >= n_z), n_z, z_bin)
