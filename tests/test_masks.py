@@ -126,6 +126,17 @@ IMAGE = CCDData(
     unit="uJy",
     wcs=north_up_wcs(CENTER, 0.1 * u.arcsec, (61, 61)),
 )
+TABLE = QTable({"id": np.arange(5)})
+for _band_name in ("acs.f606w", "wfc3.f160w"):
+    TABLE[_band_name] = FLUX
+    TABLE[f"{_band_name}_err"] = FLUX / 9
+FITTER = fitting.BayesFitter(
+    GALAXY,
+    ["acs.f606w", "wfc3.f160w"],
+    axes={"redshift": [0.3, 0.6, 1.0, 1.5, 2.2], "age": [1.0, 2.0]},
+)
+RESULTS = FITTER.fit(TABLE)
+DRAWS = FITTER.sample(TABLE, 3, seed=1)
 BLANK = CCDData(IMAGE.data - 1, unit="uJy", wcs=IMAGE.wcs)
 EVEN = CCDData(
     np.ones((61, 61)),
@@ -439,6 +450,13 @@ FUNCTIONS = {
         lambda x: reduction.drizzle_images([EVEN], EVEN.wcs, variances=[{"var_rnoise": _plane(x)}]).variances, X),
     "sed.with_xray_bands.alpha_ox": (lambda x: _with_xrays({"hard": [2, 7] * u.keV}, x), X - 3),
     "sed.with_xray_bands.bands": (lambda x: _with_xrays({"hard": x[:2]}, [-1.5]), X << u.keV),
+    "fitting.BayesFitter.fit.redshift": (lambda x: FITTER.fit(TABLE, redshift=x).chi2, X),
+    "fitting.FitResults.percentile.levels": (lambda x: RESULTS.percentile("redshift", x), X / 3),
+    "fitting.Samples.percentile.levels": (lambda x: DRAWS.percentile("redshift", x), X / 3),
+    "fitting.compare_classes.prior": (
+        lambda x: fitting.compare_classes({"a": RESULTS, "b": RESULTS}, prior={"a": x, "b": 1 - X / 3}), X / 3),
+    "photometry.ErrorModel.assign.noise": (
+        lambda x: ERRORS.assign(QTable({"id": np.arange(5), "miri.f770w": FLUX}), noise={"miri.f770w": x}), X),
     "scene.deconvolve.psf": (lambda x: scene.deconvolve(np.eye(9), _image(x)), X),
     "sed.Parameter.array.values": (lambda x: sed.Parameter(default=1.0, bounds=(0, 5), doc="a").array(x), X),
     "sed.band_luminosity.from_band": (
@@ -517,20 +535,18 @@ EXEMPT = {
         "reduction.reference_drift.offsets",
         "reduction.settling_groups.data",
     ],
-    "passed on to an argument of the matrix": ["psf.KernelField.from_psfs.hi"],
+    "passed on to an argument of the matrix": [
+        "fitting.BayesFitter.__call__.redshift",
+        "psf.KernelField.from_psfs.hi",
+    ],
     "tested below: positions in a `SkyCoord`": ["sed.color_excess.sky"],
     "not tried yet": [
         "cigale.CigaleSetup.*.redshifts",
-        "fitting.BayesFitter.*.redshift",
         "agn.agn_light.luminosity",
         "agn.agn_light.parameters",
-        "fitting.FitResults.percentile.levels",
         "fitting.FitResults.plot_redshift.z_spec",
-        "fitting.Samples.percentile.levels",
         "fitting.calibrate.redshift",
-        "fitting.compare_classes.prior",
         "fitting.measure_template_error.edges",
-        "photometry.ErrorModel.assign.noise",
         "photometry.ErrorModel.from_tables.noise",
         "photometry.ForcedPhotometer.render.flux",
         "photometry.SourceTemplates.from_arrays.arrays",

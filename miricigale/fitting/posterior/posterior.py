@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.fitting._core import percentile_places
 from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.object_rows import ObjectRows
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
@@ -50,7 +51,7 @@ def check_levels(levels):
 
     A `ValueError` if one is neither, or both kinds are there.
     """
-    levels = np.atleast_1d(np.asarray(levels, dtype=float))
+    levels = np.atleast_1d(floats(levels))
     check_that(levels.ndim == 1, "levels", "a number or a list of numbers", f"shape {levels.shape}")
     if levels.size and np.all((levels > 1) & (levels < 100)):
         # 1 is left out: it may be 1 or 100 percent
