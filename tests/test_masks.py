@@ -137,6 +137,12 @@ FITTER = fitting.BayesFitter(
 )
 RESULTS = FITTER.fit(TABLE)
 DRAWS = FITTER.sample(TABLE, 3, seed=1)
+NUCLEI = sed.SEDModel.yang2021(libraries="bundled")
+HOSTS = fitting.BayesFitter(
+    NUCLEI,
+    ["acs.f606w", "wfc3.f160w"],
+    axes={"redshift": [0.5, 1.0], "age": [1.0, 2.0], "frac_agn": [0.0, 0.5]},
+).fit(TABLE)
 BLANK = CCDData(IMAGE.data - 1, unit="uJy", wcs=IMAGE.wcs)
 EVEN = CCDData(
     np.ones((61, 61)),
@@ -187,6 +193,11 @@ def _plane(values):
 def _with_xrays(bands, slopes):
     grid = GALAXY.grid({"redshift": [1.0], "age": X}, ["acs.f606w"])
     return sed.with_xray_bands(grid, GALAXY, bands, alpha_ox=slopes).galaxy
+
+
+def _template(array):
+    catalog = QTable({"id": [1], "sky": CENTER.reshape(1)})
+    return photometry.SourceTemplates.from_arrays([array], [(3, 3)], catalog, wcs=IMAGE.wcs)
 
 
 def _sky(values):
@@ -457,6 +468,9 @@ FUNCTIONS = {
         lambda x: fitting.compare_classes({"a": RESULTS, "b": RESULTS}, prior={"a": x, "b": 1 - X / 3}), X / 3),
     "photometry.ErrorModel.assign.noise": (
         lambda x: ERRORS.assign(QTable({"id": np.arange(5), "miri.f770w": FLUX}), noise={"miri.f770w": x}), X),
+    "agn.agn_light.luminosity": (
+        lambda x: agn.agn_light(NUCLEI, HOSTS, x, {}, ["miri.f770w"])[0]["miri.f770w"], LUMINOSITY),
+    "photometry.SourceTemplates.from_arrays.arrays": (lambda x: _template(_image(x)).light[0].data, X),
     "scene.deconvolve.psf": (lambda x: scene.deconvolve(np.eye(9), _image(x)), X),
     "sed.Parameter.array.values": (lambda x: sed.Parameter(default=1.0, bounds=(0, 5), doc="a").array(x), X),
     "sed.band_luminosity.from_band": (
@@ -542,14 +556,12 @@ EXEMPT = {
     "tested below: positions in a `SkyCoord`": ["sed.color_excess.sky"],
     "not tried yet": [
         "cigale.CigaleSetup.*.redshifts",
-        "agn.agn_light.luminosity",
         "agn.agn_light.parameters",
         "fitting.FitResults.plot_redshift.z_spec",
         "fitting.calibrate.redshift",
         "fitting.measure_template_error.edges",
         "photometry.ErrorModel.from_tables.noise",
         "photometry.ForcedPhotometer.render.flux",
-        "photometry.SourceTemplates.from_arrays.arrays",
         "photometry.SourceTemplates.from_images.psf",
         "reduction.DetectorMaps.linearity",
         "scene.highres_image.noise",

@@ -163,7 +163,7 @@ def agn_light(model, hosts, luminosity, parameters, bands, *, quantity="accretio
     hosts : `~miricigale.fitting.FitResults`
         Fits of the n galaxies, of whose best models the AGN are, without that model's own AGN.
     luminosity : `~astropy.units.Quantity`, shape (n,)
-        Luminosities of the AGN; 0 is none.
+        Luminosities of the AGN; 0 is none, and masked or NaN is not known.
     parameters : dict of str to `~numpy.ndarray`, shape (n,)
         Parameters of the AGN models.
     bands : list of str
@@ -174,8 +174,8 @@ def agn_light(model, hosts, luminosity, parameters, bands, *, quantity="accretio
     Returns
     -------
     light : dict of str to `~astropy.units.Quantity`, shape (n,)
-        Fluxes by band; NaN where there is no such model, as in a galaxy whose dust has no luminosity, on which the
-        AGN fraction is based.
+        Fluxes by band; NaN where the luminosity is not known or there is no such model, as in a galaxy whose dust
+        has no luminosity, on which the AGN fraction is based.
     frac_agn : `~numpy.ndarray`, shape (n,)
         AGN fractions.
 
@@ -205,6 +205,7 @@ def agn_light(model, hosts, luminosity, parameters, bands, *, quantity="accretio
     # the power of an AGN goes as this, which is 1 of that with a half
     with np.errstate(invalid="ignore", divide="ignore"):
         power = np.where(wanted > 0, fraction / (1.0 - fraction), 0.0)
+    power[np.isnan(wanted)] = np.nan
     light = {}
     for band in bands:
         flux = (half[band] - without[band]).to_value(FNU)

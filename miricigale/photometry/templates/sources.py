@@ -34,6 +34,7 @@ from miricigale.profiles import ellipse_to_pixels, sersic_stamp
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.meta import provenance
+from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import single_threaded, threads
 from miricigale.utils.tables import unique_ids
@@ -291,7 +292,7 @@ class SourceTemplates:
         for k, array in enumerate(arrays):
             if array is None:
                 continue
-            data = np.asarray(array, float)
+            data = floats(array)
             total = data.sum() if data.ndim == 2 else np.nan
             wanted = "two-dimensional, finite and of positive total"
             got = f"shape {data.shape} and total {total} of source {columns['id'][k]}"
