@@ -2,7 +2,7 @@
 Other programs on the same data, each in an environment of its own: a table for the accuracy pages.
 
     MIRICIGALE_DATA=../shared/data python benchmarks/peers.py FOLDER [--only eazy photutils] [--n 300]
-        [--eazy-data CLONE]
+        [--eazy-data CLONE] [--lephare-data CLONE]
 
 FOLDER keeps the environments, what both sides read, and their results (JSON); a part that is there is not made
 again, so that a run goes on where the last one ended. Versions are pinned in `PEERS`. What pip cannot install is a
@@ -10,6 +10,7 @@ row of the table with pip's last words.
 
 eazy: redshifts of sources of CEERS (`ceers.sample`) without and with MIRI, our bandpasses in both. Its templates
 are not in its package: CLONE is one of github.com/gbrammer/eazy-photoz.
+lephare: the same, with its templates of COSMOS; CLONE is one of github.com/lephare-photoz/lephare-data.
 photutils: `PSFPhotometry` at the true positions of a crowded field of points against `ForcedPhotometer`.
 bagpipes: fluxes of its galaxies, and of ours with the same history, dust and redshift.
 
@@ -73,39 +74,53 @@ def write_bandpasses(path, bands):
                 file.write(f"{k} {x:.3f} {y:.6e}\n")
 
 
-def eazy_ours(folder, args):
-    """Write the catalog and the bandpasses, and fit with the default models and errors."""
+def write_catalog(folder, args):
+    """Write the sources of CEERS that redshifts are compared for: our table of them, and its bands."""
     import astropy.units as u
     from ceers import sample
-
-    from miricigale import BayesFitter
-    from miricigale.fitting import SurveyCalibration
-    from miricigale.sed import SEDModel
 
     path = Path(os.environ["MIRICIGALE_DATA"]) / "ceers/ceers_photometry_part.fits"
     table, bands, n_miri = sample(path)
     rng = np.random.default_rng(5)
     rows = np.sort(rng.choice(len(table), min(args.n, len(table)), replace=False))
     table = table[rows]
-    write_bandpasses(folder / "FILTER.RES", bands)
     flux = np.transpose([table[name].to_value(u.uJy) for name in bands])
     error = np.transpose([table[f"{name}_err"].to_value(u.uJy) for name in bands])
     save(
         folder / "catalog.json", flux=flux, error=error, redshift=table["redshift"], bands=bands,
         n_miri=n_miri[rows],
     )  # fmt: skip
+    return table, bands
+
+
+def fit_ours(folder, table, bands):
+    """Fit a catalog as ``miricigale fit`` does by default, without and with MIRI."""
+    from miricigale import BayesFitter
+    from miricigale.fitting import calibrate_bands
+    from miricigale.sed import SEDModel
+
     grid = SEDModel.survey().grid(SEDModel.survey_axes(), bands)
     results = {}
     optical = [name for name in bands if not name.startswith("miri")]
     for label, used in (("optical", optical), ("all", bands)):
-        fitter = BayesFitter(grid, used, calibration=SurveyCalibration.survey())
+        fitter = BayesFitter(grid, used)
         fitter.fit(table[:4])
+        begin = time.process_time()
+        fitter = fitter.replace(calibration=calibrate_bands(fitter, table))
+        results[f"calibration_{label}"] = time.process_time() - begin
         begin = time.process_time()
         fit = fitter.fit(table)
         results[f"seconds_{label}"] = time.process_time() - begin
         quantiles = fit.percentile("redshift", (0.16, 0.5, 0.84)).value
         results[f"z_{label}"] = quantiles
     save(folder / "ours.json", **results)
+
+
+def eazy_ours(folder, args):
+    """Write what EAZY reads, and fit."""
+    table, bands = write_catalog(folder, args)
+    write_bandpasses(folder / "FILTER.RES", bands)
+    fit_ours(folder, table, bands)
 
 
 def eazy_theirs(folder, args):
@@ -171,7 +186,7 @@ def redshift_numbers(z, quantiles, true, rows):
     return f"{scatter:.3f}, {100 * outliers:.1f} %, {100 * inside:.0f} %"
 
 
-def eazy_rows(folder):
+def redshift_rows(folder):
     catalog, ours, theirs = (load(folder / f"{n}.json") for n in ("catalog", "ours", "theirs"))
     true, two = catalog["redshift"], catalog["n_miri"] >= 2
     rows = []
@@ -184,6 +199,95 @@ def eazy_rows(folder):
         times = [1e3 * one[f"seconds_{label}"] / true.size for one in (theirs, ours)]
         rows.append((f"{words}: ms an object", *(f"{value:.0f}" for value in times)))
     return rows
+
+
+# -------------------------------------------------------------------------- lephare
+
+#: Errors of models in magnitudes: those of LePhare's settings for COSMOS in its optical bands, its near infrared
+#: ones, and IRAC's reddest.
+LEPHARE_ERRORS = {"acs": 0.02, "wfc3": 0.05, "nircam": 0.05, "miri": 0.3}
+
+
+def lephare_ours(folder, args):
+    """Write what LePhare reads, and fit, unless the run of EAZY has fitted the same."""
+    import astropy.units as u
+
+    from miricigale.filters import FilterSet
+
+    table, bands = write_catalog(folder, args)
+    for band in FilterSet.from_names(bands):
+        columns = np.column_stack([band.wave.to_value(u.AA), np.maximum(band.throughput, 0.0)])
+        np.savetxt(folder / f"{band.name}.pb", columns)
+    same = args.folder / "eazy" / "ours.json"
+    if same.exists():
+        (folder / "ours.json").write_bytes(same.read_bytes())
+    else:
+        fit_ours(folder, table, bands)
+
+
+def lephare_theirs(folder, args):
+    """Fit with LePhare's settings for COSMOS: 31 galaxies, four attenuation laws, its errors."""
+    os.environ["LEPHAREDIR"] = str(args.lephare_data.resolve())
+    os.environ["LEPHAREWORK"] = str(folder.resolve() / "work")
+    for name in ("filt", "lib_bin", "lib_mag", "zphota"):
+        (folder / "work" / name).mkdir(parents=True, exist_ok=True)
+    import lephare
+    from astropy.table import Table
+
+    catalog = load(folder / "catalog.json")
+    bands = catalog["bands"].tolist()
+    errors = [LEPHARE_ERRORS[name.split(".")[0]] for name in bands]
+    config = lephare.default_cosmos_config.copy()
+    settings = {
+        "FILTER_LIST": ",".join(f"{name}.pb" for name in bands),
+        "FILTER_REP": str(folder.resolve()),
+        "FILTER_CALIB": ",".join("0" for _ in bands),
+        "ERR_SCALE": ",".join(str(value) for value in errors),
+        "ZPHOTLIB": "CE_COSMOS",
+        "GAL_SED": "sed/GAL/COSMOS_SED/COSMOS_MOD.list",
+        # which templates have which of the four laws: the package's default of 0,0 attenuates none
+        "MOD_EXTINC": "18,26,26,33,26,33,26,33",
+        # redshifts of the sample end at 5.5
+        "Z_STEP": "0.04,0.,6.",
+        # bands of absolute magnitudes and colors, which are not used here
+        "MABS_FILT": "1",
+        "MABS_ZBIN": "0,6",
+        "MABS_REF": "1",
+        "MABS_CONTEXT": "-1",
+        "RF_COLORS": "1,2,1,2",
+        "MAG_REF": "1",
+    }
+    for name, value in settings.items():
+        config[name] = lephare.keyword(name, value)
+    begin = time.process_time()
+    if not (folder / "work/lib_mag/CE_COSMOS.doc").exists():
+        lephare.prepare(config, star_config=None, qso_config=None)
+    results = {"preparation": time.process_time() - begin}
+    jansky = 1e-29
+    for label in ("all", "optical"):
+        flux = catalog["flux"] * jansky
+        error = catalog["error"] * jansky
+        missing = ~np.isfinite(flux) | ~np.isfinite(error)
+        if label == "optical":
+            missing[:, [name.startswith("miri") for name in bands]] = True
+        flux[missing] = error[missing] = -99.0
+        table = Table({"id": np.arange(len(flux))})
+        for k, name in enumerate(bands):
+            table[name] = flux[:, k]
+            table[f"{name}_err"] = error[:, k]
+        # every band of every source may be used
+        table["context"] = 0
+        table["zspec"] = catalog["redshift"]
+        table["string"] = "-"
+        begin = time.process_time()
+        output, _ = lephare.process(config, table)
+        results[f"seconds_{label}"] = time.process_time() - begin
+        quantiles = [output[name] for name in ("Z_MED68_LOW", "Z_MED", "Z_MED68_HIGH")]
+        best = np.array(output["Z_BEST"], float)
+        best[best < 0] = np.nan
+        results[f"z_{label}"] = np.transpose(quantiles)
+        results[f"best_{label}"] = best
+    save(folder / "theirs.json", **results)
 
 
 # ------------------------------------------------------------------------ photutils
@@ -338,14 +442,14 @@ def bagpipes_rows(folder):
 
 
 PEERS = {
-    "eazy": Peer(("eazy==0.8.7",), eazy_ours, eazy_theirs, eazy_rows),
+    "eazy": Peer(("eazy==0.8.7",), eazy_ours, eazy_theirs, redshift_rows),
     "photutils": Peer(
         ("photutils==3.1.1", "scipy"), photutils_ours, photutils_theirs, photutils_rows,
         python="python3.12",
     ),
     "bagpipes": Peer(("bagpipes==1.3.6",), bagpipes_ours, bagpipes_theirs, bagpipes_rows),
+    "lephare": Peer(("lephare==1.0.0",), lephare_ours, lephare_theirs, redshift_rows),
     # installed only: the environments of tox compare them
-    "lephare": Peer(("lephare==1.0.0",)),
     "jwst": Peer(("jwst==3.0.0",)),
     "stpsf": Peer(("stpsf==2.2.0",)),
     "pcigale": Peer(("pcigale",)),
@@ -385,14 +489,15 @@ def judged(name, peer, args):
         return [(f"not installed: {failure}", "", "")]
     if peer.theirs is None:
         return [("installed; not compared here", "", "")]
-    if name == "eazy" and args.eazy_data is None:
-        return [("its templates are not on PyPI: --eazy-data", "", "")]
+    data = {"eazy": args.eazy_data, "lephare": args.lephare_data}
+    if name in data and data[name] is None:
+        return [(f"its templates are not on PyPI: --{name}-data", "", "")]
     if not (folder / "ours.json").exists():
         peer.ours(folder, args)
     if not (folder / "theirs.json").exists():
         command = [str(python), __file__, str(args.folder), "--inside", name]
-        if args.eazy_data:
-            command += ["--eazy-data", str(args.eazy_data.resolve())]
+        if data.get(name):
+            command += [f"--{name}-data", str(data[name].resolve())]
         subprocess.run(command, check=True, env=os.environ | {"PYTHONPATH": ""})
     return peer.rows(folder)
 
@@ -403,6 +508,7 @@ def main():
     parser.add_argument("--only", nargs="+", choices=PEERS, default=list(PEERS))
     parser.add_argument("--n", type=int, default=300, help="sources of CEERS")
     parser.add_argument("--eazy-data", type=Path, help="clone of gbrammer/eazy-photoz")
+    parser.add_argument("--lephare-data", type=Path, help="clone of lephare-photoz/lephare-data")
     parser.add_argument("--inside", choices=PEERS, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.inside:
