@@ -16,7 +16,8 @@ from miricigale.instrument.image_planes import plane_data
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry.commands.kernel_files import can_be_modeled, matching_kernel
 from miricigale.photometry.images.fits_images import open_map
-from miricigale.photometry.images.mosaics import MosaicFile, stated_filter
+from miricigale.photometry.images.mosaic_headers import stated_filter
+from miricigale.photometry.images.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import file_place
 from miricigale.utils.units import SURFACE_BRIGHTNESS

@@ -201,7 +201,7 @@ def join_patches(tables, grid, prior, catalog=None, ids=False):
         By number of the patch: its rows in its core, and within `RIM` of that; ``new`` says which the prior lacks.
     grid : `PatchGrid`
         The patches.
-    prior : `~miricigale.photometry.images.mosaics.MosaicHeader`
+    prior : `~miricigale.photometry.images.mosaic_headers.MosaicHeader`
         That of the prior.
     catalog : `~astropy.table.QTable`, optional
         ``id`` and ``sky`` of all sources: then the table has these rows.

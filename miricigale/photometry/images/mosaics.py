@@ -1,9 +1,7 @@
 """Images that observers bring, in any unit and with any map of the noise, as images in MJy/sr."""
 
-import contextlib
 import dataclasses
 import functools
-import json
 import logging
 import os
 
@@ -39,15 +37,19 @@ from miricigale.photometry.images.fits_images import (
     open_image,
     open_map,
 )
+from miricigale.photometry.images.mosaic_headers import (
+    SAME_ANGLE,
+    MosaicHeader,
+    angles_of_exposures,
+    own_facts,
+    unit_of,
+)
 from miricigale.photometry.images.sky_noise import mask_filled, sky_noise
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 _log = logging.getLogger(__name__)
-
-#: Position angles that differ by less are one (deg).
-_SAME_ANGLE = 1.0
 
 #: A scale of the noise further from 1 than this factor is warned of.
 _ODD_SCALE = 10.0
@@ -225,7 +227,7 @@ class MosaicFile:
             first = hdus[0].header
             wcs = image_wcs(header, hdus)
             shape = plane_shape(hdus[index])
-            angles = _angles_of_exposures(hdus)
+            angles = angles_of_exposures(hdus)
         check_data(wcs is not None, self.path, "has no celestial coordinates (WCS) in its header")
         if self.section is not None:
             wcs = cut_wcs(wcs, self.section, self.path)
@@ -237,7 +239,7 @@ class MosaicFile:
 
         # facts that the package's own files carry, then those of the header
         check_kind_of_exposure(get, self.path)
-        meta = _own_facts(header)
+        meta = own_facts(header)
         name = filter_name(get) or meta.get("filter")
         good = self.filter is None or name in (None, self.filter)
         check_that(good, "filter", f"{name!r}, the filter in {self.path}", repr(self.filter))
@@ -254,7 +256,7 @@ class MosaicFile:
                 values[key] = meta.get(key)
             if values[key] is not None:
                 meta[key] = values[key]
-        unit = _unit_of(header)
+        unit = unit_of(header)
         if self.unit is not None:
             unit = str(self.unit)
         return MosaicHeader(
@@ -279,7 +281,7 @@ class MosaicFile:
         if header_angle is None:
             return angle
         difference = (angle - header_angle).to_value(u.deg)
-        if np.max(np.abs((difference + 180) % 360 - 180)) > _SAME_ANGLE:
+        if np.max(np.abs((difference + 180) % 360 - 180)) > SAME_ANGLE:
             wanted = f"PA_APER of {self.path}, {np.round(header_angle.value, 2)} deg"
             raise argument_error("pa_aper", wanted, angle)
         return angle
@@ -529,7 +531,7 @@ class MosaicFile:
     def _in_unit(self, hdu, kind, unit, path):
         """Read a map of the noise in the unit that the image states, as far as both do."""
         values = _native(plane_data(hdu, self.section))
-        text = _unit_of(hdu.header)
+        text = unit_of(hdu.header)
         power = _POWERS.get(kind)
         have = parsed_unit(text)
         wanted = parsed_unit(unit)
@@ -544,62 +546,6 @@ class MosaicFile:
             raise data_error(path, problem) from None
         _log.info("%s: from %s to %s", path, have, wanted**power)
         return values * values.dtype.type(factor)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class MosaicHeader:
-    """Contents of the header of an image."""
-
-    index: int  # Extension of the image.
-    shape: tuple  # Rows and columns.
-    wcs: object  # Celestial coordinates.
-    filter: str | None  # As ``instrument.filter`` in lower case, or as it was given; None without.
-    pa_aper: object  # Position angle of the detector's +y axis; None without.
-    unit: str  # Unit of the pixels as the header or the caller has it; may be empty.
-    #: Whether it is a single exposure of JWST (``_cal``, ``_rate``) rather than a mosaic.
-    exposure: bool
-    keywords: dict  # Those of the photometric calibration.
-    meta: dict  # What our own files carry, with ``filter`` and ``pa_aper`` (deg).
-
-
-def stated_filter(path):
-    """Return the filter that the header of an image names, None if it names none; coordinates are not read."""
-    with open_image(path, "an image") as (hdus, extension):
-        header = hdus[find_image(hdus, extension, path, ("SCI",), no_images=PLANES)].header
-        first = hdus[0].header
-        name = filter_name(lambda key: header.get(key, first.get(key)))
-        return name or _own_facts(header).get("filter")
-
-
-def _own_facts(header):
-    """Return the facts that the package's own files carry, by name."""
-    # of another program it may be no JSON
-    with contextlib.suppress(json.JSONDecodeError):
-        return json.loads(header.get("META", "{}"))
-    return {}
-
-
-def _angles_of_exposures(hdus):
-    """
-    Position angles (deg) of the exposures of a mosaic of jwst, from its extension HDRTAB, in their shares.
-
-    None without such a table, or if all are that of the header within a degree.
-    """
-    if "HDRTAB" not in hdus or "PA_APER" not in hdus["HDRTAB"].columns.names:
-        return None
-    angles = np.asarray(hdus["HDRTAB"].data["PA_APER"], dtype=float)
-    angles = np.round(angles[np.isfinite(angles)], 1)
-    if not angles.size:
-        return None
-    apart = (angles - angles[0] + 180.0) % 360.0 - 180.0
-    if np.max(np.abs(apart)) <= _SAME_ANGLE:
-        return None
-    values, counts = np.unique(angles, return_counts=True)
-    return np.repeat(values, counts // np.gcd.reduce(counts)).tolist()
-
-
-def _unit_of(header):
-    return str(header.get("BUNIT", "") or "").strip()
 
 
 def _native(data):
