@@ -14,6 +14,7 @@ from astropy.table import MaskedColumn, QTable
 from miricigale.filters.band_names import eazy_filter, name_and_unit
 from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
+from miricigale.utils.column_units import silent_units
 from miricigale.utils.exceptions import (
     CatalogWarning,
     argument_error,
@@ -33,7 +34,6 @@ from miricigale.utils.missing_values import (
 )
 from miricigale.utils.named_values import convert_values, field_names, field_values
 from miricigale.utils.options import check_choice, check_data, check_names, check_that
-from miricigale.utils.table_files import silent_units
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, flux_unit
 

@@ -11,12 +11,11 @@ from miricigale.filters.band_names import find_filter, name_and_unit
 from miricigale.filters.catalog_files import catalog_messages
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
-from miricigale.utils.column_units import quantity_table
+from miricigale.utils.column_units import quantity_table, silent_units
 from miricigale.utils.exceptions import CatalogWarning, units_error, warn
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
-from miricigale.utils.table_files import silent_units
 from miricigale.utils.tables import as_table, error_column
 from miricigale.utils.units import FNU, flux_unit
 

@@ -94,8 +94,10 @@ def index_of_ids(schema, column):
     level = levels[0]
     if isinstance(level, dict):
         name = level["name"]
-        counts = name is None and level["start"] == 0 and level["step"] == 1
-        return "" if counts or (name is not None and is_id_name(name)) else name or "id"
+        if not name:
+            counts = level["start"] == 0 and level["step"] == 1
+            return "" if counts else "id"
+        return "" if is_id_name(name) else name
     if level not in schema.names:
         return ""
     if re.fullmatch(_UNNAMED, level):
