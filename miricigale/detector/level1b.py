@@ -21,7 +21,7 @@ from astropy.time import Time, TimeDelta
 
 from miricigale.instrument import kept_keywords, placed_keywords
 from miricigale.instrument.asdf_extension import asdf_extension, bytes_table
-from miricigale.instrument.image import WRITER, check_product_name
+from miricigale.instrument.product_files import jwst_product
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing
 from miricigale.utils.meta import plain_value
@@ -92,7 +92,9 @@ def write(path, ramp, *, start=None, filename=None, overwrite=False):
     """Write a level-1b file: see `~miricigale.detector.Ramp.write`."""
     if ramp.data.dtype != np.uint16:
         raise argument_error("data", "counts (uint16) to be written", ramp.data.dtype)
-    check_product_name(path, WRITER, own=("uncal",))
+    if jwst_product(path) not in (None, "uncal"):
+        wanted = "a name that is not of another product of JWST: ramps are x_uncal.fits"
+        raise argument_error("path", wanted, repr(os.fspath(path)))
     options = {"start": start, "filename": filename, "overwrite": overwrite}
     if not ramp.simulated and ramp.observed:
         # the keywords of the observation, and none of a simulation

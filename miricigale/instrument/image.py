@@ -1,82 +1,22 @@
 """Images that astropy can write."""
 
-import os
-import re
-
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
-from astropy.nddata import CCDData, Cutout2D, NoOverlapError, StdDevUncertainty
+from astropy.nddata import CCDData, Cutout2D, NoOverlapError
 from astropy.wcs.utils import proj_plane_pixel_scales
 
 from miricigale.filters import find_filter
 from miricigale.instrument.dq import dq_planes
 from miricigale.instrument.header_wcs import as_wcs
+from miricigale.instrument.image_planes import standard_deviation
+from miricigale.instrument.product_files import jwst_product, write_product
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import fits_meta
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import ANGLE
-
-#: How files of products of JWST are called.
-_PRODUCT = re.compile(
-    r"_(uncal|ramp|rate|rateints|cal|calints|crf|crfints|i2d|blot|median)\.fits(?:\.gz)?$"
-)
-
-#: What writes files in their layout.
-WRITER = "miricigale.reduction.write_image(image, path)"
-
-
-def check_product_name(path, writer, own=()):
-    """
-    Refuse a name of a product of JWST, whose tools would not find the image in another layout.
-
-    Parameters
-    ----------
-    path : path-like or other
-        Where an image is written; what is no path has no name.
-    writer : str
-        What writes JWST's layout, for the message.
-    own : iterable of str, optional
-        Products whose layout the caller writes, such as ``"uncal"``.
-
-    Raises
-    ------
-    ValueError
-        If the name is one of a product.
-    """
-    if not isinstance(path, (str, os.PathLike)):
-        return
-    product = _PRODUCT.search(os.fspath(path).lower())
-    if product is not None and product[1] not in own:
-        wanted = f"a name that is not one of JWST's products, whose layout {writer} writes"
-        raise argument_error("path", wanted, repr(os.fspath(path)))
-
-
-def standard_deviation(image):
-    """
-    Uncertainty of an image as a standard deviation.
-
-    Parameters
-    ----------
-    image : `~astropy.nddata.CCDData`
-        With an uncertainty: a variance, an inverse variance or a standard deviation.
-
-    Returns
-    -------
-    uncertainty : `~astropy.nddata.StdDevUncertainty`
-
-    Raises
-    ------
-    ValueError
-        If it is of unknown kind.
-    """
-    try:
-        return image.uncertainty.represent_as(StdDevUncertainty)
-    except TypeError:
-        wanted = "one with a standard deviation, a variance or an inverse variance"
-        raise argument_error("image", wanted, type(image.uncertainty).__name__) from None
 
 
 class Image(Interactive, CCDData):
@@ -208,19 +148,30 @@ class Image(Interactive, CCDData):
         Parameters
         ----------
         path : path-like
-            The file. Names of JWST's products (``_rate.fits``, ``_cal.fits``) are refused, for JWST's tools would
-            not find the image there: `miricigale.reduction.write_image` writes their layout.
+            The file. One named as a product of JWST (``x_rate.fits``, ``x_cal.fits``, ``x_i2d.fits``) has JWST's
+            layout, as `miricigale.reduction.write_image` writes it.
         overwrite : bool, optional
             Whether a file of this name may be replaced.
         *args, **kwargs
-            Others of `astropy.nddata.CCDData.write`, such as ``format``.
+            Others of `astropy.nddata.CCDData.write`, such as ``format``; not for products of JWST.
 
         Raises
         ------
+        OSError
+            If the file exists and ``overwrite`` is False.
         ValueError
-            If the name is one of a product of JWST.
+            If the image is none that the name promises: ramps, another unit, a filter that is not MIRI's.
         """
-        check_product_name(path, WRITER)
+        if jwst_product(path) is not None:
+            names = [repr(value) for value in args] + list(kwargs)
+            check_that(
+                not names,
+                "path",
+                "another name for a file with options of CCDData.write",
+                ", ".join(names),
+            )
+            write_product(self, path, overwrite=overwrite)
+            return
         if overwrite:
             kwargs["overwrite"] = True
         super().write(path, *args, **kwargs)

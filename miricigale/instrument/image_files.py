@@ -8,17 +8,13 @@ from astropy.io import fits
 
 from miricigale.instrument import dq_planes, read_dq, with_own_bits
 from miricigale.instrument.header_wcs import header_wcs
-from miricigale.instrument.image import WRITER, Image, check_product_name, standard_deviation
+from miricigale.instrument.image import Image
+from miricigale.instrument.image_planes import standard_deviation
+from miricigale.instrument.product_files import jwst_product, write_product
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, replacing, write_fits
-from miricigale.utils.meta import plain_value, undated
-from miricigale.utils.options import check_data
-
-
-def json_meta(meta):
-    """The meta dictionary of an image as JSON, without dates; a quantity keeps its unit as text."""
-    return json.dumps(undated(meta), default=plain_value)
-
+from miricigale.utils.meta import json_meta
+from miricigale.utils.options import check_data, check_that
 
 #: Steps of rounded values in the median error of an image: with its dither that adds less than 1e-3
 #: of its error to a flux.
@@ -63,8 +59,8 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
         Its WCS (with distortion) goes to the SCI header, its meta as JSON to the keyword
         META, so that names and types survive.
     path : path-like
-        The file. Names of JWST's products (``_rate.fits``, ``_cal.fits``) are refused, for JWST's tools would
-        miss its keywords: `miricigale.reduction.write_image` writes their layout.
+        The file. One named as a product of JWST (``x_rate.fits``, ``x_cal.fits``) has JWST's layout, as
+        `miricigale.reduction.write_image` writes it.
     planes : dict of str to `~numpy.ndarray`, optional
         Further image extensions by name; ``dq`` holds flags (`~miricigale.instrument.DQ`).
     rounded : bool, optional
@@ -78,7 +74,7 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     OSError
         If the file exists and ``overwrite`` is False.
     ValueError
-        If the uncertainty is of unknown kind, or the name is one of a product of JWST.
+        If the uncertainty is of unknown kind, or the file is named as a product of JWST that the image is not.
 
     Examples
     --------
@@ -89,7 +85,10 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     >>> image = CCDData(np.ones((4, 4)), unit="MJy/sr", uncertainty=error)
     >>> write_image(image, "image.fits", planes={"dq": np.zeros((4, 4), np.int64)})  # doctest: +SKIP
     """
-    check_product_name(path, WRITER)
+    if jwst_product(path) is not None:
+        check_that(not rounded, "rounded", "False for a product of JWST", rounded)
+        write_product(image, path, planes=planes, overwrite=overwrite)
+        return
     write_planes(image, path, planes=planes, rounded=rounded, overwrite=overwrite)
 
 

@@ -1,8 +1,9 @@
 """Planes of images in FITS files of any origin: their pixels, and those that belong to an image."""
 
 import numpy as np
+from astropy.nddata import StdDevUncertainty
 
-from miricigale.utils.exceptions import data_error
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.options import check_data
 
 #: What maps of the noise hold, and the extensions of an image's own file that hold them.
@@ -213,3 +214,28 @@ def noise_planes(hdus, index):
             if hdu is not None and hdu.is_image:
                 planes.append((noise_kind(hdu), hdu))
     return planes
+
+
+def standard_deviation(image):
+    """
+    Uncertainty of an image as a standard deviation.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        With an uncertainty: a variance, an inverse variance or a standard deviation.
+
+    Returns
+    -------
+    uncertainty : `~astropy.nddata.StdDevUncertainty`
+
+    Raises
+    ------
+    ValueError
+        If it is of unknown kind.
+    """
+    try:
+        return image.uncertainty.represent_as(StdDevUncertainty)
+    except TypeError:
+        wanted = "one with a standard deviation, a variance or an inverse variance"
+        raise argument_error("image", wanted, type(image.uncertainty).__name__) from None

@@ -114,3 +114,8 @@ _KEYWORD = re.compile(r"[A-Za-z0-9_-]{1,8}")
 _RESERVED = {"META", "SIMPLE", "EXTEND", "BITPIX", "NAXIS", "TFIELDS", "EXTNAME", "COMMENT"}
 # short enough to stand on one card with its keyword
 _TEXT = re.compile(r"[ -~]{0,40}")
+
+
+def json_meta(meta):
+    """The meta dictionary of an image as JSON, without dates; a quantity keeps its unit as text."""
+    return json.dumps(undated(meta), default=plain_value)

@@ -75,7 +75,9 @@ def test_a_file_that_is_renamed_later_has_its_later_name(ramp, tmp_path):
 
 @pytest.mark.parametrize("name", ["x_rate.fits", "x_cal.fits", "x_ramp.fits"])
 def test_names_of_other_products_are_refused(ramp, tmp_path, name):
-    refuses("'path' must be a name that is not one of JWST's products", ramp.write, tmp_path / name)
+    refuses(
+        "'path' must be a name that is not of another product of JWST", ramp.write, tmp_path / name
+    )
 
 
 def test_only_counts_are_written(make_exposure, tmp_path):

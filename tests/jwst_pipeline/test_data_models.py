@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 from miricigale.detector import Detector
 from miricigale.instrument import Exposure
 from miricigale.photometry.images.mosaics import as_mosaic
-from miricigale.reduction import Reducer, write_image
+from miricigale.reduction import Reducer
 
 datamodels = pytest.importorskip(
     "jwst.datamodels", reason="needs the official pipeline: pip install miricigale[jwst]"
@@ -29,7 +29,7 @@ def test_data_models_are_taken_as_their_files(tmp_path):
     assert_array_equal(same.data, rate.data)
     assert_array_equal(run.rates[0].data, rate.data)
     image = reducer.calibrate(rate)
-    write_image(image, tmp_path / "a_cal.fits")
+    image.write(tmp_path / "a_cal.fits")
     with datamodels.open(tmp_path / "a_cal.fits") as model:
         read = as_mosaic(model)
     assert_array_equal(read.data, image.data.astype(np.float32))

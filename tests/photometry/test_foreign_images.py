@@ -15,7 +15,7 @@ from astropy.nddata import (
 from astropy.wcs import WCS
 
 from helpers.errors import refuses
-from miricigale.instrument import Image, pixel_area_map, read_image, write_image
+from miricigale.instrument import Image, imager_wcs, pixel_area_map, read_image, write_image
 from miricigale.instrument.sky_axes import grid_angle, pixel_to_radec, radec_axes
 from miricigale.photometry import MosaicFile, read_mosaic
 from miricigale.photometry.commands.kernel_files import image_psf
@@ -326,18 +326,90 @@ def test_errors_of_0_are_refused_by_the_reduction(write):
     )
 
 
-@pytest.mark.parametrize("name", ["x_rate.fits", "x_cal.fits", "x_i2d.fits.gz", "X_CALINTS.fits"])
-def test_names_of_products_of_jwst_are_left_to_their_layout(name, tmp_path):
-    image = Image(noise(), unit="MJy/sr")
-    refuses("whose layout miricigale.reduction.write_image", image.write, tmp_path / name)
-    refuses("whose layout miricigale.reduction.write_image", write_image, image, tmp_path / name)
-    assert not list(tmp_path.iterdir())
-    # ramps have another layout than images
-    refuses(
-        "whose layout miricigale.detector.Ramp", write_jwst_image, image, tmp_path / "x_uncal.fits"
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("x_rate.fits", "adu/s"),
+        ("x_cal.fits", "MJy/sr"),
+        ("x_i2d.fits.gz", "MJy/sr"),
+        ("X_CAL.fits", "MJy/sr"),
+        ("x_median.fits", "adu/s"),
+    ],
+)
+def test_images_named_as_products_of_jwst_have_their_layout(name, unit, tmp_path):
+    flags = np.zeros(SHAPE, np.int64)
+    flags[2, 3] = 1
+    error = StdDevUncertainty(plane(0.1))
+    wcs = imager_wcs(CENTER, 10 * u.deg)
+    image = Image(
+        noise(),
+        unit=unit,
+        uncertainty=error,
+        flags=flags,
+        wcs=wcs,
+        filter="F770W",
+        meta={"roll": 3},
     )
+    image.write(tmp_path / name)
+    (file,) = read_images(tmp_path / name)
+    np.testing.assert_array_equal(file.image.data, noise().astype(np.float32))
+    np.testing.assert_array_equal(file.image.uncertainty.array, plane(0.1).astype(np.float32))
+    np.testing.assert_array_equal(file.image.mask, flags == 1)
+    assert file.image.unit == u.Unit(unit)
+    x, y = 3, 7
+    np.testing.assert_allclose(
+        file.image.wcs.pixel_to_world_values(x, y), wcs.pixel_to_world_values(x, y), atol=1e-9
+    )
+    header = file.header
+    assert header["TELESCOP"] == "JWST"
+    assert header["FILTER"] == "F770W"
+    assert header["DATAMODL"] == "ImageModel"
+    # one answer, whichever function is asked
+    write_image(image, tmp_path / f"a_{name}")
+    write_jwst_image(image, tmp_path / f"b_{name}")
+    for other in "ab":
+        np.testing.assert_array_equal(
+            read_images(tmp_path / f"{other}_{name}")[0].image.data, file.image.data
+        )
+    with pytest.raises(OSError, match="exist"):
+        image.write(tmp_path / name)
+    image.write(tmp_path / name, overwrite=True)
     image.write(tmp_path / "calibrated.fits")
     np.testing.assert_array_equal(CCDData.read(tmp_path / "calibrated.fits").data, noise())
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "band", "wanted"),
+    [
+        ("x_uncal.fits", "adu/s", "F770W", "Ramp.write.path. writes ramps"),
+        ("x_ramp.fits", "adu/s", "F770W", "Ramp.write.path. writes ramps"),
+        ("x_rate.fits", "MJy/sr", "F770W", "image in DN/s alone, got .* for MJy / sr"),
+        ("x_i2d.fits", "adu/s", "F770W", "image in MJy/sr alone, got .* for adu / s"),
+        ("x_cal.fits", "MJy/sr", None, "meta.'filter'. states it, got filter None"),
+        ("x_cal.fits", "MJy/sr", "nircam.f444w", "of a filter of the MIRI imager"),
+    ],
+)
+def test_images_that_are_no_products_of_miri_get_no_name_of_theirs(
+    name, unit, band, wanted, tmp_path
+):
+    image = Image(noise(), unit=unit)
+    if band is not None:
+        image = Image(noise(), unit=unit, filter=band)
+    refuses(wanted, image.write, tmp_path / name)
+    refuses(wanted, write_image, image, tmp_path / name)
+    refuses(wanted, write_jwst_image, image, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_of_astropy_are_refused_for_products_of_jwst(tmp_path):
+    image = Image(noise(), unit="MJy/sr", filter="F770W")
+    refuses(
+        "with options of CCDData.write, got hdu_mask",
+        image.write,
+        tmp_path / "x_cal.fits",
+        hdu_mask="M",
+    )
+    refuses("'rounded' must be False", write_image, image, tmp_path / "x_cal.fits", rounded=True)
 
 
 @pytest.mark.parametrize("kind", ["MIR_TACQ", "MIR_4QPM", "MIR_LYOT", "NRC_GRISM", "NIS_AMI"])

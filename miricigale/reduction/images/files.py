@@ -29,6 +29,7 @@ from miricigale.instrument import (
 from miricigale.instrument.data_models import is_data_model, read_data_model
 from miricigale.instrument.header_wcs import header_wcs, image_wcs
 from miricigale.instrument.image_planes import noise_kind, plane_data, plane_shape
+from miricigale.instrument.product_files import PLANES
 from miricigale.reduction.images.images import flagged_image, sigma
 from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import open_fits
@@ -37,9 +38,6 @@ from miricigale.utils.parallel import check_memory
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 
 _WANTED = "an image of JWST (FITS with SCI)"
-
-#: Planes beside the image, its errors and its flags.
-PLANES = ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT", "AREA", "WHT", "CON", "BKG")
 
 _VARIANCES = PLANES[:3]
 
