@@ -8,7 +8,9 @@ the three answers are the same, or all are refused.
 import importlib
 import inspect
 import re
+import tempfile
 import warnings
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -17,11 +19,13 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.utils.masked import Masked
+from matplotlib import pyplot
 
 from helpers.arguments import documented_arguments
 from helpers.errors import refuses
 from miricigale import (
     agn,
+    cigale,
     depth,
     detector,
     evaluation,
@@ -204,6 +208,68 @@ def _sky(values):
     numbers, mask = without_mask(values)
     mask = False if mask is None else mask
     return SkyCoord(Masked(np.asarray(numbers), mask=mask) * u.deg, Y / 1e4 * u.deg)
+
+
+SETUP = cigale.CigaleSetup(
+    path=Path("pcigale.ini"),
+    data_file=None,
+    components=GALAXY.components,
+    parameters={"age": np.array([1.0, 2.0])},
+    redshift=None,
+    modules={},
+    frac_agn_definition=GALAXY.frac_agn_definition,
+    bands={"acs.f606w": "acs.f606w"},
+    predicted={},
+    columns=("acs.f606w",),
+    variables=("stellar_mass",),
+)
+
+
+def _saved_models(redshifts):
+    with tempfile.TemporaryDirectory() as folder:
+        SETUP.save_models(Path(folder) / "models.fits", redshifts)
+        return Table.read(Path(folder) / "models.fits")["universe.redshift"]
+
+
+def _plotted_redshifts(redshifts):
+    figure, axes = pyplot.subplots()
+    RESULTS.plot_redshift(redshifts, ax=axes)
+    offsets = [points.get_offsets() for points in axes.collections if len(points.get_offsets())]
+    pyplot.close(figure)
+    return [*offsets, np.array([len(axes.get_title())])]
+
+
+MANY = TABLE[np.arange(40) % 5]
+MANY["id"] = np.arange(40)
+with warnings.catch_warnings():
+    # these are no fluxes of galaxies
+    warnings.simplefilter("ignore", MiricigaleWarning)
+    FIXED = FITTER.fit(MANY, redshift=np.tile(X, 8))
+
+
+def _measured_errors(noise):
+    tables = [QTable({"id": np.arange(5), "miri.f770w": factor * FLUX}) for factor in (1.0, 1.1)]
+    model = photometry.ErrorModel.from_tables(*tables, noise={"miri.f770w": noise}, bin_size=3)
+    return model.sigma(FLUX, "miri.f770w")
+
+
+DELTA = psf.MatchingKernel(np.pad([[1.0]], 1), PIXEL, target=POINT.data)
+POINTS = photometry.SourceTemplates.from_catalog(QTable({"sky": SKY}))
+STARS = QTable({"sky": SKY, "wfc3.f160w": FLUX})
+
+
+def _looked_at(values):
+    segments = np.zeros((61, 61), int)
+    segments[20:41, 20:41] = 1
+    catalog = QTable({"sky": CENTER.reshape(1)})
+    templates = photometry.SourceTemplates.from_images(
+        EVEN, segments, catalog, psf=_square(values), template="cutout", n_threads=1
+    )
+    return templates.light[0].data
+
+
+def _powers(values):
+    return np.ones((2, 5, 5)) * _image(values)
 
 
 #: By the name of the argument, and after a blank what is special: a function of one array and the array.
@@ -478,6 +544,23 @@ FUNCTIONS = {
     "sed.band_luminosity.to_band": (
         lambda x: sed.band_luminosity(1e37 * u.W, from_band=[2, 10] * u.keV, to_band=x[:2]), X << u.keV),
     "sed.xray_flux.band": (lambda x: sed.xray_flux(LUMINOSITY, 1.0, band=x[:2]), X << u.keV),
+    "cigale.CigaleSetup.axes.redshifts": (lambda x: SETUP.axes(x)["redshift"], X),
+    "cigale.CigaleSetup.grid.redshifts": (lambda x: SETUP.grid(["acs.f606w"], x).galaxy, X),
+    "cigale.CigaleSetup.save_models.redshifts": (_saved_models, X),
+    "agn.agn_light.parameters": (
+        lambda x: agn.agn_light(NUCLEI, HOSTS, LUMINOSITY, {"inclination": x}, ["miri.f770w"])[0]["miri.f770w"],
+        20 * X),
+    "fitting.FitResults.plot_redshift.z_spec": (_plotted_redshifts, X),
+    "fitting.measure_template_error.edges": (
+        lambda x: fitting.measure_template_error(FIXED, edges=x).error, X / 2 << u.um),
+    "photometry.ErrorModel.from_tables.noise": (_measured_errors, X),
+    "photometry.ForcedPhotometer.render.flux": (
+        lambda x: photometry.ForcedPhotometer(DELTA).render(IMAGE, POINTS, x).value, FLUX),
+    "photometry.SourceTemplates.from_images.psf": (_looked_at, SHARP),
+    "reduction.DetectorMaps.linearity": (
+        lambda x: _slopes(reduction.DetectorMaps(gain=1.0, read_noise=1.0, linearity=_powers(x))), X),
+    "scene.highres_image.noise": (
+        lambda x: scene.highres_image(STARS, wcs=IMAGE.wcs, psf=POINT, noise=_plane(x)).data, X),
     "sed.red_dots.axes": (lambda x: list(sed.red_dots({"temperature": x})), 4000 + 1000 * X << u.K),
 }  # fmt: skip
 
@@ -550,22 +633,11 @@ EXEMPT = {
         "reduction.settling_groups.data",
     ],
     "passed on to an argument of the matrix": [
+        "fitting.calibrate.redshift",
         "fitting.BayesFitter.__call__.redshift",
         "psf.KernelField.from_psfs.hi",
     ],
     "tested below: positions in a `SkyCoord`": ["sed.color_excess.sky"],
-    "not tried yet": [
-        "cigale.CigaleSetup.*.redshifts",
-        "agn.agn_light.parameters",
-        "fitting.FitResults.plot_redshift.z_spec",
-        "fitting.calibrate.redshift",
-        "fitting.measure_template_error.edges",
-        "photometry.ErrorModel.from_tables.noise",
-        "photometry.ForcedPhotometer.render.flux",
-        "photometry.SourceTemplates.from_images.psf",
-        "reduction.DetectorMaps.linearity",
-        "scene.highres_image.noise",
-    ],
 }
 
 

@@ -193,6 +193,8 @@ def agn_light(model, hosts, luminosity, parameters, bands, *, quantity="accretio
         if axis.kind == "galaxy":
             table[name] = hosts.best[name]
     for name, values in parameters.items():
+        if not hasattr(values, "unit"):
+            values = floats(values)
         table[name] = values
     table["frac_agn"] = np.zeros(len(hosts))
     without = model.fluxes(table, bands)

@@ -9,6 +9,7 @@ from astropy.nddata import StdDevUncertainty
 from miricigale.instrument import pixel_area_map
 from miricigale.scene.scene import Scene
 from miricigale.utils.missing_values import floats
+from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import positive
 
@@ -107,6 +108,11 @@ def highres_image(
     seed = check_seed(seed)
     if noise is None:
         noise = stream(seed, "highres", scene.filter).standard_normal(image.shape)
+    noise = floats(noise)
+    wanted = f"{image.shape} finite numbers"
+    check_that(noise.shape == image.shape, "noise", wanted, f"shape {noise.shape}")
+    n_missing = np.count_nonzero(~np.isfinite(noise))
+    check_that(n_missing == 0, "noise", wanted, f"{n_missing} that are masked or not finite")
     image.data += noise * sigma
     image.uncertainty = StdDevUncertainty(sigma)
     image.meta |= {"seed": seed, "depth": str(depth), "aperture_radius": float(_APERTURE.value)}

@@ -203,6 +203,9 @@ def measure_template_error(results, *, model_error=0.0, edges=None):
     if edges is None:
         edges = _EDGES * WAVE
     edges = to_array(edges, WAVE, "edges", ndim=1)
+    # comparisons with NaN are false: a bin with such an edge is refused too
+    increasing = edges.size > 1 and np.all(np.diff(edges) > 0)
+    check_that(increasing, "edges", "two wavelengths or more that increase", edges)
     band_error = per_band(model_error, results.filters, "model_error")
     flux, error, _, good = _residuals(results)
     # errors of bands are part of those that models leave unexplained

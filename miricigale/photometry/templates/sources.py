@@ -452,7 +452,7 @@ def _psf_array(psf, scale):
 
         n = 2 * int(instrument_psf(psf).half_width / scale - 0.5 + 1e-6) + 1
         psf = psf_image(psf, pixel_scale=scale * ANGLE, shape=n)
-    psf = np.asarray(psf, float)
+    psf = floats(psf)
     if psf.ndim != 2 or psf.shape[0] != psf.shape[1] or psf.shape[0] % 2 == 0:
         raise argument_error("psf", "an ImagePSF, or an array that is odd and square", psf.shape)
     total = psf.sum()
