@@ -149,7 +149,7 @@ def test_real_galaxies_have_their_own_grid_whose_errors_are_logged(tmp_path, cap
         "10 fitted, wfc3.f125w",
         "miri.f770w            prior  1.000              3.30       15.0",
         "calibration 'CEERS, bands of cat.fits (",
-        "errors of the models 3 to 48 % of the flux",
+        "errors of the models 4 to 58 % of the flux",
         "2 to 15 % of the flux added to errors",
         "priors of frac_agn, age",
     ):
