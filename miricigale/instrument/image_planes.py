@@ -218,7 +218,7 @@ def noise_planes(hdus, index):
 
 def standard_deviation(image):
     """
-    Uncertainty of an image as a standard deviation.
+    Uncertainty of an image as a standard deviation, in the unit of the image.
 
     Parameters
     ----------
@@ -235,7 +235,13 @@ def standard_deviation(image):
         If it is of unknown kind.
     """
     try:
-        return image.uncertainty.represent_as(StdDevUncertainty)
+        # inverse variances of 0, which is no data, are infinite
+        with np.errstate(divide="ignore"):
+            deviation = image.uncertainty.represent_as(StdDevUncertainty)
     except TypeError:
         wanted = "one with a standard deviation, a variance or an inverse variance"
         raise argument_error("image", wanted, type(image.uncertainty).__name__) from None
+    # uncertainties may have a unit of their own
+    if deviation.unit is None or image.unit is None or deviation.unit == image.unit:
+        return deviation
+    return StdDevUncertainty(deviation.array * deviation.unit.to(image.unit))

@@ -2,10 +2,11 @@
 
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.nddata import NDData, StdDevUncertainty
+from astropy.nddata import NDData
 from astropy.stats import mad_std
 from astropy.table import Table
 
+from miricigale.instrument.image_planes import standard_deviation
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.star_fit import TERMS, Star, StarPSF
 from miricigale.utils.exceptions import argument_error
@@ -94,7 +95,7 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
         if image.uncertainty is None:
             sigma = np.full(data.shape, mad_std(data[use]))
         else:
-            sigma = image.uncertainty.represent_as(StdDevUncertainty).array
+            sigma = standard_deviation(image).array
         sigma = np.where(use & (sigma > 0), sigma, np.inf)
         for x, y in _places(image, table):
             wanted += 1

@@ -23,6 +23,7 @@ from miricigale.photometry.images.arrays import image_arrays
 from miricigale.psf import filter_psf, psf_image
 from miricigale.reduction import pixel_map, read_images
 from miricigale.reduction import write_image as write_jwst_image
+from miricigale.reduction.images.images import sigma
 from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.exceptions import DataError, PhotometryWarning
 
@@ -399,6 +400,15 @@ def test_images_that_are_no_products_of_miri_get_no_name_of_theirs(
     refuses(wanted, write_image, image, tmp_path / name)
     refuses(wanted, write_jwst_image, image, tmp_path / name)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["own.fits", "second.fits"])
+def test_an_uncertainty_has_a_unit_of_its_own(name, tmp_path):
+    error = StdDevUncertainty(plane(100.0), unit="kJy/sr")
+    image = Image(noise(), unit="MJy/sr", uncertainty=error, wcs=tan(), filter="F770W")
+    image.write(tmp_path / name)
+    np.testing.assert_allclose(read_mosaic(tmp_path / name).uncertainty.array, 0.1, rtol=1e-6)
+    np.testing.assert_allclose(sigma(image), 0.1)
 
 
 def test_options_of_astropy_are_refused_for_products_of_jwst(tmp_path):

@@ -5,6 +5,7 @@ import numpy as np
 from astropy.nddata import StdDevUncertainty
 
 from miricigale.instrument.image import Image
+from miricigale.instrument.image_planes import standard_deviation
 from miricigale.utils.exceptions import PhotometryWarning, warn
 
 
@@ -51,7 +52,7 @@ def own_pixels(image):
     if image.mask is not None:
         parts["mask"] = image.mask[part]
     if image.uncertainty is not None:
-        noise = image.uncertainty.represent_as(StdDevUncertainty).array[part]
+        noise = standard_deviation(image).array[part]
         parts["uncertainty"] = StdDevUncertainty(noise * factor)
     return Image(data[part] * factor, **parts)
 

@@ -6,6 +6,7 @@ from astropy.wcs import WCS
 
 from miricigale.instrument import DQ, ImageFacts, mosaic_wcs
 from miricigale.instrument.image import Image
+from miricigale.instrument.image_planes import standard_deviation
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import attributes, without_none
 from miricigale.utils.options import check_that
@@ -42,12 +43,9 @@ def plain_flags(image):
 
 
 def sigma(image, name="image"):
-    """Standard deviation of each pixel as an array; an image without uncertainty is refused."""
+    """Standard deviation of each pixel, in the image's unit; an image without uncertainty is refused."""
     check_that(image.uncertainty is not None, name, "an image with an uncertainty", "one without")
-    uncertainty = image.uncertainty
-    if uncertainty.uncertainty_type == "std":
-        return np.asarray(uncertainty.array)
-    return np.asarray(uncertainty.represent_as(StdDevUncertainty).array)
+    return np.asarray(standard_deviation(image).array)
 
 
 def with_data(source, data, *, factor=None, unit=None, **meta):
