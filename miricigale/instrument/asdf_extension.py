@@ -68,11 +68,13 @@ def read_gwcs(hdus, *, optional=False):
         return meta["wcs"]
 
 
-def asdf_wcs(header, hdus):
-    """The gwcs in the extension ASDF of JWST's pipeline, as FITS polynomials good to 0.01 pixels."""
+def asdf_wcs(header, hdus, *, optional=False):
+    """The gwcs in the extension ASDF of JWST's pipeline (`read_gwcs`), as FITS polynomials good to 0.01 pixels."""
     from astropy.wcs import WCS
 
-    exact = read_gwcs(hdus)
+    exact = read_gwcs(hdus, optional=optional)
+    if exact is None:
+        return None
     box = tuple((-0.5, header[f"NAXIS{k}"] - 0.5) for k in (1, 2))
     return WCS(exact.to_fits_sip(bounding_box=box, max_pix_error=0.01))
 

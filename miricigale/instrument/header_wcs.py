@@ -171,17 +171,20 @@ def image_wcs(header, hdus):
     if "ASDF" not in hdus:
         return wcs
     if wcs is None:
-        return asdf_wcs(header, hdus)
+        return asdf_wcs(header, hdus, optional=True)
     shape = header["NAXIS2"], header["NAXIS1"]
     if is_exposure(lambda key: header.get(key, hdus[0].header.get(key))) and wcs.sip is None:
         try:
-            distorted = asdf_wcs(header, hdus)
+            distorted = asdf_wcs(header, hdus, optional=True)
         except ImportError as err:
             msg = (
                 f"{file}: the coordinates in the header lack the distortion, which is in "
                 f"the extension ASDF: positions are pixels off. {err}"
             )
             warn(msg, PhotometryWarning)
+            return wcs
+        if distorted is None:
+            # of an image without distortion, as it was given
             return wcs
         x, y = (np.atleast_1d(value - 1) for value in wcs.wcs.crpix)
         inside = -0.5 <= x[0] <= shape[1] - 0.5 and -0.5 <= y[0] <= shape[0] - 0.5

@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from miricigale.instrument import dq_planes, read_dq, with_own_bits
+from miricigale.instrument import DQ, dq_planes, read_dq, with_own_bits
 from miricigale.instrument.header_wcs import header_wcs
 from miricigale.instrument.image import Image
 from miricigale.instrument.image_planes import standard_deviation
@@ -15,6 +15,7 @@ from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, replacing, write_fits
 from miricigale.utils.meta import json_meta
 from miricigale.utils.options import check_data, check_that
+from miricigale.utils.units import with_adu
 
 #: Steps of rounded values in the median error of an image: with its dither that adds less than 1e-3
 #: of its error to a flux.
@@ -126,7 +127,7 @@ def _unit(header, path):
     text = str(header.get("BUNIT", "")).strip()
     try:
         if text:
-            return u.Unit(text)
+            return with_adu(u.Unit(text))
     except ValueError:
         pass
     if text:
@@ -135,6 +136,19 @@ def _unit(header, path):
         got = "none"
     wanted = "must state the unit of its pixels, such as MJy/sr, in the keyword BUNIT"
     raise data_error(path, f"{wanted}, got {got}")
+
+
+def _mask(hdus):
+    """Mask of an image: that in MASK, or of a product of JWST, which has none, the pixels not to be used."""
+    if "MASK" in hdus:
+        return np.array(hdus["MASK"].data, bool)
+    if "DQ" not in hdus or "DATAMODL" not in hdus[0].header:
+        return None
+    flags = with_own_bits(read_dq(hdus["DQ"]), hdus)
+    bad = (flags & int(DQ.DO_NOT_USE)) != 0
+    if bad.any():
+        return bad
+    return None
 
 
 def read_image(path, *, planes=()):
@@ -182,7 +196,7 @@ def read_image(path, *, planes=()):
             unit=_unit(header, path),
             wcs=wcs,
             uncertainty=None if error is None else StdDevUncertainty(error),
-            mask=np.array(hdus["MASK"].data, bool) if "MASK" in hdus else None,
+            mask=_mask(hdus),
             meta=json.loads(header.get("META", "{}")),
         )
         extra = []

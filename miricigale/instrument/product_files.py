@@ -24,7 +24,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing, write_fits
 from miricigale.utils.meta import json_meta
 from miricigale.utils.named_values import without_none
-from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
+from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, with_adu
 
 #: How files of products of JWST are called.
 _PRODUCT_NAME = re.compile(
@@ -78,20 +78,28 @@ def check_product(path, image):
     Raises
     ------
     ValueError
-        If the name is that of ramps, the unit is another one than the product's, or the filter is not MIRI's.
+        If the name is that of ramps, the unit is another one than the product's, the image has more or fewer axes,
+        or the filter is not MIRI's.
     """
     product = jwst_product(path)
     name = repr(os.fspath(path))
     if product in _RAMPS:
         wanted = "a name of images; miricigale.detector.Ramp.write(path) writes ramps"
         raise argument_error("path", wanted, name)
-    if product in _RATES and not image.unit.is_equivalent(RATE):
+    unit = with_adu(image.unit)
+    if product in _RATES and not unit.is_equivalent(RATE):
         raise argument_error(
             "path", "a name of rates for an image in DN/s alone", f"{name} for {image.unit}"
         )
-    if product in _CALIBRATED and not image.unit.is_equivalent(SURFACE_BRIGHTNESS):
+    if product in _CALIBRATED and not unit.is_equivalent(SURFACE_BRIGHTNESS):
         wanted = "a name of calibrated images for an image in MJy/sr alone"
         raise argument_error("path", wanted, f"{name} for {image.unit}")
+    n_axes = 3 if str(product).endswith("ints") else 2
+    if product is not None and image.data.ndim != n_axes:
+        wanted = (
+            f"of {n_axes} axes to be written as {name} (integrations: rateints, calints, crfints)"
+        )
+        raise argument_error("image", wanted, f"the shape {image.data.shape}")
     band = ImageFacts.of(image).band
     bands = [filter_name.removeprefix("miri.") for filter_name in imager_filters()]
     if product is not None and band not in bands:
@@ -110,7 +118,7 @@ def write_product(image, path, *, planes=None, wcs=None, overwrite=False):
     path : path-like
         The file.
     planes : dict of str to `~numpy.ndarray`, optional
-        Further planes by name (`PLANES`).
+        Further planes by name (`PLANES`), and ``DQ`` for flags besides those of the image.
     wcs : `~astropy.wcs.WCS`, optional
         World coordinates of integrations; those of the image by default.
     overwrite : bool, optional
@@ -127,18 +135,24 @@ def write_product(image, path, *, planes=None, wcs=None, overwrite=False):
     ValueError
         If a plane has another name or shape, or the image is none that the name of the file promises.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     check_product(path, image)
     if wcs is None:
         wcs = image.wcs
-    planes = dict(planes or {})
+    planes = {str(name).upper(): plane for name, plane in (planes or {}).items()}
+    flags = _flags(image, planes.pop("DQ", 0))
+    product_unit, scale = _product_unit(image.unit)
     primary, science = _headers(image, path.name)
+    science["BUNIT"] = product_unit
+    is_resampled = jwst_product(path) == "i2d" or "resample" in ExposureHistory.of(image).steps
+    if is_resampled:
+        primary["S_RESAMP"] = "COMPLETE"
     extension = asdf_extension()
     if wcs is not None:
         primary["S_WCS"] = "COMPLETE"
         _add_sky(science, wcs, image.shape[-2:])
         if image.unit.is_equivalent(SURFACE_BRIGHTNESS):
-            if "resample" in ExposureHistory.of(image).steps:
+            if is_resampled:
                 if "PIXAR_SR" not in science:
                     science["PIXAR_SR"] = proj_plane_pixel_area(wcs) * u.deg.to(u.rad) ** 2
             else:
@@ -147,15 +161,19 @@ def write_product(image, path, *, planes=None, wcs=None, overwrite=False):
                     science["PIXAR_SR"] = _nominal_area()
                     planes["AREA"] = pixel_area_map(wcs, image.shape[-2:]) / _nominal_area()
             science["PIXAR_A2"] = science["PIXAR_SR"] * u.rad.to(u.arcsec) ** 2
-    data = np.asarray(image.data, np.float32)
+    data = np.asarray(image.data * scale, np.float32)
     hdus = [fits.PrimaryHDU(header=primary), fits.ImageHDU(data, science, name="SCI")]
     if image.uncertainty is not None:
         error = standard_deviation(image).array
-        hdus.append(fits.ImageHDU(np.asarray(error, np.float32), name="ERR"))
+        hdus.append(fits.ImageHDU(np.asarray(error * scale, np.float32), name="ERR"))
         hdus[-1].header["BUNIT"] = science["BUNIT"]
-    for name, plane, legend in dq_planes(_flags(image)):
+    for name, plane, legend in dq_planes(flags):
         hdus.append(fits.ImageHDU(plane, legend, name=name))
     for name, plane in planes.items():
+        if name.startswith("VAR_"):
+            plane = np.asarray(plane) * scale**2
+        if name == "BKG":
+            plane = np.asarray(plane) * scale
         hdus.append(_plane_hdu(name, plane, image.shape))
         if name == "BKG":
             hdus[-1].header["BUNIT"] = science["BUNIT"]
@@ -180,7 +198,6 @@ def _headers(image, filename):
         if step in steps:
             keywords[word] = "COMPLETE"
     primary.update(without_none(keywords))
-    science["BUNIT"] = _unit_name(image.unit)
     science["META"] = json_meta(meta)
     names = {"PHOTMJSR": "photmjsr", "PA_APER": "pa_aper", "XPOSURE": "exposure_time"}
     for key, name in names.items():
@@ -189,12 +206,12 @@ def _headers(image, filename):
     return primary, science
 
 
-def _unit_name(unit):
-    """Unit as the pipeline writes it: astropy takes DN/s for another unit than adu/s."""
+def _product_unit(unit):
+    """Unit of the pipeline, which takes no other, as it writes it, and the factor to it from the image's."""
     for product_unit, name in ((RATE, "DN/s"), (SURFACE_BRIGHTNESS, "MJy/sr")):
-        if unit == product_unit:
-            return name
-    return unit.to_string("fits")
+        if with_adu(unit).is_equivalent(product_unit):
+            return name, np.float32(with_adu(unit).to(product_unit))
+    return unit.to_string("fits"), np.float32(1)
 
 
 def _add_sky(science, wcs, shape):
@@ -210,9 +227,13 @@ def _add_sky(science, wcs, shape):
     science["S_REGION"] = "POLYGON ICRS " + " ".join(f"{angle:.9f}" for angle in corners)
 
 
-def _flags(image):
-    """Flags of an image, with masked pixels as not to be used."""
-    flags = np.zeros(image.data.shape, np.int64)
+def _flags(image, further):
+    """Flags of an image and further ones, with masked pixels as not to be used."""
+    shape = image.data.shape
+    further = np.asarray(further, np.int64)
+    if further.shape not in ((), shape):
+        raise argument_error("planes", f"of {shape} pixels", f"DQ of {further.shape}")
+    flags = np.zeros(shape, np.int64) | further
     if image.flags is not None:
         flags = flags | np.asarray(image.flags, np.int64)
     if image.mask is not None:

@@ -49,6 +49,36 @@ _ANGLE_NAMES = {
 _AB_NAMES = ("abmag", "mag(ab)", "ab", "mag_ab", "magab", "ab_mag", "abmags")
 
 
+def with_adu(unit):
+    """
+    Return a unit of counts or rates with adu for DN, which astropy takes for another unit.
+
+    Parameters
+    ----------
+    unit : `~astropy.units.UnitBase`
+        Of an image.
+
+    Returns
+    -------
+    unit : `~astropy.units.UnitBase`
+        Itself, if it is none of DN or DN/s.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.utils.units import with_adu
+    >>> with_adu(u.DN / u.s)
+    Unit("adu / s")
+    """
+    for counts, replacement in ((u.DN, DN), (u.DN / u.s, RATE)):
+        if isinstance(unit, u.UnitBase) and unit.is_equivalent(counts):
+            factor = unit.to(counts)
+            if factor == 1:
+                return replacement
+            return u.Unit(factor * replacement)
+    return unit
+
+
 def flux_unit(unit):
     """
     Return the unit that a name of a flux density means beyond those of astropy.

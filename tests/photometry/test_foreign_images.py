@@ -402,13 +402,70 @@ def test_images_that_are_no_products_of_miri_get_no_name_of_theirs(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["own.fits", "second.fits"])
+@pytest.mark.parametrize(
+    ("name", "unit", "factor"),
+    [
+        ("x_rate.fits", "DN/s", 1.0),
+        ("x_rate.fits", "1000 adu/s", 1000.0),
+        ("x_cal.fits", "MJy/sr", 1.0),
+        # 1 mJy/arcsec2 in MJy/sr: (180 * 3600 / pi)**2 * 1e-9
+        ("x_i2d.fits", "mJy/arcsec2", 42.545170),
+    ],
+)
+def test_products_without_distortion_come_back_in_their_unit(name, unit, factor, tmp_path):
+    mask = np.zeros(SHAPE, bool)
+    mask[2, 3] = True
+    image = Image(
+        noise(),
+        unit=unit,
+        uncertainty=VarianceUncertainty(plane(0.01)),
+        mask=mask,
+        wcs=tan(),
+        filter="F770W",
+    )
+    write_image(image, tmp_path / name, planes={"dq": 4 * mask})
+    (file,) = read_images(tmp_path / name)
+    read_images_of_it = [file.image, read_image(tmp_path / name)]
+    if "rate" not in name:
+        read_images_of_it.append(read_mosaic(tmp_path / name))
+    for read in read_images_of_it:
+        assert read.unit in (u.adu / u.s, u.MJy / u.sr)
+        np.testing.assert_allclose(read.data, noise() * factor, rtol=1e-6)
+        np.testing.assert_allclose(read.uncertainty.array, 0.1 * factor, rtol=1e-6)
+        np.testing.assert_array_equal(read.mask, mask)
+        np.testing.assert_allclose(
+            read.wcs.pixel_to_world_values(3, 7), image.wcs.pixel_to_world_values(3, 7), atol=1e-9
+        )
+    np.testing.assert_array_equal(file.image.flags != 0, mask)
+    assert file.image.flags[2, 3] == 5
+    with fits.open(tmp_path / name) as hdus:
+        assert (hdus[0].header.get("S_RESAMP") == "COMPLETE") == ("i2d" in name)
+        if "i2d" in name:
+            # of the mosaic's own pixels
+            assert hdus["SCI"].header["PIXAR_SR"] == pytest.approx(AREA)
+            assert "AREA" not in hdus
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("x_cal.fits", (2, *SHAPE)), ("x_calints.fits", SHAPE)]
+)
+def test_products_have_the_axes_of_their_name(name, shape, tmp_path):
+    image = Image(np.ones(shape), unit="MJy/sr", filter="F770W")
+    refuses("'image' must be of [23] axes to be written as", image.write, tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["own.fits", "x_cal.fits"])
 def test_an_uncertainty_has_a_unit_of_its_own(name, tmp_path):
     error = StdDevUncertainty(plane(100.0), unit="kJy/sr")
     image = Image(noise(), unit="MJy/sr", uncertainty=error, wcs=tan(), filter="F770W")
     image.write(tmp_path / name)
     np.testing.assert_allclose(read_mosaic(tmp_path / name).uncertainty.array, 0.1, rtol=1e-6)
     np.testing.assert_allclose(sigma(image), 0.1)
+
+
+def test_images_without_coordinates_are_refused_for_that(tmp_path):
+    Image(noise(), unit="MJy/sr", filter="F770W").write(tmp_path / "x_cal.fits")
+    refuses("has no celestial coord", read_mosaic, tmp_path / "x_cal.fits", error=DataError)
 
 
 def test_options_of_astropy_are_refused_for_products_of_jwst(tmp_path):

@@ -35,7 +35,7 @@ from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.named_values import without, without_none
 from miricigale.utils.parallel import check_memory
-from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
+from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, with_adu
 
 _WANTED = "an image of JWST (FITS with SCI)"
 
@@ -289,22 +289,17 @@ def _unit(header, path):
     text = str(header.get("BUNIT", "")).strip()
     try:
         if text:
-            unit = u.Unit(text.replace("counts", "DN"))
+            unit = with_adu(u.Unit(text.replace("counts", "DN")))
         else:
             unit = None
     except ValueError:
         unit = None
-    brightness = SURFACE_BRIGHTNESS
-    for stated_unit, unit_inside in (
-        (u.Unit("DN/s"), RATE),
-        (RATE, RATE),
-        (brightness, brightness),
-    ):
-        if unit is not None and unit.is_equivalent(stated_unit):
-            factor = unit.to(stated_unit)
+    for own_unit in (RATE, SURFACE_BRIGHTNESS):
+        if unit is not None and unit.is_equivalent(own_unit):
+            factor = unit.to(own_unit)
             if factor == 1:
-                return unit_inside
-            return u.Unit(factor * unit_inside)
+                return own_unit
+            return u.Unit(factor * own_unit)
     wanted = "must state in BUNIT that it is a rate (DN/s, adu/s) or a surface brightness (MJy/sr)"
     raise data_error(path, f"{wanted}, got {text!r}")
 

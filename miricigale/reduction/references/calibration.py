@@ -6,7 +6,7 @@ from miricigale.instrument import DQ, field_mask
 from miricigale.reduction.images.images import flag_pixels, plain_flags, with_data
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
-from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
+from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, with_adu
 
 
 def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
@@ -58,13 +58,14 @@ def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
     >>> print(f"{np.nanmedian(cal.data):.1f} {cal.unit}")
     5.0 MJy / sr
     """
-    if rate.unit is None or not rate.unit.is_equivalent(RATE):
+    unit = with_adu(rate.unit)
+    if unit is None or not unit.is_equivalent(RATE):
         raise argument_error("rate", f"in {RATE}", f"unit {rate.unit}")
     inside = field_mask(subarray=subarray)
     if rate.shape != inside.shape:
         raise argument_error("rate", f"of shape {inside.shape} for {subarray!r}", rate.shape)
     flat = np.broadcast_to(floats(flat).astype(np.float32), rate.shape)
-    scale = np.float32(rate.unit.to(RATE) * conversion) / flat
+    scale = np.float32(unit.to(RATE) * conversion) / flat
     out = with_data(
         rate,
         np.asarray(rate.data, np.float32) * scale,
