@@ -13,7 +13,7 @@ from miricigale.utils.files import packed_open, unpacked_size
 from miricigale.utils.meta import full_meta
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_data
-from miricigale.utils.table_files import TABLE_FORMATS, read_table
+from miricigale.utils.table_files import TABLE_FORMATS, read_table, table_suffix
 from miricigale.utils.units import WAVE
 
 #: Units of wavelengths as headers name them.
@@ -96,7 +96,7 @@ def read_curve(path, unit=None):
         one that is named, a wavelength is there more than twice, or a throughput is below -5 % of the peak.
     """
     path = Path(path).expanduser()
-    if path.suffix.lower() in TABLE_FORMATS:
+    if table_suffix(path) in TABLE_FORMATS:
         read = _of_table
     else:
         read = _of_text
@@ -149,7 +149,7 @@ def _not_negative(throughput, path):
 
 def _of_table(path, unit):
     table = read_table(path, wanted="a filter")
-    if path.suffix.lower() == ".csv" and any(map(_is_number, table.colnames)):
+    if table_suffix(path) == ".csv" and any(map(_is_number, table.colnames)):
         # without names of columns
         return _of_text(path, unit)
     wave_name, throughput_name = curve_columns(table, _THROUGHPUT, path)
@@ -162,7 +162,7 @@ def _of_table(path, unit):
     if is_percent or _PERCENT.search(throughput_name):
         throughput = throughput / 100
     meta = full_meta(table.meta)
-    if path.suffix.lower() in (".xml", ".vot", ".votable"):
+    if table_suffix(path) in (".xml", ".vot", ".votable"):
         meta = _parameters(path) | meta
     keywords = {}
     for keyword, entry in meta.items():
@@ -211,7 +211,8 @@ def _parameters(path):
 def _of_text(path, unit):
     unpacked_size(path)
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        with packed_open(path) as stream:
+            lines = stream.read().decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise data_error(path, f"cannot be read as a filter: {err}") from None
     lines = [line.strip() for line in lines]

@@ -18,7 +18,7 @@ from miricigale.utils.exceptions import argument_error, data_error, unknown_name
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
-from miricigale.utils.table_files import write_table
+from miricigale.utils.table_files import table_suffix, write_table
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_array, frozen_quantity, to_array
 
 #: Version of the band averages: raised when the same curve gives other numbers.
@@ -341,7 +341,13 @@ class Filter(Frozen, Interactive):
         return QTable({"wave": self.wave, "throughput": self.throughput}, meta=meta)
 
     def write(self, path, *, overwrite=False):
-        """Write the curve as a table, in the format of the suffix (``.ecsv``, ``.fits``, ...)."""
+        """
+        Write the curve as a table, in the format of the suffix (``.ecsv``, ``.fits``, ...).
+
+        CSV is refused, which keeps neither units nor the wavelength at which catalogs quote fluxes.
+        """
+        wanted = "a file of a format with units, such as .ecsv or .fits"
+        check_that(table_suffix(path) != ".csv", "path", wanted, str(path))
         write_table(self.to_table(), path, overwrite=overwrite)
 
     @classmethod

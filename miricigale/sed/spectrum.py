@@ -25,7 +25,7 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
-from miricigale.utils.table_files import read_table, write_table
+from miricigale.utils.table_files import read_table, table_suffix, write_table
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number, to_array
 
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
@@ -330,8 +330,10 @@ class SED(Frozen, Interactive):
         Write the spectrum as a table, in the format of the suffix (``.ecsv``, ``.fits``, ...).
 
         The parts are in nJy: readers such as that of specutils take a further column in the unit of the flux for
-        its uncertainty.
+        its uncertainty. CSV is refused, which keeps neither units nor the redshift.
         """
+        wanted = "a file of a format with units, such as .ecsv or .fits"
+        check_that(table_suffix(path) != ".csv", "path", wanted, str(path))
         table = self.to_table()
         for name in self.components:
             table[name] = table[name].to(_PART)

@@ -1,10 +1,11 @@
 """Tables of users: read in any of the usual formats, or refused in one sentence, and written by suffix."""
 
+import json
 import re
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
+from astropy.io import fits, votable
 from astropy.io.ascii import InconsistentTableError
 from astropy.table import Column, MaskedColumn, QTable, Table
 
@@ -30,6 +31,7 @@ from miricigale.utils.fits_tables import (
     table_read,
 )
 from miricigale.utils.ids import is_id_name
+from miricigale.utils.meta import plain_value
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
@@ -139,10 +141,9 @@ TABLE_FORMATS = {
     ".hdf5": "hdf5",
     ".parquet": "parquet",
 }
-#: What astropy must know further to write a format; VOTables in binary, for its writer of text is not safe.
+#: What astropy must know further to write a format.
 _OPTIONS = {
     "hdf5": {"path": "table", "serialize_meta": True},
-    "votable": {"tabledata_format": "binary2"},
 }
 #: The same of VOTables.
 _VOTABLE_TYPES = FITS_TYPES | {
@@ -150,6 +151,14 @@ _VOTABLE_TYPES = FITS_TYPES | {
     np.dtype(np.uint32): np.int64,
     np.dtype(np.uint64): np.int64,
 }
+
+
+def table_suffix(path):
+    """Suffix of a file in lower case, without that of its packing."""
+    name = Path(path).name.lower()
+    for packing in (".gz", ".bz2", ".xz", ".zip"):
+        name = name.removesuffix(packing)
+    return Path(name).suffix
 
 
 def write_table(table, path, *, overwrite=False):
@@ -184,13 +193,27 @@ def write_table(table, path, *, overwrite=False):
             hdus.writeto(partial)
         else:
             if form == "votable":
-                plain_table = _for_votable(sky_as_angles(table))
-            elif form == "ascii.csv":
+                _write_votable(sky_as_angles(table), partial)
+                return
+            if form == "ascii.csv":
                 # text of both angles in one cell is no position
                 plain_table = sky_as_angles(table)
             else:
                 plain_table = table
             plain_table.write(partial, format=form, **_OPTIONS.get(form, {}))
+
+
+def _write_votable(table, path):
+    """Write a VOTable in binary, for astropy's writer of text is not safe, its meta as JSON in a parameter."""
+    document = votable.from_table(_for_votable(table))
+    element = document.get_first_table()
+    if table.meta:
+        text = json.dumps(dict(table.meta), default=plain_value)
+        parameter = votable.tree.Param(
+            document, name="META", datatype="unicodeChar", arraysize="*", value=text
+        )
+        element.params.append(parameter)
+    document.to_xml(str(path), tabledata_format="binary2")
 
 
 def _for_votable(table):
@@ -212,10 +235,7 @@ def _for_votable(table):
 def _table_format(path):
     start = first_bytes(path).removeprefix(BOM)
     first = start.strip().partition(b"\n")[0].decode(errors="replace")
-    name = Path(path).name.lower()
-    for packing in (".gz", ".bz2", ".xz", ".zip"):
-        name = name.removesuffix(packing)
-    suffix = Path(name).suffix
+    suffix = table_suffix(path)
     if start.startswith(b"SIMPLE"):
         return "fits"
     if start.startswith(b"# %ECSV"):

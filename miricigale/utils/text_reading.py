@@ -1,5 +1,6 @@
 """Tables in text files and others that astropy reads by itself, with ids as they stand there."""
 
+import json
 import math
 import os
 import re
@@ -72,8 +73,21 @@ def read_text(path, form, id_names):
         if len(tables) == 1:
             check_names_differ([field.name for field in tables[0].fields])
         # names are what users see; astropy takes the IDs of fields
-        return Table.read(document, format=form, use_names_over_ids=True)
+        table = Table.read(document, format=form, use_names_over_ids=True)
+        table.meta.update(_own_meta(tables))
+        return table
     return Table.read(path, format=form)
+
+
+def _own_meta(tables):
+    """The meta dictionary that the package wrote into a VOTable; empty for others."""
+    for parameter in tables[0].params if tables else ():
+        if parameter.name == "META":
+            try:
+                return dict(json.loads(str(parameter.value)))
+            except ValueError:
+                break
+    return {}
 
 
 def _check_status(document, path):

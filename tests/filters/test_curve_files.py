@@ -1,5 +1,7 @@
 """Curves in files: units, detectors, blanks, edges, and what is written is read."""
 
+import gzip
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -190,7 +192,7 @@ def test_descending_tables_are_read_and_missing_values_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["mips.24", "irac.ch1", "miri.f770w"])
-@pytest.mark.parametrize("suffix", ["ecsv", "fits"])
+@pytest.mark.parametrize("suffix", ["ecsv", "fits", "vot", "fits.gz", "vot.gz"])
 def test_a_filter_that_is_written_is_read_with_its_convention(tmp_path, name, suffix):
     band = Filter(name)
     band.write(tmp_path / f"m.{suffix}")
@@ -199,6 +201,19 @@ def test_a_filter_that_is_written_is_read_with_its_convention(tmp_path, name, su
     assert again.reference_wavelength == band.reference_wavelength
     assert again.reference_temperature == band.reference_temperature
     assert again.name == name
+
+
+def test_a_filter_is_not_written_without_its_unit(tmp_path):
+    refuses(
+        "'path' must be a file of a format with units", Filter("F770W").write, tmp_path / "m.csv"
+    )
+
+
+def test_a_packed_curve_in_text_is_read(tmp_path):
+    text = b"# um\n7.0 0\n7.1 0.5\n7.6 0.9\n8.8 0\n"
+    (tmp_path / "a.dat").write_bytes(text)
+    (tmp_path / "b.dat.gz").write_bytes(gzip.compress(text))
+    assert Filter.read(tmp_path / "b.dat.gz").pivot == Filter.read(tmp_path / "a.dat").pivot
 
 
 def test_filters_of_sedpy_are_filters():

@@ -76,7 +76,7 @@ def test_a_spectrum_of_a_model_has_its_parts_and_can_be_kept(tmp_path):
     far = sed.redshifted(2.0)
     total = sum(far.components[name].fnu for name in names)
     assert_quantity_allclose(total, far.fnu, rtol=1e-9, atol=1e-20 * u.uJy)
-    for name in ("sed.ecsv", "sed.fits"):
+    for name in ("sed.ecsv", "sed.fits", "sed.vot"):
         sed.write(tmp_path / name)
         back = SED.read(tmp_path / name)
         assert back.redshift == 1.5
