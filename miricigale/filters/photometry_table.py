@@ -363,4 +363,5 @@ def _is_ab(table, name):
         plain, unit = name_and_unit(name)
         if unit is None:
             return _MAGNITUDE.match(plain) is not None
-    return unit == u.ABmag
+    # columns of astropy keep a name such as "ABmag" as text
+    return (flux_unit(unit) or unit) == u.ABmag

@@ -221,3 +221,14 @@ def test_a_unit_that_is_said_is_that_of_errors_without_one(catalog):
     for name in BANDS:
         table[f"{name}_err"] = catalog[f"{name}_err"].value / 1e3
     same(as_photometry(table, BANDS, units="mJy"), catalog)
+
+
+@pytest.mark.parametrize("unit", ["ABmag", "mag(AB)", "AB mag", u.ABmag])
+def test_names_of_magnitudes_are_units_in_tables_in_memory_too(unit):
+    # astropy keeps "ABmag" of a column as text
+    table = Table({"id": [1], "F770W": [23.9], "F770W_err": [0.1]})
+    table["F770W"].unit = unit
+    table["F770W_err"].unit = "mag"
+    table = as_photometry(table, ["miri.f770w"])
+    assert table["miri.f770w"].to_value(u.uJy) == pytest.approx(1.0, rel=1e-3)
+    assert table["miri.f770w_err"].to_value(u.uJy) == pytest.approx(0.0921, rel=1e-2)
