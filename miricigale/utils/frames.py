@@ -3,7 +3,7 @@
 import numpy as np
 
 from miricigale.utils.exceptions import CatalogWarning, warn
-from miricigale.utils.ids import is_id_name
+from miricigale.utils.ids import is_id_name, is_written_index
 from miricigale.utils.named_values import subset
 from miricigale.utils.options import check_that
 
@@ -54,6 +54,8 @@ def frame_columns(data, argument):
     repeated = sorted({name for name in names if names.count(name) > 1})
     check_that(not repeated, argument, "a frame whose columns have different names", repeated)
     columns = {name: _of_series(data[key]) for name, key in zip(names, data.columns, strict=True)}
+    if names and is_written_index(names[0], names, columns[names[0]]):
+        columns["id"] = columns.pop(names[0])
     return _of_index(data, columns, argument) | columns
 
 

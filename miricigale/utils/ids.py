@@ -13,11 +13,13 @@ _NAMES = (
 )  # fmt: skip
 #: The number of a segment, which is an id where nothing else is.
 _LABEL = "label"
+#: What pandas calls the index that it wrote into text without a name.
+WRITTEN_INDEX = "Unnamed: 0"
 #: Names that ids often have, but other things too.
 _LIKELY = ("name", "designation", "iauname", "object", "source", "target", "seq", "recno", "index")
 _ID_PART = re.compile(r"(?:^|[_\-. ])id(?:$|[_\-. ])", re.IGNORECASE)
 _ID_END = re.compile(r"[a-z](?:Id|ID)$|[A-Z]ID$")
-#: Whole numbers up to which every one is exact in double and single precision.
+#: Whole numbers below which every one is exact in double and single precision.
 _EXACT = {8: 2**53, 4: 2**24, 2: 2**11}
 #: Ids listed in a message.
 _LISTED = 3
@@ -72,6 +74,29 @@ def id_column(colnames, argument, *, labels=True):
             how = f"name the right one 'id', or give columns={{'id': {names[0]!r}}} with a map of columns"
             raise argument_error(argument, wanted, f"{' and '.join(map(repr, names))} ({how})")
     return None
+
+
+def is_written_index(name, colnames, values):
+    """
+    Whether a column is the index of a frame that pandas wrote into text without a name, and holds ids.
+
+    Parameters
+    ----------
+    name : str
+        Its name; pandas reads ``Unnamed: 0``.
+    colnames : iterable of str
+        Names of all columns; another one that is called as ids are is preferred.
+    values : array_like, shape (n,)
+        Its values; an index that counts the rows from 0 says nothing.
+
+    Returns
+    -------
+    bool
+    """
+    if name != WRITTEN_INDEX or any(map(is_id_name, colnames)):
+        return False
+    values = np.ma.getdata(values)
+    return not np.array_equal(values, np.arange(len(values)))
 
 
 def likely_ids(table):
@@ -214,7 +239,8 @@ def _of_floats(ids, missing, argument):
     if not np.all(safe == np.round(safe)):
         return np.array([repr(value) for value in safe.tolist()])
     limit = _EXACT.get(ids.dtype.itemsize, 2**53)
-    rows = np.flatnonzero(~(np.abs(safe) <= limit))
+    # the limit itself may be the next number, rounded
+    rows = np.flatnonzero(~(np.abs(safe) < limit))
     if rows.size:
         wanted = f"a table with ids as integers or text, for floats of {8 * ids.dtype.itemsize} bits are not exact"
         got = f"{float(safe[rows[0]])!r} in row {rows[0]} (from 0), of {rows.size} so large"

@@ -36,7 +36,7 @@ from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
 from miricigale.utils.text_reading import BOM, check_text, first_bytes, read_text
-from miricigale.utils.text_tables import drop_repeated, is_sextractor, names_in_comments
+from miricigale.utils.text_tables import drop_repeated, is_barred, is_sextractor, names_in_comments
 
 
 def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
@@ -242,6 +242,8 @@ def _table_format(path):
         return "ascii.ecsv"
     if suffix in TABLE_FORMATS:
         return TABLE_FORMATS[suffix]
+    if suffix == ".tsv":
+        return "ascii.csv"
     named = re.match("#(?!#)", first) and any(map(is_id_name, first.strip("# \r").split()))
     if is_sextractor(start):
         return "ascii.sextractor"
@@ -249,7 +251,7 @@ def _table_format(path):
         return "ascii.commented_header"
     if first.startswith("#") and names_in_comments(start.decode("utf-8", "replace")):
         return "ascii.no_header"
-    # which astropy does not try
-    if ";" in first:
+    # which astropy does not try, or takes for one column if the first name is empty
+    if ";" in first or start.startswith(b"\t") or is_barred(start):
         return "ascii.csv"
     return "ascii"

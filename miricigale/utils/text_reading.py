@@ -16,10 +16,16 @@ from astropy.utils.exceptions import AstropyWarning
 from miricigale.utils.exceptions import CatalogWarning, warn
 from miricigale.utils.files import is_zip, packed_open
 from miricigale.utils.fits_tables import check_names_differ
-from miricigale.utils.ids import ids_of_text, is_id_name
+from miricigale.utils.ids import WRITTEN_INDEX, ids_of_text, is_id_name, is_written_index
 from miricigale.utils.missing_values import is_missing_word
 from miricigale.utils.region_files import region_table
-from miricigale.utils.text_tables import csv_layout, names_in_comments, without_comments
+from miricigale.utils.text_tables import (
+    commas_for_tabs,
+    csv_layout,
+    names_in_comments,
+    plain_rows,
+    without_comments,
+)
 
 _PIECE = 1 << 20
 BOM = b"\xef\xbb\xbf"
@@ -47,17 +53,29 @@ def read_text(path, form, id_names):
             # a mark at the start is no part of the first name, and of archives astropy reads no text
             with packed_open(path) as stream:
                 source = stream.read().decode("utf-8-sig").splitlines()[n_comments:]
+        units = {}
         if form == "ascii.csv":
             source = without_comments(source, path, options["delimiter"])
+            source, units = plain_rows(source, path, options["delimiter"])
+            if options["delimiter"] == "\t":
+                source = commas_for_tabs(source, path)
+                options["delimiter"] = ","
         with warnings.catch_warnings():
             # what 64 bits do not hold is read as text
             warnings.filterwarnings("ignore", "OverflowError converting to IntType", AstropyWarning)
             table = Table.read(source, **options)
         if form != "ascii.ecsv":
             names = [name for name in table.colnames if name in id_names or is_id_name(name)]
+            if WRITTEN_INDEX in table.colnames:
+                names.append(WRITTEN_INDEX)
+            for name, unit in units.items():
+                table[name].unit = unit
             _numbers_among_words(table, names)
             _ids_as_written(table, path, source, options, names)
             _unmark_first_name(table)
+            first = table.colnames[0] if table.colnames else None
+            if first and is_written_index(first, table.colnames, table[first]):
+                table.rename_column(first, "id")
         return table
     if is_zip(path):
         msg = f"of {form} in a zip archive: unpack it first"

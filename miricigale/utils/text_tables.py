@@ -1,13 +1,14 @@
 """Layout of tables in text files: comments, separators, and names of columns that stand twice."""
 
 import csv
+import io
 import re
 
 import numpy as np
 
 from miricigale.utils.exceptions import CatalogWarning, warn
 from miricigale.utils.files import packed_open
-from miricigale.utils.ids import is_id_name
+from miricigale.utils.ids import WRITTEN_INDEX, is_id_name
 from miricigale.utils.missing_values import is_missing_word
 
 _BOM = "\ufeff"
@@ -15,6 +16,10 @@ _BOM = "\ufeff"
 _SEPARATORS = (",", ";", "\t", "|")
 #: Text in which the names of the columns are looked for.
 _HEAD = 1 << 20
+#: Lines in which bars, rules and units are looked for.
+_BARRED = 50
+#: A line between names and rows: of Markdown, or after the units of VizieR.
+_RULE = re.compile(r"[-:|;,\t ]+")
 #: First line of a catalog of SExtractor: number, name and meaning of the first column.
 _SEXTRACTOR = re.compile(rb"#\s*1\s+[A-Za-z]\w*(?:\s|$)")
 
@@ -54,6 +59,91 @@ def csv_layout(path):
     if n_comments and _holds_names(lines[n_comments - 1], header, separator):
         n_comments -= 1
     return separator, n_comments
+
+
+def is_barred(start):
+    """Whether every line of a text that begins with these bytes stands between bars, as in Markdown."""
+    lines = start.decode("utf-8", "replace").splitlines()[:_BARRED]
+    lines = [line.strip() for line in lines if line.strip()]
+    # tables of IPAC have bars in their header alone
+    return len(lines) > 1 and all(line.startswith("|") and line.endswith("|") for line in lines)
+
+
+def plain_rows(source, path, separator):
+    """
+    Leave rules, outer bars and the line of units of VizieR out of a CSV, and name a first column without a name.
+
+    Parameters
+    ----------
+    source : str or list of str
+        The file, or its lines from the names of the columns on.
+    path : path-like
+        The file.
+    separator : str
+        Between the cells.
+
+    Returns
+    -------
+    source : str or list of str
+        The same if there is nothing of these.
+    units : dict of str to str
+        Units of the columns that have one.
+    """
+    if isinstance(source, str):
+        with packed_open(path) as stream:
+            head = stream.read(_HEAD).decode("utf-8-sig", "replace").splitlines()
+    else:
+        head = source
+    head = [line for line in head[:_BARRED] if line.strip()]
+    barred = separator == "|" and is_barred("\n".join(head).encode())
+    unnamed = bool(head) and re.match(rf'(?:""|\s*){re.escape(separator)}', head[0].strip("\n"))
+    rule = 0
+    for number, line in enumerate(head[1:3], start=1):
+        if _RULE.fullmatch(line.strip()) and "-" in line:
+            rule = number
+    if not (barred or unnamed or rule):
+        return source, {}
+    if isinstance(source, str):
+        with packed_open(path) as stream:
+            source = stream.read().decode("utf-8-sig").splitlines()
+    lines = [line for line in source if line.strip()]
+    if barred:
+        lines = [line.strip()[1:-1] for line in lines]
+    cells = list(csv.reader(lines[:3], delimiter=separator))
+    names = [name.strip() for name in cells[0]]
+    if not barred and unnamed and not names[0]:
+        # the index of a DataFrame, as pandas writes and calls it
+        lines[0] = f"{WRITTEN_INDEX}{lines[0].lstrip(' ').removeprefix(chr(34) * 2)}"
+        names[0] = WRITTEN_INDEX
+    units = {}
+    if rule == 2:
+        for name, unit in zip(names, cells[1], strict=False):
+            if unit.strip():
+                units[name] = unit.strip()
+    return lines[:1] + lines[1 + rule :], units
+
+
+def commas_for_tabs(source, path):
+    """
+    Put commas between the cells of a table with tabs: of two tabs in a row astropy makes one, and values move.
+
+    Parameters
+    ----------
+    source : str or list of str
+        The file, or its lines from the names of the columns on.
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    lines : list of str
+    """
+    if isinstance(source, str):
+        with packed_open(path) as stream:
+            source = stream.read().decode("utf-8-sig").splitlines()
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(csv.reader(source, delimiter="\t"))
+    return text.getvalue().splitlines()
 
 
 def names_in_comments(text):

@@ -108,6 +108,9 @@ def test_floats_that_cannot_tell_ids_apart_are_refused():
     )
     single = np.array([1, 2**24 + 2], dtype=np.float32)
     refuses("floats of 32 bits are not exact", read_ids, Table({"id": single}))
+    # which is what 2^24 + 1 becomes
+    single = np.array([1, 2**24 + 1], dtype=np.float32)
+    refuses("floats of 32 bits are not exact", read_ids, Table({"id": single}))
 
 
 @pytest.mark.parametrize(
@@ -416,3 +419,16 @@ def test_missing_ids_are_no_duplicates_and_numbers_in_messages_are_plain():
     warned(r"1 row has an id that occurred before \(5\)", warn_of_duplicates, ids, "x")
     wrong = Table({"id": np.array([2.0**60, 1.0])})
     refuses(r"got 1\.152921504606847e\+18 in row 0", read_ids, wrong)
+
+
+@pytest.mark.parametrize("separator", [",", "\t"])
+def test_an_index_that_pandas_wrote_into_text_is_the_ids(separator, tmp_path):
+    pd = pytest.importorskip("pandas")
+    frame = pd.DataFrame({"f": [1.0, 2.0]}, index=[901, 2**62 + 1])
+    path = tmp_path / "c.csv"
+    frame.to_csv(path, sep=separator)
+    for data in (path, str(path), pd.read_csv(path, sep=separator), frame):
+        assert read_ids(as_table(data, "catalog")).tolist() == [901, 2**62 + 1]
+    # one that counts the rows says nothing
+    frame.reset_index(drop=True).to_csv(path, sep=separator)
+    assert "id" not in as_table(path, "catalog").colnames

@@ -1,7 +1,9 @@
 """Tables in text, as programs and people lay them out, and names of columns that stand twice."""
 
+import gzip
 import zipfile
 
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -178,3 +180,38 @@ def test_words_of_iraf_and_of_databases_are_missing(word, tmp_path):
     path = tmp_path / "c.csv"
     path.write_text(f"id,f\n1,{word}\n2,3.5\n")
     assert read_table(path, wanted="a catalog")["f"].tolist() == [None, 3.5]
+
+
+@pytest.mark.parametrize("blank", ["", "   "])
+@pytest.mark.parametrize("name", ["c.csv", "c.tsv", "c.tsv.gz", "c.txt"])
+def test_an_empty_cell_between_tabs_moves_no_value(name, blank, tmp_path):
+    # the fast reader of astropy makes one of two tabs: 0.5 was the flux
+    text = f"id\tf\te\n7\t2.5\t0.1\n9\t{blank}\t0.5\n".encode()
+    (tmp_path / name).write_bytes(gzip.compress(text) if name.endswith("gz") else text)
+    table = read_table(tmp_path / name, wanted="a catalog")
+    assert table["id"].tolist() == [7, 9]
+    assert table["e"].tolist() == [0.1, 0.5]
+    assert np.ma.asarray(table["f"]).mask.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("separator", ["\t", ";"])
+def test_units_and_rules_of_vizier_are_no_rows(separator, tmp_path):
+    rows = [["ID", "RAJ2000", "f_F770W"], ["", "deg", "uJy"], ["----", "---", "-----"]]
+    rows += [["0012", "150.1", "1.5"], ["0013", "150.2", "  "]]
+    text = "#RESOURCE=yCat\n#Column ID (A4)\n\n"
+    text += "\n".join(separator.join(cells) for cells in rows) + "\n\n"
+    (tmp_path / "c.tsv").write_text(text)
+    table = read_table(tmp_path / "c.tsv", wanted="a catalog")
+    assert table["ID"].tolist() == ["0012", "0013"]
+    assert table["RAJ2000"].unit == "deg"
+    assert table["f_F770W"][0] == 1.5 * u.uJy
+    assert np.all(table["f_F770W"].mask == [False, True])
+
+
+@pytest.mark.parametrize("rule", ["", "|---:|:---|\n"])
+def test_tables_between_bars_are_read(rule, tmp_path):
+    # of Markdown, and of astropy's fixed width
+    (tmp_path / "c.md").write_text(f"| id | f   |\n{rule}| 7  | 2.5 |\n| 9  | 3.5 |\n")
+    table = read_table(tmp_path / "c.md", wanted="a catalog")
+    assert table["id"].tolist() == [7, 9]
+    assert table["f"].tolist() == [2.5, 3.5]
