@@ -2,7 +2,7 @@
 Other programs on the same data, each in an environment of its own: a table for the accuracy pages.
 
     MIRICIGALE_DATA=../shared/data python benchmarks/peers.py FOLDER [--only eazy photutils] [--n 300]
-        [--eazy-data CLONE] [--lephare-data CLONE]
+        [--eazy-data CLONE] [--lephare-data CLONE] [--mophongo CLONE]
 
 FOLDER keeps the environments, what both sides read, and their results (JSON); a part that is there is not made
 again, so that a run goes on where the last one ended. Versions are pinned in `PEERS`. What pip cannot install is a
@@ -13,6 +13,8 @@ are not in its package: CLONE is one of github.com/gbrammer/eazy-photoz.
 lephare: the same, with its templates of COSMOS; CLONE is one of github.com/lephare-photoz/lephare-data.
 photutils: `PSFPhotometry` at the true positions of a crowded field of points against `ForcedPhotometer`.
 bagpipes: fluxes of its galaxies, and of ours with the same history, dust and redshift.
+mophongo: forced photometry of a crowded field of galaxies and points whose kernel is known exactly. It is on no
+registry: pip takes the commit in `MOPHONGO` from GitHub, or from a clone of it with ``--mophongo``.
 
 Times are CPU seconds of this machine, without imports and compilation.
 """
@@ -33,6 +35,11 @@ import numpy as np
 FWHM = 2.5
 #: Pixels of the side of the crowded field, and its number of points.
 SIDE, N_POINTS = 200, 400
+#: Sources of the field of galaxies, its side (arcsec), and the noise (uJy) in a pixel of 0.06 arcsec.
+N_GALAXIES, GALAXY_SIDE = 650, 53
+PRIOR_NOISE, IMAGE_NOISE = 0.004, 0.02
+#: Commit of mophongo.
+MOPHONGO = "6a128b15c8c20be206108723acd63b13024a9b11"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -441,6 +448,123 @@ def bagpipes_rows(folder):
     return rows
 
 
+# ------------------------------------------------------------------------- mophongo
+
+
+def mophongo_ours(folder, args):
+    """Make a crowded field whose image is the prior's light through a known kernel, and measure it."""
+    import astropy.units as u
+    from scipy.signal import fftconvolve
+
+    from miricigale.photometry import ErrorSettings, ForcedPhotometer, detect_sources
+    from miricigale.psf import MatchingKernel
+    from miricigale.utils.tables import match_sky
+    from photometry import FINE, cutout_kernel, galaxy_field, mosaic
+
+    automatic = cutout_kernel()
+    # what the kernel makes of the sharp PSF is the wide one: there is no error of the kernel
+    wide = fftconvolve(automatic.source, automatic.array, mode="same")
+    kernel = MatchingKernel(automatic.array, pixel_scale=FINE, source=automatic.source, target=wide)
+    rng = np.random.default_rng(1)
+    prior, light, sky, flux = galaxy_field(N_GALAXIES, GALAXY_SIDE, kernel, rng)
+    light = light + rng.normal(0, IMAGE_NOISE, light.shape)
+    image = mosaic(light, prior.wcs, IMAGE_NOISE)
+    segmentation, detected = detect_sources(prior, threshold=1.0, n_pixels=8)
+    index, _ = match_sky(detected["sky"], sky, radius=0.3 * u.arcsec)
+    truth = np.full(len(detected), np.nan)
+    truth[index[index >= 0]] = flux[index >= 0]
+    # bright and faint sources in one segment have no true flux of their own
+    x, y = prior.wcs.world_to_pixel(sky)
+    labels = segmentation.data[np.rint(y).astype(int), np.rint(x).astype(int)]
+    sources_of_label = np.bincount(labels, minlength=segmentation.max_label + 1)
+    truth[sources_of_label[detected["label"]] != 1] = np.nan
+    x, y = prior.wcs.world_to_pixel(detected["sky"])
+    np.savez(
+        folder / "field.npz", prior=prior.data / prior.uncertainty.array * PRIOR_NOISE,
+        image=light, segmentation=segmentation.data, label=detected["label"], x=x, y=y,
+        kernel=kernel.array, source=kernel.source, target=kernel.target,
+    )  # fmt: skip
+    segments_alone = {
+        "template": "cutout", "wings": False, "errors": ErrorSettings(size_scatter=None),
+    }  # fmt: skip
+    results = {"truth": truth}
+    for label, options in (("default", {}), ("segments", segments_alone)):
+        photometer = ForcedPhotometer(kernel, **options)
+        photometer.measure(image, prior, segmentation, detected)
+        begin = time.process_time()
+        result = photometer.measure(image, prior, segmentation, detected)
+        results[f"seconds_{label}"] = time.process_time() - begin
+        results[f"flux_{label}"] = result.flux.value
+        results[f"error_{label}"] = result.flux_err.value
+    save(folder / "ours.json", **results)
+
+
+def mophongo_theirs(folder, args):
+    """Measure the same images, segments and kernel: by default, and fluxes alone, of either sign."""
+    from astropy.table import Table
+    from mophongo.fit import FitConfig
+    from mophongo.pipeline import Pipeline
+
+    field = np.load(folder / "field.npz")
+    catalog = Table({"id": field["label"], "x": field["x"], "y": field["y"]})
+    images = [field["prior"].astype(np.float32), field["image"].astype(np.float32)]
+    weights = []
+    for image, noise in zip(images, (PRIOR_NOISE, IMAGE_NOISE), strict=True):
+        weights.append(np.full(image.shape, noise**-2.0, np.float32))
+    # as its guide says, PSFs and kernels have a unit sum
+    psfs = [field[name] / field[name].sum() for name in ("source", "target")]
+    kernel = field["kernel"] / field["kernel"].sum()
+    settings = {
+        "default": FitConfig(),
+        # the same least squares as ours: fluxes alone, of either sign
+        "segments": FitConfig(fit_method="lls", fit_astrometry_niter=0),
+    }
+    results = {}
+    for label, config in settings.items():
+        # compilation, and what is read on first use, count with neither program
+        for _ in range(2):
+            pipeline = Pipeline(
+                [image.copy() for image in images], field["segmentation"].copy(),
+                catalog=catalog, psfs=psfs, weights=[weight.copy() for weight in weights],
+                kernels=[None, kernel], config=config,
+            )  # fmt: skip
+            begin = time.process_time()
+            table, _ = pipeline.run()
+            seconds = time.process_time() - begin
+        results[f"seconds_{label}"] = seconds
+        results[f"flux_{label}"] = table["flux_1"]
+        results[f"error_{label}"] = table["err_1"]
+    save(folder / "theirs.json", **results)
+
+
+def mophongo_rows(folder):
+    """Rows by true flux over our error by default; both by default first, then segments with least squares."""
+    ours, theirs = (load(folder / f"{name}.json") for name in ("ours", "theirs"))
+    true = ours["truth"]
+    snr = true / ours["error_default"]
+
+    def numbers(results, label, rows):
+        flux = results[f"flux_{label}"][rows]
+        pull = (flux - true[rows]) / results[f"error_{label}"][rows]
+        # sources whose light is all masked have no flux
+        good = np.isfinite(pull)
+        wide = 1.4826 * np.median(np.abs(pull[good]))
+        bias = np.median((flux / true[rows])[good]) - 1
+        beyond = np.mean(np.abs(pull[good]) > 5)
+        return f"{wide:.2f}, {100 * bias:+.1f} %, {100 * beyond:.0f} %"
+
+    rows = []
+    for label in ("default", "segments"):
+        for low, high in ((0, 10), (10, 30), (30, np.inf)):
+            some = (snr >= low) & (snr < high)
+            texts = [numbers(results, label, some) for results in (theirs, ours)]
+            name = f"{label}, S/N {low}-{high} ({some.sum()}): MAD of pulls, bias, beyond 5"
+            rows.append((name, *texts))
+        times = [f"{results[f'seconds_{label}']:.2f}" for results in (theirs, ours)]
+        rows.append((f"{label}: CPU s of {true.size} sources", *times))
+    return rows
+
+
 PEERS = {
     "eazy": Peer(("eazy==0.8.7",), eazy_ours, eazy_theirs, redshift_rows),
     "photutils": Peer(
@@ -453,7 +577,10 @@ PEERS = {
     "jwst": Peer(("jwst==3.0.0",)),
     "stpsf": Peer(("stpsf==2.2.0",)),
     "pcigale": Peer(("pcigale",)),
-    "mophongo": Peer(("mophongo",)),
+    "mophongo": Peer(
+        (f"mophongo @ git+https://github.com/ivolabbe/mophongo@{MOPHONGO}",),
+        mophongo_ours, mophongo_theirs, mophongo_rows,
+    ),
 }  # fmt: skip
 
 
@@ -484,6 +611,9 @@ def judged(name, peer, args):
     """Rows of the table of a peer."""
     folder = args.folder / name
     folder.mkdir(parents=True, exist_ok=True)
+    if name == "mophongo" and args.mophongo is not None:
+        source = f"mophongo @ git+{args.mophongo.resolve().as_uri()}@{MOPHONGO}"
+        peer = dataclasses.replace(peer, requirements=(source,))
     python, failure = environment(folder, peer)
     if failure:
         return [(f"not installed: {failure}", "", "")]
@@ -495,7 +625,8 @@ def judged(name, peer, args):
     if not (folder / "ours.json").exists():
         peer.ours(folder, args)
     if not (folder / "theirs.json").exists():
-        command = [str(python), __file__, str(args.folder), "--inside", name]
+        # without this folder, whose `mophongo.py` is another module
+        command = [str(python), "-P", __file__, str(args.folder), "--inside", name]
         if data.get(name):
             command += [f"--{name}-data", str(data[name].resolve())]
         subprocess.run(command, check=True, env=os.environ | {"PYTHONPATH": ""})
@@ -509,6 +640,7 @@ def main():
     parser.add_argument("--n", type=int, default=300, help="sources of CEERS")
     parser.add_argument("--eazy-data", type=Path, help="clone of gbrammer/eazy-photoz")
     parser.add_argument("--lephare-data", type=Path, help="clone of lephare-photoz/lephare-data")
+    parser.add_argument("--mophongo", type=Path, help="clone of ivolabbe/mophongo, not GitHub's")
     parser.add_argument("--inside", choices=PEERS, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.inside:
