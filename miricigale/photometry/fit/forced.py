@@ -26,6 +26,7 @@ from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.psf import KernelField, MatchingKernel, as_kernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, is_number, positive, to_array
@@ -395,6 +396,8 @@ class ForcedPhotometer(Interactive):
         else:
             highres, segmentation, catalog = prior
             templates = self._templates(highres, segmentation, catalog[place.near_rows])
+            # models and stamps of the fits to the prior
+            return_freed_memory()
         self._check_grid(templates)
         rows, templates = self._rows(sources, place, templates)
         # what the result says of its making

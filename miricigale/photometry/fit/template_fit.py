@@ -15,6 +15,7 @@ from miricigale.photometry.templates.normal_equations import (
     sandwich_matrix,
 )
 from miricigale.utils.exceptions import PhotometryWarning, warn
+from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
@@ -141,6 +142,7 @@ def _sandwich(fit, correlation):
     white = list(map(fit.arrays.whitened, fit.columns))
     spread = [_spread(fit, image, correlation) for image in white]
     middle, border = sandwich_matrix(fit.bank, fit.inverse_sigma, correlation, spread)
+    return_freed_memory()
     middle = middle[keep][:, keep]
     border = border[keep]
     if fit.free is not None:
@@ -276,6 +278,8 @@ class TemplateFit:
         matrix, projection, power, light = normal_matrix(
             bank, self.inverse_sigma, [data] + list(white)
         )
+        # stamps over the noise, of which many were made and freed
+        return_freed_memory()
         self.light = light / bank.full_light()[:, None]
         self.power = power
         diagonal = matrix.diagonal()

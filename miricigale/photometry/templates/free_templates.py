@@ -12,6 +12,7 @@ from miricigale.photometry.templates.normal_equations import (
 )
 from miricigale.photometry.templates.pieces import divided_galaxies
 from miricigale.photometry.templates.template_changes import TemplateChanges
+from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import parallel_map
 
 #: Changes whose root of the sum of squares over the noise is below this are left out: they can move
@@ -113,6 +114,7 @@ class FreeTemplates:
         cross, changes, change_border = change_matrices(
             fit.bank, self.bank, inverse_sigma, images, correlation
         )
+        return_freed_memory()
         matrix = joined_matrix(middle, cross[fit.rows], changes, self.basis)
         return matrix, _right_side(border, change_border, self.basis)
 
@@ -148,10 +150,13 @@ def free_templates(fit, fitted):
         return None
     change_bank = bank.at_resolution(bank.order[rows[owner]], [change.cutout for change in changes])
     # the bank's rows are in an order of their own
-    changes = [changes[k] for k in change_bank.order]
-    owner = owner[change_bank.order]
-    fixed = np.array([change.fixed for change in changes], bool)
-    light = np.array([change.light for change in changes])
+    order = change_bank.order
+    owner = owner[order]
+    fixed = np.array([change.fixed for change in changes], bool)[order]
+    light = np.array([change.light for change in changes], float)[order]
+    # the bank alone has the cutouts, which it drops as it makes their templates
+    del changes
+    return_freed_memory()
     basis = change_basis(len(rows), owner, light, fixed)
     images = [fit.arrays.whitened(fit.arrays.flux)]
     for column in fit.columns:
@@ -159,6 +164,7 @@ def free_templates(fit, fitted):
     cross, changes_matrix, projection = change_matrices(
         bank, change_bank, fit.inverse_sigma, images
     )
+    return_freed_memory()
     cross = cross[rows]
     owner = owner[~fixed]
     # changes have unit width in units of the flux of their source

@@ -24,6 +24,10 @@ _PART = 250_000
 _PARTS_OF_BLOCK = 16
 
 
+#: Stands for a cutout that was dropped; None would be a point.
+_DROPPED = object()
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class FineTemplates:
     """Convolve cutouts on the fine grid, as spline coefficients."""
@@ -221,6 +225,9 @@ class TemplateBank:
         shape (m, k). Needed for several kernels.
     executor : `concurrent.futures.Executor`, optional
         Threads that the bank's `map` works with.
+    once : bool, optional
+        Whether cutouts are dropped as soon as their templates are made, if these are kept: they can then not be
+        made anew, and no other bank can be made of this one.
     """
 
     fine: FineTemplates
@@ -229,6 +236,7 @@ class TemplateBank:
     max_bytes: float = 1.5e9
     weigh: Callable | None = None
     executor: Executor | None = None
+    once: bool = False
 
     def __post_init__(self):
         sources = self.sources
@@ -280,12 +288,12 @@ class TemplateBank:
         return dataclasses.replace(self, sources=sources)
 
     def at_resolution(self, rows, cutout):
-        """Make the bank of cutouts that have the image's resolution, at some of the sources."""
+        """Make the bank of cutouts that have the image's resolution, at some of the sources; it is made once."""
         unit = np.ones((1, 1))
         old = self.sources
         sources = BankSources(cutout, old.fine_xy[rows], old.xy[rows], old.poly[rows])
         fine = dataclasses.replace(self.fine, kernel=unit, target=unit)
-        return dataclasses.replace(self, sources=sources, fine=fine, weigh=None)
+        return dataclasses.replace(self, sources=sources, fine=fine, weigh=None, once=True)
 
     def reuse(self, bank):
         """
@@ -354,6 +362,9 @@ class TemplateBank:
             block = self._make(rows.start, rows.stop)
             if keep:
                 blocks.append(block)
+            if keep and self.once:
+                for source in self.order[rows]:
+                    self.sources.cutout[source] = _DROPPED
             yield block
         if keep:
             self._kept = blocks
