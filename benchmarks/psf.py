@@ -12,6 +12,7 @@ import warnings
 
 import astropy.units as u
 import numpy as np
+import scipy.ndimage
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable
@@ -223,6 +224,47 @@ def light_ratio(result, row, radius=0.5):
     return float(1 + residual.data[near].sum() / (model - background)[near].sum())
 
 
+def residual_powers(result, rows, cutoff=5.0, half=10, n_blank=300):
+    """
+    Power of the residual over that of empty sky, at spatial frequencies that the telescope passes, and above.
+
+    The mirror (6.6 m) passes nothing above 5 cycles per arcsec at the blue end of F770W (6.6 um): what is there
+    comes from the detector and the resampling of the mosaic, not from light. Of squares of 2 ``half`` + 1 pixels
+    under a Hann window.
+
+    Returns
+    -------
+    ratio : `~numpy.ndarray`, shape (n, 2)
+        Passed, and above the ``cutoff``; NaN at the edge.
+    deviation : float
+        Standard deviation of the second for single squares of empty sky.
+    """
+    residual = result.residual_image
+    white = np.where(residual.mask, 0.0, residual.data / residual.uncertainty.array)
+    model = np.where(residual.mask, np.inf, result.model_image.data / residual.uncertainty.array)
+    size = 2 * half + 1
+    window = np.hanning(size + 2)[1:-1]
+    window = window[:, None] * window
+    frequency = np.fft.fftfreq(size, result.meta["pixel_scale"])
+    frequency = np.hypot(frequency[:, None], frequency)
+    bands = (frequency > 0.3) & (frequency < cutoff), frequency > cutoff
+
+    def powers(y, x):
+        square = white[y - half : y + half + 1, x - half : x + half + 1]
+        if square.shape != (size, size):
+            return np.nan, np.nan
+        power = np.abs(np.fft.fft2(square * window)) ** 2
+        return power[bands[0]].mean(), power[bands[1]].mean()
+
+    busy = scipy.ndimage.maximum_filter(np.abs(model), size, mode="constant", cval=np.inf)
+    empty = np.argwhere(busy < 1)
+    rng = np.random.default_rng(1)
+    blank = np.array([powers(y, x) for y, x in empty[rng.choice(len(empty), n_blank)]])
+    sources = [powers(round(result.y[k]), round(result.x[k])) for k in rows]
+    mean = blank.mean(axis=0)
+    return np.array(sources) / mean, blank[:, 1].std() / mean[1]
+
+
 def field(folder):
     """Print how bright sources of real images are fitted, without and with the stars."""
     start, psfs = f"{folder}/uds-test-", f"{folder}/psf/uds-test-"
@@ -264,12 +306,16 @@ def field(folder):
         print(f"  chi2 {np.round(np.sort(chi2), 2)}; pulls {pulls:.3f}, 5 sigma {depth:.1f} nJy")
         ratio = [round(light_ratio(result, k), 3) for k in bright[np.argsort(-snr[bright])]]
         print(f"  light over the model's within 0.5 arcsec, brightest first: {ratio}")
+        ratio, deviation = residual_powers(result, bright[np.argsort(-snr[bright])])
+        print(f"  power of residuals over that of the sky, passed by the telescope: {ratio[:, 0]}")
+        print(f"  and above (one square of sky +- {deviation:.2f}): {ratio[:, 1]}")
         if result.psf_stars is not None:
             print(f"  {result.psf_stars.meta}")
 
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
+    np.set_printoptions(precision=1, suppress=True)
     if sys.argv[1:2] == ["stars"]:
         stars([int(one) for one in sys.argv[2:]] or [1, 2, 3])
     elif sys.argv[1:2] == ["field"]:

@@ -89,15 +89,18 @@ class TemplateChanges:
         PSFs of the high-resolution image and of the image, on fine pixels.
     size_scatter : float
         Standard deviation of ln size between the bands of the two images.
+    width_error : float, optional
+        Standard deviation of ln width of the image's PSF, by which templates that are the image itself may change.
     """
 
-    def __init__(self, source, target, size_scatter):
+    def __init__(self, source, target, size_scatter, width_error=0.0):
         self._source = ShapeModels(source)
         self._target = ShapeModels(target)
         target_variance = _gaussian_variance(target)
         self._width = np.sqrt(target_variance)
         self._blur = np.sqrt(max(target_variance - _gaussian_variance(source), 0.0))
         self._size_scatter = size_scatter
+        self._width_error = width_error
 
     def of(self, cutout, fitted, min_power):
         """
@@ -199,6 +202,12 @@ class TemplateChanges:
         is_strong = self._size_scatter**2 * np.sum(middle**2) > min_power**2 * power
         if is_strong and not fitted["covariance"][1, 1]:
             changes.append(Change(Cutout(self._size_scatter * middle, remainder.origin)))
+        # of a source as sharp as the PSF that change is none, but the PSF may be wider or narrower: of a Gaussian
+        # the derivative to ln width is its variance times the Laplacian
+        wider = self._width_error * self._width**2 * scipy.ndimage.laplace(template)
+        is_strong = np.sum(wider**2) > min_power**2 * power
+        if is_strong and not fitted["covariance"][1, 1]:
+            changes.append(Change(Cutout(wider, remainder.origin), float(wider.sum())))
         # each pixel adds to the light, and to what is taken off by the fit
         weight = 1.0 - self._blurred(template) / power
         pixel_variance = cutout.noise / max(np.count_nonzero(core), 1)
