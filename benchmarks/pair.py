@@ -163,7 +163,7 @@ def main():
         ]
         (old, old_memory), (new, new_memory) = medians
         memory = f"{old_memory:.2f} {new_memory:.2f}"
-        print(f"{name:12s} {old:8.1f} {new:8.1f} {new / old:6.2f}   {memory:>12s}", flush=True)
+        print(f"{name:12s} {old:8.2f} {new:8.2f} {new / old:6.2f}   {memory:>12s}", flush=True)
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ class Chain:
         wave = _core.merge_nodes(parts + [marks, limit, windows])
         wave.flags.writeable = False
         self.wave = wave
-        self.log_wave = np.log(wave)
+        self.inverse_step = 1.0 / np.diff(wave)
         self.weights = _core.trapezoid_weights(wave)
         self.to_lnu = wave**2 / _core.LIGHT
         self._hard = int(np.searchsorted(wave, _core.LYMAN_LIMIT))  # these ionize hydrogen

@@ -195,12 +195,11 @@ def _row_flags(model, values, n):
 
 @cached(maxsize=16)
 def _stack(filters):
-    """All passbands one after the other, as `_core.band_means` takes them."""
+    """Integrals over all passbands, as `_core.band_means` takes them."""
     waves = [band.wave.to_value(WAVE) for band in filters]
     curves = [np.asarray(band.throughput, dtype=float) for band in filters]
     start = np.append(0, np.cumsum(list(map(len, waves))))
-    band_wave = np.concatenate(waves)
-    return start, band_wave, *_core.band_tables(start, band_wave, np.concatenate(curves))
+    return _core.band_tables(start, np.concatenate(waves), np.concatenate(curves))
 
 
 def spectra(model, values):
@@ -259,7 +258,7 @@ class _Blocks:
         self.far = far
         self.chain = model.chain
         self.bands = bands
-        self.span = np.array([bands[1].min(), bands[1].max()])
+        self.span = np.array([bands[0].min(), bands[0].max()])
         self._light = np.empty((BLOCK, self.chain.wave.size))
 
     def _keys(self, rows, roles):
@@ -330,10 +329,10 @@ class _Blocks:
         edges = np.maximum(np.searchsorted(chain.wave, edges) + [-1, 1], 0).tolist()
         for out, key, (a, b) in zip(dim, different, edges, strict=True):
             out[a:b] = chain.sky_transmission(key[0], key[1:], a, b)
-        flux = np.empty((n, self.bands[0].size - 1))
+        flux = np.empty((n, len(self.bands[0])))
         scale = mass * dilution(z, self.far[rows])
         _core.block_fluxes(
-            chain.wave, chain.log_wave, chain.to_lnu, light, spectra, model_of_row, power, dim, sky, z, scale,
+            chain.wave, chain.inverse_step, chain.to_lnu, light, spectra, model_of_row, power, dim, sky, z, scale,
             *self.bands, UNCOVERED, flux,
         )  # fmt: skip
         block = rows_of(values, rows)

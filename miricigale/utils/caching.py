@@ -6,6 +6,9 @@ import functools
 
 import numpy as np
 
+#: Types of values that nobody can change, the most common ones.
+_PLAIN = frozenset([float, int, bool, str, bytes, type(None)])
+
 
 class FrozenDict(dict):
     """
@@ -74,6 +77,13 @@ def frozen(value):
     -------
     value : object
     """
+    # the most common types first: this is called for each of many small results
+    kind = type(value)
+    if kind in _PLAIN:
+        return value
+    if kind is np.ndarray:
+        value.flags.writeable = False
+        return value
     if isinstance(value, np.ndarray):
         _freeze_array(value)
         return value
@@ -105,13 +115,19 @@ def _freeze_array(array):
 
 def _freeze_fields(value):
     """Freeze the fields of a frozen dataclass; those of others are theirs to change."""
-    if not value.__dataclass_params__.frozen:
-        return
-    for field in dataclasses.fields(value):
-        entry = getattr(value, field.name, None)
+    for name in _fields_to_freeze(type(value)):
+        entry = getattr(value, name, None)
         changed = frozen(entry)
         if changed is not entry:
-            object.__setattr__(value, field.name, changed)
+            object.__setattr__(value, name, changed)
+
+
+@functools.cache
+def _fields_to_freeze(cls):
+    """Names of the fields of a frozen dataclass; none of another."""
+    if not cls.__dataclass_params__.frozen:
+        return ()
+    return tuple(field.name for field in dataclasses.fields(cls))
 
 
 def cached(function=None, *, maxsize=None, copies=False):

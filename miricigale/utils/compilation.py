@@ -20,6 +20,18 @@ from miricigale.utils.caching import cached
 
 log = logging.getLogger(__name__)
 
+#: Options of kernels called from Python that allocate nothing, whose sums may be taken in any order.
+KERNEL = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": True,
+    "no_cfunc_wrapper": True,
+    "_nrt": False,
+}
+#: Options of functions that become part of kernels.
+PART = {**KERNEL, "no_cpython_wrapper": True, "forceinline": True}
+
 
 class _Listener(event.Listener):
     """Says what is compiled, once for each subpackage; compiling is faster without garbage collection."""

@@ -57,6 +57,7 @@ ARGUMENTS = {
     "psf.hst._hst_blur": (0.06,),
     "psf.hst._hst_optics": ("wfc3.f160w", 0.06, 11, 45.0),
     "psf.telescope.band_quantiles": ("miri.f770w",),
+    "utils.caching._fields_to_freeze": (Filter,),
     "utils.package_tables.declared": ("miricigale.fitting", "columns.toml"),
     "utils.compilation._digest": ("miricigale",),
     "workflow.background._named": ("miri.f770w", "low", None, None),

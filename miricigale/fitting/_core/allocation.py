@@ -4,8 +4,7 @@ from collections import namedtuple
 
 import numpy as np
 
-from miricigale.fitting._core.structs import KERNEL
-from miricigale.utils.compilation import njit
+from miricigale.utils.compilation import KERNEL, njit
 
 #: Sets of groups that have to have an effective number of their own: ``start``, int64 (n_sets + 1,), of each in
 #: ``group``, int64, flat.

@@ -8,10 +8,10 @@ negative the best scale that is not negative is 0 and R = 0.
 """
 
 from miricigale.fitting._core import structs as at
-from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.limits import limited_scale
-from miricigale.fitting._core.structs import BLOCK, DONE, KEY_BITS, KEY_MASK, NO_LIGHT, PART
-from miricigale.utils.compilation import njit
+from miricigale.fitting._core.structs import BLOCK, DONE, KEY_BITS, KEY_MASK, NO_LIGHT
+from miricigale.utils._core.functions import exponential
+from miricigale.utils.compilation import PART, njit
 
 
 @njit(**PART)

@@ -23,7 +23,7 @@ from miricigale.fitting._core.histogram import add_model, widest
 from miricigale.fitting._core.limits import limited_likelihoods
 from miricigale.fitting._core.pairs import agn_products, best_of_galaxy, list_runs, project
 from miricigale.fitting._core.single import single_likelihoods
-from miricigale.fitting._core.structs import BLOCK, KERNEL, KEY_BITS, PART
+from miricigale.fitting._core.structs import BLOCK, KEY_BITS
 from miricigale.fitting._core.sums import (
     PARTS,
     add_joint,
@@ -35,7 +35,7 @@ from miricigale.fitting._core.sums import (
     keep_best,
     take_draw,
 )
-from miricigale.utils.compilation import njit
+from miricigale.utils.compilation import KERNEL, PART, njit
 
 _LOG10_E = 0.43429448190325183
 # Models without AGN so far below the best are not looked at for a reference.

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from miricigale.fitting._core.functions import log10
-from miricigale.fitting._core.structs import BLOCK, DONE, KERNEL, KEY_BITS, KEY_MASK, PART
-from miricigale.utils.compilation import njit
+from miricigale.fitting._core.structs import BLOCK, DONE, KEY_BITS, KEY_MASK
+from miricigale.utils._core.functions import log10
+from miricigale.utils.compilation import KERNEL, PART, njit
 
 # Steps of the histogram of bounds ...
 _N_LEVELS = 1024

@@ -11,9 +11,9 @@ import math
 import numpy as np
 
 from miricigale.fitting._core import structs as at
-from miricigale.fitting._core.functions import log10
-from miricigale.fitting._core.structs import KERNEL, PART, Scales
-from miricigale.utils.compilation import njit
+from miricigale.fitting._core.structs import Scales
+from miricigale.utils._core.functions import log10
+from miricigale.utils.compilation import KERNEL, PART, njit
 
 PER_DEX = 100
 N_BINS = 2048

@@ -10,10 +10,9 @@ distribution. Axes without effect for a label stay at it; the others are *active
 import math
 from collections import namedtuple
 
-from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.population import NEVER, _evaluate
-from miricigale.fitting._core.structs import KERNEL, PART
-from miricigale.utils.compilation import njit
+from miricigale.utils._core.functions import exponential
+from miricigale.utils.compilation import KERNEL, PART, njit
 
 #: Labels of a `Space`: first cell and number of cells of each axis, int64 (n_labels, n_axes); the active axes,
 #: int64 (n_labels, n_axes), and their number, (n_labels,); share of the proposal below each cell, (n_axes,

@@ -12,9 +12,8 @@ from collections import namedtuple
 
 import numpy as np
 
-from miricigale.fitting._core.functions import exponential
-from miricigale.fitting._core.structs import KERNEL, PART
-from miricigale.utils.compilation import njit
+from miricigale.utils._core.functions import exponential
+from miricigale.utils.compilation import KERNEL, PART, njit
 
 #: Least weight of a node that counts.
 _LEAST_WEIGHT = 1e-10

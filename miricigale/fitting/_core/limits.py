@@ -19,9 +19,9 @@ import math
 import numpy as np
 
 from miricigale.fitting._core import structs as at
-from miricigale.fitting._core.functions import exponential, polynomial
-from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
-from miricigale.utils.compilation import njit
+from miricigale.fitting._core.structs import BLOCK, NO_LIGHT
+from miricigale.utils._core.functions import exponential, polynomial
+from miricigale.utils.compilation import PART, njit
 
 # Offsets of the vectors in Lanes.limited: scale, half of chi2 and of its second derivative, the
 # limits' probability over exp(exponent), the exponent, the scale without limits (0 in lanes that do

@@ -3,9 +3,9 @@
 import numpy as np
 
 from miricigale.fitting._core.batched_pairs import galaxy_products
-from miricigale.fitting._core.functions import exponential, log10
-from miricigale.fitting._core.structs import BLOCK, KERNEL
-from miricigale.utils.compilation import njit
+from miricigale.fitting._core.structs import BLOCK
+from miricigale.utils._core.functions import exponential, log10
+from miricigale.utils.compilation import KERNEL, njit
 
 # Below this ln of a prior there is none.
 _NONE = -1e200

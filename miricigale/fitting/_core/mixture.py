@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from miricigale.fitting._core.batched_pairs import best_mixture
-from miricigale.fitting._core.structs import KERNEL, PART
-from miricigale.utils.compilation import njit
+from miricigale.utils.compilation import KERNEL, PART, njit
 
 # Steps of expectation from each start.
 _STEPS = 3

@@ -2,8 +2,7 @@
 
 from collections import namedtuple
 
-from miricigale.fitting._core.structs import PART
-from miricigale.utils.compilation import njit
+from miricigale.utils.compilation import PART, njit
 
 #: Nuclei of an object: their bands, int64 (n,); what is subtracted of AGN fluxes from the totals, (n, n), so that
 #: the rest has errors of its own; what makes AGN fluxes those of errors of 1 that are not correlated, (n, n); and

@@ -17,8 +17,8 @@ import numpy as np
 
 from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.batched_pairs import best_scale
-from miricigale.fitting._core.structs import BLOCK, DONE, KERNEL, KEY_BITS, PART
-from miricigale.utils.compilation import njit
+from miricigale.fitting._core.structs import BLOCK, DONE, KEY_BITS
+from miricigale.utils.compilation import KERNEL, PART, njit
 
 #: Tori handled side by side; arrays of unit vectors are padded with zeros to a multiple.
 GROUP = 4

@@ -3,12 +3,12 @@
 import math
 from collections import namedtuple
 
-from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.interpolation import galaxy_light, with_agn
 from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.nuclei import with_nuclei
-from miricigale.fitting._core.structs import NO_LIGHT, PART
-from miricigale.utils.compilation import njit
+from miricigale.fitting._core.structs import NO_LIGHT
+from miricigale.utils._core.functions import exponential
+from miricigale.utils.compilation import PART, njit
 
 #: ln of what has no probability, and below which there is none.
 NEVER = -1e300

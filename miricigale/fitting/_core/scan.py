@@ -11,10 +11,10 @@ import numpy as np
 
 from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.batched_pairs import best_mixture
-from miricigale.fitting._core.functions import exponential, log10_single
-from miricigale.fitting._core.structs import BLOCK, KERNEL, PART
+from miricigale.fitting._core.structs import BLOCK
 from miricigale.fitting._core.workspace import aligned
-from miricigale.utils.compilation import njit
+from miricigale.utils._core.functions import exponential, log10_single
+from miricigale.utils.compilation import KERNEL, PART, njit
 
 #: Value of a model that may not be used, and ln of a prior below which there is none.
 _NOWHERE = np.float32(-1e30)

@@ -14,9 +14,9 @@ rounding changes a weight by some 1e-7.
 import numpy as np
 
 from miricigale.fitting._core import structs as at
-from miricigale.fitting._core.functions import exponential
-from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
-from miricigale.utils.compilation import njit
+from miricigale.fitting._core.structs import BLOCK, NO_LIGHT
+from miricigale.utils._core.functions import exponential
+from miricigale.utils.compilation import PART, njit
 
 # Offsets of the vectors in Lanes.single: N, D, K, M, the scale's variance, the share, x*, the
 # other fraction there ...

@@ -44,18 +44,6 @@ W0, W1, W2, V1, U2, V2, F1, F2, WZ, WR, TOP, T = (i * BLOCK for i in range(8, 20
 #: Length of the whole buffer.
 SIZE = 20 * BLOCK
 
-#: Kernels called from Python.
-KERNEL = {
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": True,
-    "no_cfunc_wrapper": True,
-    "_nrt": False,
-}
-#: Parts of kernels.
-PART = {**KERNEL, "no_cpython_wrapper": True, "forceinline": True}
-
 
 class Tables(NamedTuple):
     """

@@ -8,8 +8,8 @@ from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.batched_pairs import best_mixture, best_scale
 from miricigale.fitting._core.histogram import add_model
 from miricigale.fitting._core.single import pair_weight
-from miricigale.fitting._core.structs import BLOCK, PART
-from miricigale.utils.compilation import njit
+from miricigale.fitting._core.structs import BLOCK
+from miricigale.utils.compilation import PART, njit
 
 #: Parts of the weight so far by which light models are sampled for the histograms ...
 PARTS = 16_000.0

@@ -1,13 +1,12 @@
 """Many models at once: starlight behind dust with its re-emission, and fluxes in bands."""
 
-import math
-
 import numpy as np
 
 from miricigale.sed._core.bands import band_means
 from miricigale.utils.compilation import njit
 
-_TILE = 256  # wavelengths of all ages that stay in the cache
+_TILE = 512  # wavelengths, and
+_ROWS = 16  # rows, whose sums stay in the cache
 
 
 @njit(cache=True)
@@ -18,34 +17,47 @@ def weighted_sums(weights, spectra):
     The digits of a row do not depend on the others, as those of a matrix product do, and ages
     without weight cost nothing.
     """
-    n_wave = spectra.shape[1]
-    out = np.zeros((weights.shape[0], n_wave))
-    for first in range(0, n_wave, _TILE):
-        last = min(first + _TILE, n_wave)
-        for i in range(weights.shape[0]):
-            total = out[i, first:last]
-            used = np.flatnonzero(weights[i])
-            four = used.size - used.size % 4
+    n_age, n_wave = spectra.shape
+    n = weights.shape[0]
+    out = np.zeros((n, n_wave))
+    has_weight = np.empty(n_age, dtype=np.bool_)
+    for head in range(0, n, _ROWS):
+        rows = range(head, min(head + _ROWS, n))
+        for k in range(n_age):
+            has_weight[k] = False
+            for i in rows:
+                if weights[i, k] != 0.0:
+                    has_weight[k] = True
+        used = np.flatnonzero(has_weight)
+        four = used.size - used.size % 4
+        for first in range(0, n_wave, _TILE):
+            last = min(first + _TILE, n_wave)
             for k in range(0, four, 4):  # added one after the other, whatever their number
                 a = used[k]
                 b = used[k + 1]
                 c = used[k + 2]
                 d = used[k + 3]
-                w = weights[i, a]
-                x = weights[i, b]
-                y = weights[i, c]
-                z = weights[i, d]
                 p = spectra[a, first:last]
                 q = spectra[b, first:last]
                 r = spectra[c, first:last]
                 s = spectra[d, first:last]
-                for j in range(last - first):
-                    total[j] = (((total[j] + w * p[j]) + x * q[j]) + y * r[j]) + z * s[j]
+                for i in rows:
+                    w = weights[i, a]
+                    x = weights[i, b]
+                    y = weights[i, c]
+                    z = weights[i, d]
+                    if w == 0.0 and x == 0.0 and y == 0.0 and z == 0.0:
+                        continue
+                    total = out[i, first:last]
+                    for j in range(last - first):
+                        total[j] = (((total[j] + w * p[j]) + x * q[j]) + y * r[j]) + z * s[j]
             for k in range(four, used.size):
-                w = weights[i, used[k]]
                 p = spectra[used[k], first:last]
-                for j in range(last - first):
-                    total[j] += w * p[j]
+                for i in rows:
+                    w = weights[i, used[k]]
+                    total = out[i, first:last]
+                    for j in range(last - first):
+                        total[j] += w * p[j]
     return out
 
 
@@ -110,50 +122,57 @@ def mix_light(
 
 @njit(cache=True)
 def block_fluxes(
-    wave, log_wave, to_lnu, light, agn, model_of_row, power, dim, sky, z, scale,
-    start, band, moments, bucket, tolerance, out,
+    wave, inverse_step, to_lnu, light, agn, model_of_row, power, dim, sky, z, scale,
+    span, edge, integrals, tolerance, out,
 ):  # fmt: skip
     """
     Band fluxes of a block of models, each at its own redshift.
 
     Parameters
     ----------
-    wave, log_wave, to_lnu : shape (n_wave,)
-        Rest wavelengths in um, their logarithms, and the factor from L_lambda to L_nu.
+    wave, to_lnu : shape (n_wave,)
+        Rest wavelengths in um, and the factor from L_lambda to L_nu.
+    inverse_step : shape (n_wave - 1,)
+        One over the steps between wavelengths.
     light, agn : shape (n, n_wave) and (n_agn, n_wave)
         L_lambda of the galaxies, and of AGN for one watt.
-    which, power : shape (n,)
+    model_of_row, power : shape (n,)
         Which of the AGN each model has (int), and its power in W.
     dim, sky : shape (n_dim, n_wave) and (n,)
         Transmissions between the source and us, and which of them each model has (int).
     z, scale : shape (n,)
         Redshift, and factor from L_nu to flux.
-    start, band, moments, bucket, tolerance
+    span, edge, integrals, tolerance
         As for `band_means`.
     out : shape (n, n_band)
         Filled with the fluxes; NaN in bands that the spectrum does not cover.
     """
     observed = np.empty(wave.size)
-    log_observed = np.empty(wave.size)
     fnu = np.empty(wave.size)
-    low = band.min()
-    high = band.max()
+    slope = np.zeros(wave.size)
+    turn = np.zeros(wave.size)
+    low = span[:, 0].min()
+    high = span[:, 1].max()
     for i in range(z.size):
         k = model_of_row[i]
         p = power[i]
         s = sky[i]
         stretch = 1.0 + z[i]
-        log_stretch = math.log(stretch)
+        per_step = 1.0 / stretch
         for j in range(wave.size):
             observed[j] = wave[j] * stretch
         # what no band looks at is left out
         begin = max(np.searchsorted(observed, low, side="right") - 1, 0)
-        for j in range(begin, min(np.searchsorted(observed, high) + 1, wave.size)):
-            log_observed[j] = log_wave[j] + log_stretch
-            total = light[i, j]
-            if p > 0.0:
-                total += p * agn[k, j]
-            fnu[j] = total * to_lnu[j] * dim[s, j]
-        band_means(observed, log_observed, fnu, start, band, moments, bucket, tolerance, out[i])
+        end = min(np.searchsorted(observed, high) + 1, wave.size)
+        for j in range(begin, end):
+            fnu[j] = light[i, j] * to_lnu[j] * dim[s, j]
+        if p > 0.0:
+            for j in range(begin, end):
+                fnu[j] += p * agn[k, j] * to_lnu[j] * dim[s, j]
+        for j in range(begin, end - 1):
+            slope[j] = (fnu[j + 1] - fnu[j]) * inverse_step[j] * per_step
+        for j in range(begin + 1, end - 1):
+            turn[j] = slope[j] - slope[j - 1]
+        band_means(observed, fnu, slope, turn, span, edge, integrals, tolerance, out[i])
         for b in range(out.shape[1]):
             out[i, b] *= scale[i]

@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.sed._core.attenuation import leitherer_calzetti, smc_power_law
 from miricigale.sed._core.nodes import trapezoid_weights
 from miricigale.sed._core.thermal import PLANCK_K
+from miricigale.utils._core.functions import exponential
 from miricigale.utils.compilation import njit
 
 #: Mean over the sphere of cos i (1 + 2 cos i) / 3: a disk's light over its face-on value.
@@ -16,6 +17,12 @@ DISK_MEAN = 7.0 / 18.0
 POLAR_LAWS = ("smc", "calzetti", "gaskell")
 
 _WAVE_THICK = 200.0  # um: optical depth of the emitting dust is one
+#: h c / (lambda k T) beyond which a body is dark: 1e-17 of its peak.
+_LARGEST_EXPONENT = 60.0
+#: Logarithm of the optical depth beyond which 1 - exp(-depth) is one to 1e-23.
+_OPAQUE = 4.0
+#: Logarithm of a transmission below which no light is left.
+_LOG_DARK = -700.0
 
 
 def polar_curve(wave, law):
@@ -68,6 +75,42 @@ def polar_share(opening_angle):
     return DISK_MEAN - s**2 / 6.0 - 2.0 * s**3 / 9.0
 
 
+@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+def _dimmed(absorption, weight, face_on, disk, ebv, dims_disk, out):
+    """Fill ``out`` with the disk behind polar dust, if it is; return the power taken from ``face_on``."""
+    lost = 0.0
+    for i in range(face_on.size):
+        through = exponential(max(absorption[i] * ebv, _LOG_DARK))
+        lost += weight[i] * face_on[i] * (1.0 - through)
+        out[i] = disk[i]
+        if dims_disk:
+            out[i] *= through
+    return lost
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+def _modified_blackbody(front, exponent, thick, weight, temperature, beta, out):
+    """Fill ``out`` with the emission of polar dust on any scale; return its power."""
+    n = front.size
+    # wavelengths ascend
+    first = 0
+    while first < n and exponent[first] > _LARGEST_EXPONENT * temperature:
+        out[first] = 0.0
+        first += 1
+    thin = first
+    while thin < n and beta * thick[thin] > _OPAQUE:
+        thin += 1
+    per_temperature = 1.0 / temperature
+    for i in range(first, n):
+        out[i] = front[i] / (exponential(exponent[i] * per_temperature) - 1.0)
+    for i in range(thin, n):
+        out[i] *= 1.0 - exponential(-exponential(beta * thick[i]))
+    power = 0.0
+    for i in range(first, n):
+        power += weight[i] * out[i]
+    return power
+
+
 @njit(cache=True)
 def add_polar(grid, face_on, disk, dust, ebv, temperature, beta, share, dims_disk):
     """
@@ -78,46 +121,27 @@ def add_polar(grid, face_on, disk, dust, ebv, temperature, beta, share, dims_dis
     scale (W/um); ``share`` is that of `polar_share`; ``dims_disk`` whether the line of sight passes
     the polar dust. Returned are the parts as seen, shape (3, n_wave), the disk's light over all
     directions, and torus and polar emission on the given scale: where that is not positive,
-    nothing is scaled.
+    nothing is scaled. Exponentials are good to 1e-11.
     """
-    absorption = grid[0]
-    front = grid[1]
-    exponent = grid[2]
-    thick = grid[3]
     weight = grid[4]
     n = face_on.size
     parts = np.zeros((3, n))
     power = 0.0
     total = 0.0
-    lost = 0.0
-    body = 0.0
-    dusty = ebv > 0.0
     for i in range(n):
         power += weight[i] * face_on[i]
         total += weight[i] * dust[i]
-        parts[0, i] = disk[i]
-        if not dusty:
-            continue
-        if face_on[i] > 0.0 or disk[i] > 0.0:
-            through = math.exp(absorption[i] * ebv)
-            lost += weight[i] * face_on[i] * (1.0 - through)
-            if dims_disk:
-                parts[0, i] *= through
-        x = exponent[i] / temperature
-        if x < 600.0:
-            value = front[i] / math.expm1(x)
-            depth = beta * thick[i]
-            if depth < 4.0:  # beyond, 1 - exp(-exp(depth)) is one to 1e-23
-                value *= -math.expm1(-math.exp(depth))
-            parts[2, i] = value
-            body += weight[i] * value
     polar = 0.0
-    if dusty:
+    if ebv > 0.0:
+        lost = _dimmed(grid[0], weight, face_on, disk, ebv, dims_disk, parts[0])
+        body = _modified_blackbody(grid[1], grid[2], grid[3], weight, temperature, beta, parts[2])
         if body == 0.0 and lost > 0.0:
             return parts, power, math.nan  # the grid ends before the light of the dust
         if body > 0.0:
             polar = share * lost / body
             total += share * lost
+    else:
+        parts[0] = disk
     if not total > 0.0:
         return parts, power, total
     norm = 1.0 / total

@@ -1,5 +1,6 @@
 """Our own torus, a sum of blackbodies behind a screen."""
 
+import operator
 import tomllib
 from pathlib import Path
 from typing import NamedTuple
@@ -87,8 +88,11 @@ class _Shape(NamedTuple):
     radius_ratio: float
 
 
+_shape_values = operator.itemgetter(*_Shape._fields)
+
+
 def _shape(values):
-    return _Shape(*(float(values[name]) for name in _Shape._fields))
+    return _Shape._make(map(float, _shape_values(values)))
 
 
 @cached_by_file(maxsize=2)

@@ -5,8 +5,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, overload
 
-from miricigale.fitting._core.structs import PART
-from miricigale.utils.compilation import njit
+from miricigale.utils.compilation import PART, njit
 
 _LOG2E = 1.4426950408889634
 # Their sum is ln 2; products of the first with whole numbers are exact in either precision.

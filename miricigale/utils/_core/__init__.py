@@ -1,0 +1,1 @@
+"""Kernels that several subpackages share; arrays and numbers only."""
