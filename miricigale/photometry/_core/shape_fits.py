@@ -317,7 +317,9 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     columns = np.zeros((n * k + 1, white.size))
     columns[-1] = white.reshape(-1)
     flux = np.zeros(n)
-    matrix = np.eye(n * k)
+    matrix = np.zeros((n * k, n * k))
+    for i in range(n * k):
+        matrix[i, i] = 1.0
     slope = np.zeros(n * k)
     trial = start
     parameters = start
@@ -346,7 +348,9 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
                 trial[s, j] = min(max(moved, limits[0, j]), limits[1, j])
         if gained < gain:
             # so near the minimum everything is linear
-            flux = flux + step[::k]
+            flux = flux.copy()
+            for s in range(n):
+                flux[s] += step[s * k]
             parameters = trial
             chi2 = chi2 - gained
             break
@@ -354,16 +358,23 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     # Laplace's approximation of the integral over all parameters
     evidence = -0.5 * (chi2 + log_determinant(factor))
     covariance = np.empty((n, k, k))
+    least = flux[0]
+    for s in range(n):
+        least = min(least, flux[s])
     # without a positive matrix the evidence is no number
-    if not (np.isfinite(evidence) and flux.min() > 0):
+    if not (np.isfinite(evidence) and least > 0):
         return np.inf, flux, parameters, evidence, covariance, matrix
     joint_covariance = inverse_of(factor)
     for s in range(n):
         evidence += 0.5 * log_determinant(cholesky(precision[s]))
-        covariance[s] = joint_covariance[s * k : (s + 1) * k, s * k : (s + 1) * k]
+        for i in range(k):
+            for j in range(k):
+                covariance[s, i, j] = joint_covariance[s * k + i, s * k + j]
         # from flux to ln flux
-        covariance[s, 0] /= flux[s]
-        covariance[s, :, 0] /= flux[s]
+        for i in range(k):
+            covariance[s, 0, i] /= flux[s]
+        for i in range(k):
+            covariance[s, i, 0] /= flux[s]
     return chi2, flux, parameters, evidence, covariance, matrix
 
 
@@ -390,6 +401,15 @@ def _center_products(images, along_x, along_y, s, inverse, white, products):
     products[0] = (aa, ab, ac, ad)
     products[1] = (ab, bb, bc, bd)
     products[2] = (ac, bc, cc, cd)
+
+
+@njit(cache=True, nogil=True)
+def _product(a, b):
+    """Sum of the products of two vectors: expressions of whole arrays take seconds to compile."""
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -420,24 +440,33 @@ def evidence_of(
     """
     _, ny, nx = plan.response.shape
     # the best one first
-    shapes = np.concatenate((best[:, 2:], shapes))
+    n_shapes = len(shapes) + 1
+    all_shapes = np.empty((n_shapes, 4))
+    for i in range(4):
+        all_shapes[0, i] = best[0, 2 + i]
+        for s in range(1, n_shapes):
+            all_shapes[s, i] = shapes[s - 1, i]
     placed = _placed(plan, best[0, 0] - corners[0, 0], best[0, 1] - corners[0, 1])
     curves = np.empty((_TOGETHER, 2, ny, nx), np.float32)
-    likelihoods = np.zeros((len(shapes), 2))
+    likelihoods = np.zeros((n_shapes, 2))
     neighbor_data = np.zeros(len(neighbors))
     products = np.empty((3, 4))
     columns = np.empty((3, white.size))
-    data = np.sum(white**2)
+    data = 0.0
+    for row in white:
+        data += _product(row, row)
     center = precision[0]
-    off = best[0, :2] - mean[0, :2]
+    off_x = best[0, 0] - mean[0, 0]
+    off_y = best[0, 1] - mean[0, 1]
     log_prior = np.log(center[0, 0] * center[1, 1] - center[0, 1] ** 2)
     # derivative of half of the prior's chi^2 by the center
-    pull_x = center[0, 0] * off[0] + center[0, 1] * off[1]
-    pull_y = center[0, 1] * off[0] + center[1, 1] * off[1]
-    for first in range(0, len(shapes), _TOGETHER):
-        n = min(_TOGETHER, len(shapes) - first)
+    pull_x = center[0, 0] * off_x + center[0, 1] * off_y
+    pull_y = center[0, 1] * off_x + center[1, 1] * off_y
+    for first in range(0, n_shapes, _TOGETHER):
+        n = min(_TOGETHER, n_shapes - first)
         for s in range(n):
-            fill_curves(plan.kx, plan.ky, shapes[first + s], table, curves[s].reshape(1, -1))
+            shape = all_shapes[first + s]
+            fill_curves(plan.kx, plan.ky, shape, table, curves[s].reshape(1, -1))
         images, along_x, along_y = _images(plan, curves[:n], placed, n)
         for s in range(n):
             _center_products(images, along_x, along_y, s, inverse, white, products)
@@ -448,12 +477,13 @@ def evidence_of(
                 _whiten(along_y, s, inverse, 0, 0, columns[2])
                 shared = np.dot(columns, neighbors.T)
                 if first + s == 0:
-                    neighbor_data = flux * shared[0]
-                    data -= np.sum(neighbor_data * neighbor_data)
+                    for b in range(len(neighbors)):
+                        neighbor_data[b] = flux[0] * shared[0, b]
+                    data -= _product(neighbor_data, neighbor_data)
                 for i in range(3):
                     for j in range(3):
-                        products[i, j] -= np.sum(shared[i] * shared[j])
-                    products[i, 3] -= np.sum(shared[i] * neighbor_data)
+                        products[i, j] -= _product(shared[i], shared[j])
+                    products[i, 3] -= _product(shared[i], neighbor_data)
             likelihoods[first + s, 0] = -1e9
             power = products[0, 0]
             projection = products[0, 3]
@@ -471,7 +501,7 @@ def evidence_of(
                 det = xx * yy - xy * xy
                 step_x = (yy * slope_x - xy * slope_y) / det
                 step_y = (xx * slope_y - xy * slope_x) / det
-                chi2 = data - light * projection + off[0] * pull_x + off[1] * pull_y
+                chi2 = data - light * projection + off_x * pull_x + off_y * pull_y
                 gained = slope_x * step_x + slope_y * step_y
                 # Laplace's integral over center and light
                 evidence = gained - chi2 - np.log(abs(det)) - np.log(power) + log_prior
