@@ -7,6 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, vstack
 
+from miricigale.fitting import GridSettings
 from miricigale.instrument import frame_time, frames_per_group
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
@@ -27,6 +28,9 @@ EXISTING = "existing bands"
 _SIZES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.2, 1.6])
 #: Field of the imager.
 _FIELD = 74 * 113 * u.arcsec**2
+#: Part of the weight of its models that each fit may leave out: means change by 1e-6, and what is planned is
+#: uncertain by far more.
+_RTOL = 1e-4
 #: Groups of the shortest exposure of a budget.
 _LEAST = 3
 
@@ -335,7 +339,8 @@ class Planner:
         plans = subset(planned, bands)
         photometry = self.photometry(plans.values(), measured)
         all_bands = list(config.fit.bands) + list(bands)
-        fitter = study_fitter(config.fit, all_bands, axes=fit_plan(config, name))
+        settings = GridSettings(interpolate=0, rtol=_RTOL)
+        fitter = study_fitter(config.fit, all_bands, axes=fit_plan(config, name), settings=settings)
         results = fitter.fit(photometry, executor=self.executor)
         table = self._results(results, photometry, plans)
         if pointings is None:

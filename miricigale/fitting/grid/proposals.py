@@ -1,6 +1,7 @@
 """Mixtures of t distributions that places between the nodes of a grid are drawn from, fitted to places before."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -81,9 +82,12 @@ class FittedParts:
         return self.kernel._replace(share=part_share / part_share.sum())
 
 
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """Places of one label in one peak: their rows, and its parts, which are fitted, wide and narrow."""
+class _Group(NamedTuple):
+    """
+    Places of one label in one peak: their rows, and its parts, which are fitted, wide and narrow.
+
+    The first part is ``first``, the wide one ``wide``; ``last`` is the one after its own.
+    """
 
     label: int
     peak: int
@@ -91,16 +95,8 @@ class _Group:
     first: int
     n_fitted: int
     n_local: int
-
-    @property
-    def wide(self):
-        """Index of the wide part."""
-        return self.first + self.n_fitted
-
-    @property
-    def last(self):
-        """Index of the part after its own."""
-        return self.wide + 1 + self.n_local
+    wide: int
+    last: int
 
 
 def fit_mixture(labels, n_peaks, places, n_local=0):
@@ -127,11 +123,12 @@ def fit_mixture(labels, n_peaks, places, n_local=0):
     groups = _groups(labels, n_peaks, places, n_local)
     n_labels = len(labels.n_active)
     n_axes = places.score.shape[1]
+    label = np.array([group.label for group in groups])
+    peak = np.array([group.peak for group in groups])
+    n_parts = np.array([group.last - group.first for group in groups])
     start = np.zeros(n_labels + 1, np.int64)
-    index = []
-    for group in groups:
-        index += [group.label * n_peaks + group.peak] * (group.last - group.first)
-        start[group.label + 1 :] = group.last
+    start[1:] = np.cumsum(np.bincount(label, n_parts, minlength=n_labels).astype(np.int64))
+    index = np.repeat(label * n_peaks + peak, n_parts)
     n = len(index)
     parts = _core.Parts(
         start=start,
@@ -144,15 +141,16 @@ def fit_mixture(labels, n_peaks, places, n_local=0):
     )
     moments = _moments_of_peaks(places)
     scratch = np.empty((n_axes, n_axes))
-    for peak, (mean, cov) in moments.items():
-        wide = np.array([group.wide for group in groups if group.peak == peak])
+    all_wide = np.array([group.wide for group in groups])
+    for each_peak, (mean, cov) in moments.items():
+        wide = all_wide[peak == each_peak]
         _core.add_widest(labels, parts, wide, mean, _WIDE_SQUARE * cov, scratch)
     for group in groups:
         if group.n_fitted:
             _fit_group(labels, parts, group, places, moments[group.peak])
         if group.n_local:
             _add_local_parts(labels, parts, group, places)
-    return FittedParts(parts, np.array(index))
+    return FittedParts(parts, index)
 
 
 def _groups(labels, n_peaks, places, n_local):
@@ -169,23 +167,28 @@ def _groups(labels, n_peaks, places, n_local):
     peaks = np.flatnonzero(of_peak > 0)
     # whole numbers of few bits are sorted by counting them
     order = np.argsort(index.astype(np.min_scalar_type(n_groups)), kind="stable")
-    ends = np.concatenate([[0], np.cumsum(np.bincount(index, minlength=n_groups))])
+    number = np.bincount(index, minlength=n_groups)
+    ends = np.concatenate([[0], np.cumsum(number)]).tolist()
+    is_fitted = (flat > MIN_WEIGHT * of_peak).ravel().tolist()
+    has_local = (share.ravel() >= _MIN_LOCAL_WEIGHT) & (number >= _N_NEAR)
+    has_local = (has_local & (n_local > 0)).tolist()
     groups = []
     first = 0
     for label in range(n_labels):
-        for peak in peaks:
+        for peak in peaks.tolist():
             k = label * n_peaks + peak
             rows = order[ends[k] : ends[k + 1]]
             n_fitted = 0
-            if flat[label, peak] > MIN_WEIGHT * of_peak[peak]:
+            if is_fitted[k]:
                 effective = _effective_number(places.flat[rows])
-                n_fitted = int(np.clip(effective / _POINTS_EACH, 1, _MAX_PARTS))
-            n_narrow = n_local
-            if share[label, peak] < _MIN_LOCAL_WEIGHT or rows.size < _N_NEAR:
-                n_narrow = 0
-            group = _Group(label, peak, rows, first, n_fitted, n_narrow)
-            groups.append(group)
-            first = group.last
+                n_fitted = int(min(max(effective / _POINTS_EACH, 1), _MAX_PARTS))
+            n_narrow = 0
+            if has_local[k]:
+                n_narrow = n_local
+            wide = first + n_fitted
+            last = wide + 1 + n_narrow
+            groups.append(_Group(label, peak, rows, first, n_fitted, n_narrow, wide, last))
+            first = last
     return groups
 
 
