@@ -1,8 +1,9 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.nddata import CCDData
-from numpy.testing import assert_allclose
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData, StdDevUncertainty
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi, kstest
 
 from helpers.errors import refuses
@@ -53,6 +54,23 @@ def test_threshold_is_source_extractors(deep):
     assert catalog.meta["threshold"] == 0.25
     assert catalog.meta["n_pixels"] == 60
     assert DETECTION_PRESETS["yang2021"].n_pixels == 60
+
+
+def test_a_bright_pixel_is_spread_by_a_gaussian_of_the_width_of_the_preset():
+    """All pixels within the radius at which the Gaussian crosses the threshold, and none beyond."""
+    wcs = north_up_wcs(SkyCoord(53.1, -27.8, unit="deg"), 0.1 * u.arcsec, (41, 41))
+    data = np.zeros((41, 41))
+    data[20, 18] = 100.0
+    image = CCDData(data, uncertainty=StdDevUncertainty(np.ones((41, 41))), unit="uJy", wcs=wcs)
+    y, x = np.indices(data.shape)
+    square = (y - 20) ** 2 + (x - 18) ** 2
+    sigma = 4.0 / np.sqrt(8 * np.log(2))
+    # between two squares of distances from one pixel to another
+    for limit in (3.0, 6.5):
+        threshold = 100 * np.exp(-limit / (2 * sigma**2)) / (2 * np.pi * sigma**2)
+        preset = DetectionPreset(threshold=threshold, n_pixels=3, fwhm=4.0)
+        segmentation, _ = detect_sources(image, preset=preset)
+        assert_array_equal(segmentation.data > 0, square < limit)
 
 
 def test_mask_background_and_missing_uncertainty(deep):

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from helpers.errors import refuses
-from miricigale.instrument import aperture, pixel_to_sky
+from miricigale.instrument import aperture, imager_wcs, pixel_area_map, pixel_to_sky
 from miricigale.psf import (
     MIRI_PIXEL_SCALE,
     _core,
@@ -26,6 +26,13 @@ from miricigale.psf.telescope import band_quantiles
 
 CORNERS = [(359.0, 0.0), (1026.0, 0.0), (1026.0, 1023.0), (700.0, 300.0)]
 SMALL = {"fov": 4 * u.arcsec, "oversampling": 3}
+
+
+def test_the_usual_pixel_has_the_area_of_that_of_the_sky():
+    wcs = imager_wcs(SkyCoord(53.1, -27.8, unit="deg"), 30 * u.deg)
+    # by the distortion, at the reference position of the imager
+    area = pixel_area_map(wcs, (1024, 1032))[512, 692] * u.sr
+    assert (MIRI_PIXEL_SCALE**2 / area).to_value(u.one) == pytest.approx(1, abs=2e-4)
 
 
 @pytest.mark.parametrize(("x", "y"), CORNERS)

@@ -46,6 +46,20 @@ def test_threshold_means_what_source_extractor_means():
     assert len(found) < 10
 
 
+def test_a_bright_pixel_is_spread_by_source_extractors_filter():
+    # 3 x 3 pyramid: 4 / 16 of the light in the middle, 2 / 16 at the sides, 1 / 16 at the corners
+    data = np.zeros((15, 15))
+    data[7, 6] = 16.0
+    y, x = np.indices(data.shape)
+    steps = np.abs(y - 7) + np.abs(x - 6)
+    square = np.maximum(np.abs(y - 7), np.abs(x - 6)) <= 1
+    for threshold, seen in ((3.99, steps == 0), (1.995, steps <= 1), (0.999, square)):
+        _, labels = sep_tools.extract(data, threshold, err=np.ones_like(data), min_area=1)
+        np.testing.assert_array_equal(labels > 0, seen)
+    objects, _ = sep_tools.extract(data, 4.001, err=np.ones_like(data), min_area=1)
+    assert len(objects) == 0
+
+
 def test_bad_errors_are_masked(image):
     err = np.ones_like(image)
     err[38:43, 28:33] = 0
