@@ -442,6 +442,7 @@ def test_blends_are_flagged_and_twins_not_counted_twice(tools):
     assert result.crowded.tolist() == [True, True, False, True]
 
 
+@pytest.mark.slow
 def test_threads_do_not_change_a_bit(tools, monkeypatch):
     # pieces so small that there are many for each thread
     monkeypatch.setattr("miricigale.photometry.templates.templates._PART", 5000)

@@ -228,6 +228,7 @@ def test_plans_of_bands_are_exposed_as_in_ceers(capsys):
     assert "pointings = 3" in told.out
 
 
+@pytest.mark.slow
 def test_products_are_shown_cited_and_have_psfs(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exposure = Exposure("F770W", n_groups=8, pointing="150.1 2.2", subarray="SUB64")

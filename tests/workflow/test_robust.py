@@ -81,6 +81,7 @@ def undisturbed(tmp_path_factory):
     return contents(folder)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_eight_times_ends_with_the_same_bytes(tmp_path, undisturbed):
     folder = tmp_path / "run"
     # from the first file of the folder to the last product, and moments between
@@ -95,6 +96,7 @@ def test_a_run_that_is_killed_eight_times_ends_with_the_same_bytes(tmp_path, und
     assert contents(folder) == undisturbed
 
 
+@pytest.mark.slow
 def test_a_second_run_in_the_folder_is_refused_and_the_first_one_goes_on(tmp_path, undisturbed):
     folder = tmp_path / "run"
     first = start(folder)
