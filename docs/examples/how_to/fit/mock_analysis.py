@@ -7,7 +7,7 @@ right.
 """
 
 # %%
-# 60 simulated galaxies stand for your catalog. They have redshifts and F160W magnitudes of GOODS-S, six bands
+# 36 simulated galaxies stand for your catalog. They have redshifts and F160W magnitudes of GOODS-S, six bands
 # with the depths of existing surveys, and two MIRI bands.
 
 import matplotlib.pyplot as plt
