@@ -180,7 +180,10 @@ def _image_paths(args):
             return paths, prior
     elif args.image and args.highres and not args.positional and len(args.highres) == 1:
         return args.image, args.highres[0]
-    msg = "wanted are --image and --highres, or the images and last the prior without options"
+    msg = (
+        "give the images and, last, the high-resolution image (the prior): miricigale photometry "
+        "f770w.fits f444w.fits; or both by option, --image and --highres"
+    )
     raise ValueError(msg)
 
 

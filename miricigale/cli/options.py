@@ -46,6 +46,94 @@ _BY_PURPOSE = {
 }
 
 
+#: What users type for an option of another name: the first of these that a command has.
+_OPTIONS_BY_PURPOSE = {
+    "filters": ["--bands", "--filter"],
+    "bands": ["--filter"],
+    "band": ["--filter", "--bands"],
+    "exptime": ["--time"],
+    "exposure": ["--time"],
+    "times": ["--time"],
+    "mag": ["--depth"],
+    "limit": ["--depth"],
+    "budget": ["--hours"],
+    "ra": ["--position"],
+    "dec": ["--position"],
+    "coord": ["--position"],
+    "out": ["--output"],
+    "outdir": ["--output"],
+    "out-dir": ["--output"],
+    "outfile": ["--output"],
+    "dir": ["--output"],
+    "cat": ["--catalog"],
+    "prior": ["--highres"],
+    "reference": ["--highres"],
+    "detection-image": ["--highres"],
+    "seg": ["--segmentation"],
+    "segm": ["--segmentation"],
+    "segmap": ["--segmentation"],
+    "rms": ["--error"],
+    "err": ["--error"],
+    "wht": ["--weight"],
+    "zp": ["--zero-point"],
+    "zeropoint": ["--zero-point"],
+    "z": ["--redshift"],
+    "zspec": ["--z-spec"],
+    "z-phot": ["--redshift"],
+    "grid": ["--axes"],
+    "model": ["--axes"],
+    "templates": ["--axes"],
+    "units": ["--flux-unit", "--unit"],
+    "columns": ["--map"],
+    "translate": ["--map"],
+    "survey": ["--map"],
+    "ebmv": ["--ebv"],
+    "clobber": ["--overwrite"],
+    "force": ["--overwrite", "--redo"],
+    "n-threads": ["--threads"],
+    "nthreads": ["--threads"],
+    "ncores": ["--threads"],
+    "ncpu": ["--threads"],
+    "cores": ["--threads"],
+    "jobs": ["--threads"],
+    "n-jobs": ["--threads"],
+    "workers": ["--threads"],
+    "fast": ["--quick"],
+    "dry-run": ["--plan", "--print-config"],
+    "stage": ["--until"],
+    "stages": ["--until"],
+    "stop-after": ["--until"],
+    "scale": ["--pixel-scale"],
+    "pixscale": ["--pixel-scale"],
+    "plot": ["--plots"],
+    "html": ["--page"],
+}
+
+
+#: What to say about options of other programs without a counterpart, if a command has the option named first.
+_SENTENCES = {
+    "zmax": (
+        "--axes",
+        "the grid has the redshifts; BayesFitter(axes={...}) in Python takes others",
+    ),
+    "zmin": (
+        "--axes",
+        "the grid has the redshifts; BayesFitter(axes={...}) in Python takes others",
+    ),
+    "psf-size": ("--psf", "the PSF is taken as it is in its file"),
+    "aperture": (
+        "--highres",
+        "total fluxes are fitted; miricigale.photometry.aperture_photometry in Python has apertures",
+    ),
+    "sampler": (
+        "--axes",
+        "the command fits on a grid; BayesFitter(engine='nautilus') in Python samples",
+    ),
+}
+_SENTENCES["z-max"] = _SENTENCES["zmax"]
+_SENTENCES["z-min"] = _SENTENCES["zmin"]
+
+
 def _meant(name, names):
     """Say which name is meant, if it is there."""
     if name in names or name == "--help":
@@ -67,11 +155,22 @@ def _nearest_option(flag, names):
     if argument in names:
         return f"; {argument} has no option before it"
     flags = [name for name in names if name.startswith("-")]
+    word = flag.lstrip("-").replace("_", "-")
+    for name in _OPTIONS_BY_PURPOSE.get(word, ()):
+        if name in flags:
+            return f"; did you mean {name!r}?"
+    if word in _SENTENCES and _SENTENCES[word][0] in flags:
+        return f"; {_SENTENCES[word][1]}"
     # the last word of an option, such as --unit for --flux-unit
     ending = [name for name in flags if name.endswith("-" + flag.lstrip("-"))]
     if len(ending) == 1:
         return f"; did you mean {ending[0]!r}?"
-    return _nearest(flag, flags)
+    # the dashes that all have make short names seem alike
+    bare = {name.lstrip("-"): name for name in flags}
+    close = difflib.get_close_matches(flag.lstrip("-"), bare, n=1, cutoff=0.65)
+    if close:
+        return f"; did you mean {bare[close[0]]!r}?"
+    return ""
 
 
 def quantity_in(unit):

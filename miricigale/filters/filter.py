@@ -19,7 +19,15 @@ from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import table_suffix, write_table
-from miricigale.utils.units import FNU, WAVE, Frozen, frozen_array, frozen_quantity, to_array
+from miricigale.utils.units import (
+    FNU,
+    WAVE,
+    Frozen,
+    frozen_array,
+    frozen_quantity,
+    is_number,
+    to_array,
+)
 
 #: Version of the band averages: raised when the same curve gives other numbers.
 VERSION = 1
@@ -155,6 +163,24 @@ class Filter(Frozen, Interactive):
         """Throughput at wavelengths, by straight lines; 0 outside."""
         x = to_array(wave, WAVE, "wave")
         return np.interp(x, self.wave.value, self.throughput, left=0.0, right=0.0)
+
+    def __mul__(self, other):
+        """Return the filter times a number, or times the throughput of another filter (mirrors, a window)."""
+        if is_number(other):
+            return self.replace(throughput=self.throughput * other)
+        if not isinstance(other, Filter):
+            return NotImplemented
+        wave = np.union1d(self.wave.value, other.wave.value) * WAVE
+        # between points of both the product of straight lines is a parabola: halves follow it closely
+        wave = np.union1d(wave.value, 0.5 * (wave.value[1:] + wave.value[:-1])) * WAVE
+        name = f"{self.name}*{other.name}"
+        return self.replace(wave=wave, throughput=self(wave) * other(wave), name=name)
+
+    __rmul__ = __mul__
+
+    def replace(self, **changes):
+        """Return a copy with other values of the constructor's arguments."""
+        return dataclasses.replace(self, **changes)
 
     @classmethod
     def from_name(cls, name):
@@ -371,6 +397,25 @@ class Filter(Frozen, Interactive):
         throughput = np.asarray(bandpass(wave).value, dtype=float)
         name = name or str(bandpass.meta.get("expr") or "synphot")
         return cls(wave, throughput, name=name, meta={"source": "synphot"})
+
+    @classmethod
+    def from_sedpy(cls, band, *, name=None):
+        """
+        Make a filter of one of astro-sedpy.
+
+        Parameters
+        ----------
+        band : `sedpy.observate.Filter`
+            With its wavelengths (Angstrom) and transmission (counted in photons).
+        name : str, optional
+            Name of the filter; that of sedpy if not given.
+
+        Returns
+        -------
+        filter : `Filter`
+        """
+        wave = np.asarray(band.wavelength, dtype=float) * u.AA
+        return cls(wave, band.transmission, name=name or band.name, meta={"source": "astro-sedpy"})
 
     def to_synphot(self):
         """This filter as a `synphot.SpectralElement` (photon response, linear between points)."""

@@ -3,7 +3,7 @@
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import ModelWarning, argument_error, warn
+from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.units import FNU, WAVE, to_array
@@ -75,7 +75,10 @@ def spectrum_arrays(sed, bands):
     order = slice(None, None, -1 if wave[-1] < wave[0] else 1)
     wave = check_wave(wave[order])
     flux = flux[order]
-    is_converted = getattr(flux, "unit", None) == FNU
+    unit = getattr(flux, "unit", None)
+    is_converted = unit == FNU
+    if unit is not None and (unit * u.sr).is_equivalent(FNU, u.spectral_density(1 * WAVE)):
+        raise units_error("sed", "a flux density; multiply by the solid angle", unit)
     if is_converted:
         spectral = []
     else:

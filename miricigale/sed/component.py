@@ -49,8 +49,12 @@ def named_component(name, **defaults):
     Raises
     ------
     KeyError
-        If there is no component of the name.
+        If there is no component of the name; for a role the message lists its components.
     """
+    if name in ROLES and name not in COMPONENTS:
+        names = [n for n in COMPONENTS.names() if COMPONENTS.metadata(n)["role"] == name]
+        msg = f"{name!r} is a role; its components are {', '.join(names)}"
+        raise KeyError(msg)
     options = _CIGALE_OPTIONS.get(name, {}) | defaults
     return COMPONENTS.get(CIGALE_MODULES.get(name, name))(**options)
 

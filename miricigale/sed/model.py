@@ -77,7 +77,9 @@ class SEDModel(Interactive):
     1.0
     """
 
-    def __init__(self, components, *, cosmology=COSMOLOGY, frac_agn_definition="dust"):
+    def __init__(self, components=None, *, cosmology=COSMOLOGY, frac_agn_definition="dust"):
+        wanted = "given; SEDModel.survey() and SEDModel.yang2021() have theirs"
+        check_that(components is not None, "components", wanted, "None")
         self.components = in_order(components)
         fraction_span(frac_agn_definition)
         self.cosmology = cosmology
@@ -532,7 +534,7 @@ class SEDModel(Interactive):
             check_that(value is not None, name, "given, or parameters by name", "None")
         return tables.flux_table(self, table, self._bands(filters))
 
-    def grid(self, axes, filters, *, cache=True):
+    def grid(self, axes=None, filters=None, *, cache=True, **values):
         """
         Factorised band fluxes of a grid of models.
 
@@ -545,6 +547,8 @@ class SEDModel(Interactive):
             but 0 the grid has no AGN.
         filters : `~miricigale.filters.FilterSet` or list of str or `~miricigale.filters.Filter`
             The bands. They may stand before a dict of axes.
+        **values
+            Values of axes by name, in place of a dict: ``model.grid(["F770W"], redshift=[0.5, 1.0])``.
         cache : bool, optional
             Whether a grid of the same content (axes, bands, components, data, cosmology, code)
             is taken from the cache folder, and a new one kept there.
@@ -573,9 +577,16 @@ class SEDModel(Interactive):
         >>> model.grid(axes, ["miri.f770w"], cache=False)
         <ModelGrid 2 redshifts x 3 galaxies x 0 AGN x 1 fractions, 1 bands, 6 models>
         """
+        if values and filters is None:
+            # bands alone may stand first
+            axes, filters = None, axes
+        if values:
+            check_that(axes is None, "axes", "left out beside values of axes by name", "both")
+            axes = values
         if isinstance(filters, Mapping):
             # bands first, as fitters have them
             axes, filters = filters, axes
+        check_that(filters is not None, "filters", "given", "None")
         if axes is None or isinstance(axes, str):
             axes = self.named_axes(axes)
         axes = gridding.check_axes(self, axes)

@@ -161,6 +161,20 @@ class SED(Frozen, Interactive):
 
     _other_names = {
         "wavelength": "wave",
+        "wavelengths": "wave",
+        "flux_density": "fnu",
+        "f_nu": "fnu",
+        "f_lambda": "flam",
+        "nu": "frequency",
+        "z": "redshift",
+        "rest_wave": "rest_wavelength",
+        "magnitude": "synthetic_magnitude",
+        "mag": "synthetic_magnitude",
+        "ab_mag": "synthetic_magnitude",
+        "photometry": "fluxes",
+        "synthetic_fluxes": "fluxes",
+        "synthetic_magnitudes": "magnitudes",
+        "save": "write",
         "properties": "derived",
         "quantities": "derived",
         "to_spectrum": "to_specutils",
@@ -311,6 +325,38 @@ class SED(Frozen, Interactive):
     def fluxes(self, bands):
         """Mean flux densities in several bands, uJy, shape (n,); see `~miricigale.filters.FilterSet`."""
         return FilterSet(bands).synthetic_fluxes(self)
+
+    def magnitudes(self, bands):
+        """AB magnitudes in several bands, shape (n,), NaN where the flux is not positive; see `fluxes`."""
+        flux = self.fluxes(bands)
+        return np.where(flux.value > 0, flux.value, np.nan) * flux.unit << u.ABmag
+
+    def luminosity(self, *, cosmology=COSMOLOGY):
+        """
+        Luminosity nu L_nu at the source, at `rest_wavelength`.
+
+        It is 4 pi times the luminosity distance (10 pc at redshift 0) squared times nu F_nu, which is the same at
+        the wavelengths of source and observer.
+
+        Parameters
+        ----------
+        cosmology : `~astropy.cosmology.Cosmology`, optional
+            The cosmology.
+
+        Returns
+        -------
+        luminosity : `~astropy.units.Quantity`, shape (n,)
+            In solar luminosities.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> sed = SEDModel.yang2021(libraries="bundled")(redshift=1.0, mass=1e10)
+        >>> sed.luminosity().unit
+        Unit("solLum")
+        """
+        far = distance(self.redshift, cosmology) * u.m
+        return (4 * np.pi * far**2 * self.frequency * self.fnu).to(u.Lsun)
 
     def to_table(self):
         """The spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""

@@ -28,7 +28,9 @@ MODULES = {
     "Gaussian2DKernel": Gaussian2DKernel,
 }  # fmt: skip
 #: Messages of Python about code, which say nothing of what is wanted.
-BARE = re.compile("positional argument|unexpected keyword|NoneType|object is not|object has no")
+BARE = re.compile(
+    r"positional argument|unexpected keyword|NoneType|object is not|object has no attribute '\w+'$"
+)
 
 #: Intent, call and outcome: nothing where it works, else what the sentence of the refusal says.
 GUESSES = tomllib.loads(Path(__file__).with_name("guesses.toml").read_text("utf-8"))["guesses"]

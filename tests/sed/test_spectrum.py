@@ -150,3 +150,28 @@ def test_samples_that_a_file_flags_are_in_no_spectrum(tmp_path, name, flags):
     table.write(tmp_path / "s.ecsv")
     with pytest.raises(ValueError, match="'fnu' must be finite values, got 1"):
         SED.read(tmp_path / "s.ecsv")
+
+
+def test_luminosities_are_those_of_the_closed_form(flat):
+    # nu L_nu of a flat spectrum of 3 uJy at redshift 1, and what a model says of its own dust
+    far = COSMOLOGY.luminosity_distance(1.0)
+    sed = flat.replace(redshift=1.0)
+    expected = 4 * np.pi * far**2 * sed.fnu * sed.frequency
+    assert_quantity_allclose(sed.luminosity(), expected.to(u.Lsun), rtol=1e-9)
+    # whatever the redshift at which it is seen
+    for redshift in (0.0, 3.0):
+        assert_quantity_allclose(sed.redshifted(redshift).luminosity(), sed.luminosity(), rtol=1e-9)
+    model = SEDModel.yang2021(libraries="bundled", agn=False)(redshift=2.0, mass=1e10, ebv=0.3)
+    dust = model.components["dust"]
+    # integral of nu L_nu over ln nu, the same for source and observer
+    total = -np.trapezoid(dust.luminosity(), np.log(dust.frequency.value))
+    assert_quantity_allclose(total, model.derived["dust_luminosity"].to(u.Lsun), rtol=0.01)
+
+
+def test_magnitudes_of_several_bands_are_those_of_each(flat):
+    bands = ["F770W", "F1000W"]
+    for magnitude, band in zip(flat.magnitudes(bands), bands, strict=True):
+        assert_allclose(magnitude.value, flat.synthetic_magnitude(band).value)
+    assert flat.magnitudes(bands).unit == u.ABmag
+    dark = flat * 0
+    assert np.isnan(dark.magnitudes(bands).value).all()

@@ -184,6 +184,14 @@ def test_help_names_presets_and_surveys(capsys):
         (["fit", "--catalog", "a.fits"], "CATALOG has no option before it"),
         (["fit", "a.fits", "--unit", "Jy"], "did you mean '--flux-unit'?"),
         (["help", "fit"], "did you mean '--help'?"),
+        (["plan", "--filters", "F770W"], "--filters F770W; did you mean '--bands'? (see"),
+        (
+            ["fit", "a.fits", "--zmax", "4"],
+            "--zmax 4; the grid has the redshifts; BayesFitter(axes=",
+        ),
+        (["fit", "a.fits", "--ncores", "4"], "did you mean '--threads'?"),
+        (["fit", "a.fits", "--zzz", "4"], "--zzz 4 (see miricigale fit --help)"),
+        (["photometry", "a.fits"], "give the images and, last, the high-resolution image"),
         (["sensitivity", "F770W"], "did you mean 'plan'?"),
         (
             ["run", "goodss", "--quick", "--plan", "--until", "mosaic"],

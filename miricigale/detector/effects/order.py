@@ -66,6 +66,9 @@ def effect_from_record(record):
 
 def checked_effects(effects):
     """Effects as a tuple; anything that is not an effect is refused."""
+    if isinstance(effects, str):
+        wanted = "a tuple of effects (Detector() and Detector.miri_imager('flight') have theirs)"
+        raise argument_error("effects", wanted, repr(effects))
     effects = tuple(effects)
     for effect in effects:
         check_that(isinstance(effect, Effect), "effects", "made of detector effects", repr(effect))

@@ -1,0 +1,64 @@
+"""Names that other packages use: each is an attribute here, or ends in a sentence with the right one."""
+
+import importlib
+import re
+
+import pytest
+
+import miricigale
+from miricigale import Filter, SEDModel
+from miricigale.utils.attribute_hints import attribute_hint
+from miricigale.utils.interactive import Interactive
+from miricigale.utils.package_tables import declared
+
+HINTS = {k: v for k, v in declared("miricigale.utils", "hints.toml").items() if k != "words"}
+OTHER_NAMES = declared("miricigale.utils", "other_names.toml")
+
+#: Classes that sentences may name.
+PUBLIC = set(miricigale.__all__)
+
+
+@pytest.mark.parametrize("name", HINTS)
+def test_sentences_name_what_there_is(name):
+    cls = getattr(miricigale, name)
+    assert issubclass(cls, Interactive)
+    for wrong, sentence in HINTS[name].items():
+        assert wrong not in dir(cls), f"{name}.{wrong} is an attribute"
+        assert wrong not in OTHER_NAMES.get(name, {}), f"{name}.{wrong} is an alias"
+        words = set(re.findall(r"\w+", sentence))
+        fields = set(getattr(cls, "__dataclass_fields__", ()))
+        assert words & (set(dir(cls)) | fields | PUBLIC | {"len"}) or "miricigale." in sentence, (
+            sentence
+        )
+        for path in re.findall(r"miricigale((?:\.\w+)+)", sentence):
+            module, _, function = f"miricigale{path}".rpartition(".")
+            assert hasattr(importlib.import_module(module), function), path
+
+
+@pytest.mark.parametrize("name", [n for n in OTHER_NAMES if hasattr(miricigale, n)])
+def test_other_names_are_of_attributes(name):
+    cls = getattr(miricigale, name)
+    fields = getattr(cls, "__dataclass_fields__", {})
+    for other, ours in OTHER_NAMES[name].items():
+        assert other not in set(dir(cls)) | set(fields), other
+        first = ours.removesuffix("()").partition(".")[0]
+        # of fitters and results some are set, or found among the quantities, of an instance
+        own = {"BayesFitter": {"filters"}, "FitResults": {"redshift"}, "Ramp": {"exposure"}}
+        own["Ramp"] |= {"pixel_dq", "group_dq"}
+        assert first in set(dir(cls)) | set(fields) | own.get(name, set()), (other, ours)
+
+
+def test_nearest_names_by_spelling_and_by_meaning():
+    names = ["synthetic_flux", "synthetic_magnitude", "pivot", "plot", "_private"]
+    assert attribute_hint(Filter, "pivt", names) == "did you mean 'pivot'?"
+    assert attribute_hint(Filter, "draw_curve", names) == "did you mean 'plot'?"
+    assert "synthetic_magnitude" in attribute_hint(Filter, "get_mags", names)
+    assert attribute_hint(Filter, "xyzzy", names) == ""
+    model = SEDModel.yang2021(libraries="bundled", agn=False)
+    with pytest.raises(AttributeError, match=r"no attribute 'get_photometry'; fluxes\(filters, "):
+        model.get_photometry  # noqa: B018
+    with pytest.raises(AttributeError, match=r"no attribute 'xyzzy'$") as caught:
+        model.xyzzy  # noqa: B018
+    # Python suggests by the names of the object where we do not
+    assert (caught.value.name, caught.value.obj) == ("xyzzy", model)
+    assert not hasattr(model, "free_parameters")
