@@ -128,24 +128,26 @@ def psf(args):
 
 def cite(args):
     """Print what to cite."""
-    if args.file is None:
-        from miricigale import __version__
+    from miricigale import __version__
 
-        sources = [
-            f"miricigale {__version__} (CITATION.cff)",
-            "Yang et al. 2021, ApJ 908, 144 (the study that it repeats)",
-        ]
-        if args.bibtex:
-            print(bibtex(sources))
-            return 0
-        print("\n".join(sources))
-        print("and what 'miricigale cite FILE' names for the products that you use")
+    sources = [
+        f"miricigale {__version__} (CITATION.cff)",
+        "Yang et al. 2021, ApJ 908, 144 (the study that it repeats)",
+    ]
+    note = "and what 'miricigale cite FILE' names for the products that you use"
+    if args.file is not None:
+        of_product = citations_of(args.file)
+        note = None
+        if of_product:
+            sources = of_product
+        else:
+            note = f"{args.file} names no data or methods beside the package"
+    if args.bibtex:
+        print(bibtex(sources))
         return 0
-    sources = citations_of(args.file)
-    if not sources:
-        print(f"{args.file} names nothing to be cited")
-    else:
-        print(bibtex(sources) if args.bibtex else "\n".join(sources))
+    print("\n".join(sources))
+    if note:
+        print(note)
     return 0
 
 

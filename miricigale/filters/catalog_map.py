@@ -359,7 +359,8 @@ class CatalogMap:
                 say = "AB magnitudes are units={'flux': 'ABmag'}"
             elif unit is not None:
                 say = "say another, such as units={'flux': 'uJy'}, if it is wrong"
-            raise units_error(argument, f"convertible to {FNU}", f"{unit}: {say}", column=name)
+            got = f"{unit or 'no unit'}: {say}"
+            raise units_error(argument, f"convertible to {FNU}", got, column=name)
         values = _column_floats(table[name], name, argument)
         errors = None
         if error in table.colnames:

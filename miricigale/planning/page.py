@@ -79,7 +79,7 @@ def answer(planner, plans, comparison):
         facts["mix"] = " of a made-up mix"
     else:
         facts["mix"] = ""
-    facts["bands"] = " + ".join(name.removeprefix("miri.").upper() for name in plan.bands)
+    facts["bands"] = _bands_in_words(row["plan"], plans)
     times = []
     for band in bands:
         times.append(f"{band.time.to_value(u.s):.0f}")
@@ -100,7 +100,25 @@ def answer(planner, plans, comparison):
         reason = "text"
     else:
         reason = "no_area"
-    return str(sentence(declared("miricigale.planning")["answer"][reason], facts))
+    texts = declared("miricigale.planning")
+    said = str(sentence(texts["answer"][reason], facts))
+    # the first row is that of the existing bands
+    if len(comparison) > 2 and np.all(np.isfinite(comparison["merit"][1:3])):
+        ranking = {
+            "n": len(comparison) - 1,
+            "merit": texts["sets"]["merits"][planner.config.survey.rank],
+            "next": _bands_in_words(comparison["plan"][2], plans),
+        }
+        for key, value in zip(("first", "second"), comparison["merit"][1:3], strict=True):
+            ranking[key] = f"{value:.2g}"
+        said += " " + str(sentence(texts["answer"]["rank"], ranking))
+    return said
+
+
+def _bands_in_words(name, plans):
+    """Return the bands of a plan, such as F770W + F1000W."""
+    bands = next(plan.bands for plan in plans if plan.name == name)
+    return " + ".join(band.removeprefix("miri.").upper() for band in bands)
 
 
 def _entries(table):

@@ -13,7 +13,8 @@ from miricigale.utils.named_values import without_none
 
 
 @cached
-def _version():
+def package_version():
+    """Return the version of the package; ``"unknown"`` in a source tree that is not installed."""
     try:
         return importlib.metadata.version("miricigale")
     except importlib.metadata.PackageNotFoundError:
@@ -37,7 +38,7 @@ def provenance(*, citations=(), **values):
         Package name and version, UTC date, citations (sorted, unique) and the values.
     """
     date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    meta = {"package": "miricigale", "version": _version(), "created": date}
+    meta = {"package": "miricigale", "version": package_version(), "created": date}
     if citations:
         meta["citations"] = sorted(set(citations))
     meta.update(without_none(values))

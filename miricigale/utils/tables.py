@@ -239,6 +239,8 @@ def require_columns(table, names, argument, *, units=None):
             have = flux_unit(have) or u.Unit(have)
         # magnitudes are no units of flux
         if not (isinstance(have, u.UnitBase) and have.is_equivalent(unit)):
+            if have is None:
+                have = "no unit"
             raise units_error(argument, f"convertible to {unit}", have, column=name)
 
 

@@ -256,6 +256,7 @@ def test_the_command_writes_a_page(tmp_path, capsys):
     page = (folder / "plan.html").read_text()
     # it opens with the answer, as the command ends
     answer = re.search(r"A plan of F.*\(1665 s, 3 dithers\) reaches 5 sigma at .*", told.out)[0]
+    assert "It ranks first of 2 plans: per hour, the AGN found times the purity comes to" in answer
     assert page.index(answer) < page.index("<li>")
     assert len(re.findall("<img ", page)) == 4
     assert "nan" not in re.sub(r"base64,[^']*", "", page)

@@ -63,7 +63,10 @@ NOWHERE = SkyCoord([53, np.nan], [-27, -27], unit="deg")
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"half_light_radius": [0.1, 0.2]}, "'half_light_radius' must be .* to arcsec, got None"),
+        (
+            {"half_light_radius": [0.1, 0.2]},
+            "'half_light_radius' must be .* to arcsec, got no unit",
+        ),
         ({"miri.f770w": [1, 2] * u.s}, r"'miri\.f770w' must be convertible to uJy, got s"),
         ({"id": [3, 3]}, r"ids are unique, got duplicates such as \[3\]"),
         ({"id": [1.5, 2.5]}, "integers or text in 'id'"),
@@ -128,7 +131,7 @@ def test_bundled_catalog():
 def test_columns_called_by_a_filter_must_be_fluxes(table, tmp_path, name):
     table[name] = [1.0, 2.0]
     table.write(tmp_path / "c.ecsv")
-    match = rf"column '{name}' must be convertible to uJy, got None"
+    match = rf"column '{name}' must be convertible to uJy, got no unit"
     refuses(match, read_catalog, tmp_path / "c.ecsv", error=u.UnitsError)
     table[name] = [20.0, 21.0] * u.ABmag
     refuses(rf"column '{name}' must be .* got mag\(AB\)", check_catalog, table, error=u.UnitsError)

@@ -34,7 +34,7 @@ from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argum
 from miricigale.utils.files import PARTIAL
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.ids import Duplicates
-from miricigale.utils.meta import plain_value, undated
+from miricigale.utils.meta import package_version, plain_value, undated
 from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.progress import progress
@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 
 #: Astropy's warnings are turned off for a process, not for a thread.
 _WRITING = threading.Lock()
-_PACKAGES = ("miricigale", "numpy", "numba", "astropy")
+_PACKAGES = ("numpy", "numba", "astropy")
 
 
 def fit_file(
@@ -407,7 +407,8 @@ def _job(fitter, rows, options, catalog_settings):
 def _begin(folder, job, resume):
     """Keep the parts of this fit, or remove those of another if ``resume`` is not set."""
     job = json.loads(json.dumps(job, default=plain_value))
-    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    versions = {"miricigale": package_version()}
+    versions |= {name: importlib.metadata.version(name) for name in _PACKAGES}
     # a call that failed before its first part leaves nothing to keep
     if resume and folder.records:
         changes = _differences(folder.facts["job"], job)

@@ -106,9 +106,16 @@ def warn_of_pulls(results):
 
 
 @contextlib.contextmanager
+def without_scatter_warnings():
+    """Silence `warn_of_pulls`, for fits whose errors nobody can change."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", re.escape(_TEXT), FitWarning)
+        yield
+
+
+@contextlib.contextmanager
 def without_warnings():
     """Silence warnings of catalogs and of `warn_of_pulls`, for fits that measure errors themselves."""
-    with warnings.catch_warnings():
+    with without_scatter_warnings():
         warnings.simplefilter("ignore", CatalogWarning)
-        warnings.filterwarnings("ignore", re.escape(_TEXT), FitWarning)
         yield

@@ -90,6 +90,9 @@ class Inputs:
     def check(self):
         """Refuse, before any image is read, what is missing, or not what it should be."""
         for image in self.images:
+            _check_order(image, self.highres)
+        _check_headers(self.images, self.highres, self.kernels)
+        for image in self.images:
             _check_images(image, self.highres)
         for argument, path in self._named:
             if not os.path.isfile(file_place(path)[0]):
@@ -310,8 +313,33 @@ def _blank(shape, wcs):
     return Image(data, unit=SURFACE_BRIGHTNESS, wcs=wcs, mask=mask, uncertainty=noise)
 
 
-def _check_images(image, highres):
-    """Refuse images that are not what they should be, or do not overlap."""
+def _check_headers(images, highres, kernels):
+    """Refuse, in one message, all headers that lack a filter or an orientation that is needed."""
+    from miricigale.psf import MODEL_FILTERS
+
+    files = [(image, "", kernel) for image, kernel in zip(images, kernels, strict=True)]
+    files.append((highres, "highres_", None if None in kernels else kernels[0]))
+    lacking = []
+    for file, prefix, kernel in files:
+        name = file.header.filter
+        is_modeled = file.psf is None and kernel is None
+        if name is None and (file is not highres or is_modeled):
+            lacking.append(
+                f"'{prefix}filter' must be given, for the header of {file.path} does not name it"
+            )
+        # the models of WFC3/IR have no orientation
+        is_turned = name is None or (name in MODEL_FILTERS and not name.startswith("wfc3."))
+        if is_modeled and is_turned and file.header.pa_aper is None:
+            lacking.append(
+                f"'{prefix}pa_aper' must be given (or '{prefix}psf'), for that of {file.path} has no PA_APER"
+            )
+    # a single one has a message of its own
+    if len(lacking) > 1:
+        raise ValueError("; ".join(lacking))
+
+
+def _check_order(image, highres):
+    """Refuse an image and a prior that stand in each other's place."""
     wanted = image.filter
     image_filter = None
     if wanted is not None:
@@ -323,6 +351,10 @@ def _check_images(image, highres):
             f"{image.path} is in {image_filter}"
         )
         raise ValueError(msg)
+
+
+def _check_images(image, highres):
+    """Refuse images that are not what they should be, or do not overlap."""
     # headers refuse what contradicts them
     headers = [(image.path, image.header), (highres.path, highres.header)]
     name = image.header.filter
