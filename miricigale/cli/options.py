@@ -6,6 +6,7 @@ import difflib
 import inspect
 import re
 import sys
+import textwrap
 import tomllib
 from importlib import resources
 from pathlib import Path
@@ -313,7 +314,10 @@ def make_parser(argv):
         command_parser = parsers[group].add_parser(
             word,
             help=text,
-            description=command.get("description", f"{text[0].upper()}{text[1:]}."),
+            # examples stand in lines of their own, so that argparse wraps neither
+            description=textwrap.fill(
+                command.get("description", f"{text[0].upper()}{text[1:]}."), 78
+            ),
             epilog="examples:\n  " + "\n  ".join(command["examples"]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             parents=[verbosity],
