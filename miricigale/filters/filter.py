@@ -408,14 +408,20 @@ class Filter(Frozen, Interactive):
         band : `sedpy.observate.Filter`
             With its wavelengths (Angstrom) and transmission (counted in photons).
         name : str, optional
-            Name of the filter; that of sedpy if not given.
+            Name of the filter; else that of the same curve in the library, or of sedpy.
 
         Returns
         -------
         filter : `Filter`
+            Noise of the curve below zero is set to zero and counted in ``meta["n_negative"]``.
         """
-        wave = np.asarray(band.wavelength, dtype=float) * u.AA
-        return cls(wave, band.transmission, name=name or band.name, meta={"source": "astro-sedpy"})
+        name = name or find_filter(band.name) or band.name
+        throughput = np.asarray(band.transmission, dtype=float)
+        meta = {"source": "sedpy"}
+        n_negative = int(np.count_nonzero(throughput < 0))
+        if n_negative:
+            meta["n_negative"] = n_negative
+        return cls(band.wavelength * u.AA, np.maximum(throughput, 0.0), str(name), meta=meta)
 
     def to_synphot(self):
         """This filter as a `synphot.SpectralElement` (photon response, linear between points)."""

@@ -60,19 +60,9 @@ def as_filter(given, name=None, *, unit=None):
     if hasattr(given, "waveset"):
         return Filter.from_synphot(given, name=name)
     if hasattr(given, "wavelength") and hasattr(given, "transmission"):
-        return _of_sedpy(given, name)
+        return Filter.from_sedpy(given, name=name)
     wanted = "a Filter, the name of one, the path of its file, or one of synphot or sedpy"
     raise argument_error(name or "filter", wanted, type(given).__name__)
-
-
-def _of_sedpy(curve, name):
-    """Filter of sedpy's: wavelengths in Angstrom and the response to photons, whose noise may be negative."""
-    name = name or find_filter(curve.name) or curve.name
-    throughput = np.asarray(curve.transmission, dtype=float)
-    meta = {"source": "sedpy"}
-    if np.any(throughput < 0):
-        meta["n_negative"] = int(np.count_nonzero(throughput < 0))
-    return Filter(curve.wavelength * u.AA, np.maximum(throughput, 0.0), str(name), meta=meta)
 
 
 def _is_path(text):

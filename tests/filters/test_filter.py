@@ -87,7 +87,7 @@ def test_filters_of_sedpy():
 
     theirs = Curve("jwst_f1000w")
     band = Filter.from_sedpy(theirs)
-    assert band.name == "jwst_f1000w"
+    assert band.name == "miri.f1000w"
     assert_quantity_allclose(band.pivot, theirs.wave_pivot * u.AA, rtol=1e-3)
 
 

@@ -98,8 +98,8 @@ plt.show()
 # %%
 # 2. Measure, with nuclei
 # -----------------------
-# The prior image is one in which AGN are faint: here F150W. ``components`` of 2 asks for a point in the center
-# of each galaxy beside its smooth light.
+# Use a prior image in which AGN are faint, here F150W. ``components=2`` fits a point in the center of each galaxy
+# in addition to its smooth light.
 
 prior = images[nircam]
 segmentation, detected = detect_sources(prior, preset="default")

@@ -94,8 +94,9 @@ plt.show()
 # %%
 # 5. Ramps
 # --------
-# The detector applies its effects in a fixed order, and turns a scene into counts, group by group. Here are those
-# of one pixel in both integrations. ``Ramp.write`` makes a JWST level 1b file, which the official pipeline reads.
+# The detector applies its effects in a fixed order, and turns a scene into counts, group by group. The figure
+# shows the counts of one pixel in both integrations. ``Ramp.write`` makes a JWST level 1b file, which the official
+# pipeline reads.
 
 detector = Detector.miri_imager()
 ramps = {k: [detector.expose(scene, seed=1) for scene in scenes[k]] for k in miri}
@@ -183,8 +184,9 @@ plt.show()
 # %%
 # 10. Error function
 # ------------------
-# Formal errors do not include wrong templates and backgrounds. The truth shows these: the scatter of measured
-# against true flux, as a function of flux, is the error that enters the fits. It gives the depth, too.
+# Formal errors do not include the errors of templates and backgrounds. The comparison with the truth does: the
+# scatter of measured against true flux, as a function of flux, is the error that enters the fits. It also gives
+# the depth.
 
 errors = ErrorModel.from_tables(truth, measured, filters=miri, bin_size=10)
 measured = errors.assign(measured, filters=miri)
@@ -215,8 +217,8 @@ fits["with MIRI"][best].plot_sed()
 plt.show()
 
 # %%
-# Above is the galaxy whose AGN fraction MIRI constrains most. Its posteriors, and mean and standard deviation for
-# all galaxies:
+# The figure above has the galaxy whose AGN fraction MIRI constrains most. Its posteriors follow, and the mean and
+# the standard deviation for all galaxies:
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
 for label, table in tables.items():

@@ -54,8 +54,8 @@ for name, depth in zip(["wfc3.f160w", *miri], depths, strict=True):
 photometry = existing.perturb(truth["id", "sky", *existing.filters], seed=1)
 
 # %%
-# The MIRI images in color, F1500W in red. AGN have red colors, but so do galaxies whose PAH features are in
-# F1500W.
+# The MIRI images are shown in color, with F1500W in red. AGN have red colors, but so do galaxies whose PAH
+# features are in F1500W.
 
 planes = [images[name].data / images[name].data.std() for name in reversed(miri)]
 ax = plt.subplots(figsize=(6, 6))[1]
@@ -83,8 +83,8 @@ plt.show()
 # %%
 # 3. Join
 # -------
-# One table for all MIRI bands, and that joined with the catalog by id. Sources that MIRI does not detect in two
-# bands (5 sigma) are left out of the sample.
+# The fluxes in all MIRI bands go into one table, which is joined with the catalog by id. The sample leaves out
+# sources that MIRI does not detect in two bands (5 sigma).
 
 measured = join_bands(results)
 columns = [column for name in miri for column in (name, f"{name}_err")]
@@ -99,8 +99,8 @@ shown
 # %%
 # 4. Fit
 # ------
-# The fitter compares each source with a grid of models of real galaxies with AGN. It counts errors of these
-# models, and how rare AGN are.
+# The fitter compares each source with a grid of models of real galaxies with AGN. It takes into account the errors
+# of these models, and how rare AGN are.
 
 fitter = BayesFitter([*existing.filters, *miri])
 fits = fitter.fit(sample)
@@ -113,9 +113,9 @@ shown
 # %%
 # 5. Find the AGN
 # ---------------
-# A source is selected if its AGN fraction is at least 0.4 with a probability of one half: if the median of the
-# posterior is. This is the rule of plans and studies, too. Redshifts and fractions are compared with the truth,
-# which is known here.
+# A source is selected if the median of the posterior of its AGN fraction is at least 0.4, that is, if the fraction
+# is at least 0.4 with a probability of one half. Plans and studies have the same rule. Redshifts and fractions are
+# compared with the truth, which is known here.
 
 selected = table["frac_agn_p50"] >= 0.4
 order = [list(truth["id"]).index(key) for key in table["id"]]
@@ -135,8 +135,8 @@ right.legend()
 plt.show()
 
 # %%
-# The numbers of this small sample. The fractions are below the true ones, since the fitter counts that AGN as
-# strong as these are rare; in this field every fourth galaxy has one.
+# These are the numbers of this small sample. The fractions are below the true ones, because AGN as strong as these
+# are rare according to the prior; in this field every fourth galaxy has one.
 
 quality = selection_quality(f_true > 0, selected)
 metrics = photoz_metrics(z_true, table["redshift_mean"])
@@ -148,8 +148,8 @@ print(f"purity {quality.purity.value:.2f}")
 # %%
 # 6. Look at one of them
 # ----------------------
-# The selected source with the best-known AGN fraction, with its model. ``fits.write("fits.fits")`` keeps all
-# posteriors.
+# The figure shows the selected source with the best-known AGN fraction, and its model. ``fits.write("fits.fits")``
+# keeps all posteriors.
 
 best = np.argmin(np.where(selected, table["frac_agn_std"], np.inf))
 fits[best].plot_sed()

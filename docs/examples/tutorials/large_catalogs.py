@@ -142,7 +142,7 @@ age = kept.stat().st_mtime_ns - before
 print(f"{len(results)} objects; part 3 is {age} ns younger")
 
 # %%
-# ``manifest.json`` says what the parts are results of: checksums of catalog and grid, settings, versions.
+# ``manifest.json`` records how the parts were made: checksums of the catalog and the grid, settings, and versions.
 
 manifest = json.loads(Path("fits/manifest.json").read_text())
 sorted(manifest)

@@ -6,7 +6,7 @@ A fit gives one of your galaxies a high AGN fraction. You want to see whether th
 """
 
 # %%
-# Two simulated galaxies at redshift 1: one has half of its infrared power from an AGN, the other none.
+# Two galaxies at redshift 1 are simulated. In one, an AGN emits half of the infrared power; the other has no AGN.
 
 import matplotlib.pyplot as plt
 import numpy as np

@@ -32,8 +32,8 @@ for band in bands:
     photometry[f"{band}_err"] = 0.1 * fluxes[band]
 
 # %%
-# ``pairs`` asks for joint posteriors, which are summed over all 18 million models. That of redshift and AGN
-# fraction is always there. Any two parameters of the grid can be a pair.
+# ``pairs`` asks for joint posteriors, which are summed over all 18 million models. The pair of redshift and
+# AGN fraction is always kept. Any two parameters of the grid can be a pair.
 
 names = ["redshift", "frac_agn", "ebv", "age"]
 pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]

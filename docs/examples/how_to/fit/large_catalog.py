@@ -52,7 +52,7 @@ results = fit_file(fitter, "catalog.fits", "fits", resume=False, **options)
 results
 
 # %%
-# A part is lost, as after a crash. The same call fits what is missing, and nothing else. Results of other settings
+# A part is lost, as after a crash. The same call fits only what is missing. Results of other settings
 # are refused in this folder.
 
 Path("fits/part-00002.fits").unlink()

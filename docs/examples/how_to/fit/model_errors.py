@@ -45,7 +45,7 @@ for band in bands:
 # %%
 # Start with a model error of 10 %, fit at the known redshifts, and measure the error that the residuals need.
 # Repeat with what was found. Use one half of the sample here and test on the other. Fits warn of bands that
-# scatter by more than the errors in use; here that is what is measured.
+# scatter by more than the errors in use; here this scatter is what we measure.
 
 warnings.filterwarnings("ignore", "fluxes scatter", FitWarning)
 model = SEDModel.yang2021(agn=False)

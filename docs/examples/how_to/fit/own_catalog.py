@@ -24,8 +24,9 @@ with open("mine.csv", "w") as file:
     file.write(catalog)
 
 # %%
-# ``columns`` gives each filter your name of its column, ``units`` the unit. Errors of magnitudes become errors of
-# fluxes. Blank fields are missing bands; so are -99, 99 and the like, which a warning counts.
+# ``columns`` names your column for each filter, and ``units`` states the unit. Errors of magnitudes become errors
+# of fluxes. Blank fields are missing bands. Codes such as -99 and 99 are missing bands too, and a warning counts
+# them.
 
 columns = {
     "id": "name",
@@ -46,10 +47,8 @@ table.round(3)
 table
 
 # %%
-# The table goes to the fitter as it is. Unless you say something else, it has the models for real galaxies, their
-# grid, and their calibration: errors of the models by rest wavelength, and priors of parameters and of the errors
-# of
-# bands.
+# The fitter takes this table. By default it has the models for real galaxies, their grid, and their calibration:
+# the errors of the models by rest wavelength, and the priors of the parameters and of the errors of the bands.
 
 fitter = BayesFitter(bands)
 results = fitter.fit(photometry)
@@ -100,14 +99,16 @@ plt.show()
 #    [units]
 #    flux = "ABmag"
 #
-# It prints what is fitted: a table of the errors of the bands, and models, bands, and errors with priors in three
-# lines. Three sources say nothing about the errors of the bands, so both have their prior: MIRI's are 3.3 times
-# those
-# of the catalog, and 15 % of the flux. A catalog of a hundred sources or more is measured by the command, in
-# Python
-# by :func:`~miricigale.fitting.calibrate_bands` (:doc:`/method/fitting_errors`). ``--classes all`` fits quasars
-# and
-# little red dots too (:doc:`/method/classes`).
+# The command prints a table of the errors of the bands, and three lines that list the models, the bands, and the
+# errors with the priors. Three sources are too few to measure the errors of the bands, so these have their prior:
+# in MIRI's bands the errors of the catalog times 3.3, and 15 % of the flux. In a catalog of a hundred sources or
+# more the command measures them; in Python, :func:`~miricigale.fitting.calibrate_bands` does
+# (:doc:`/method/fitting_errors`). ``--classes all`` also fits quasars and little red dots
+# (:doc:`/method/classes`).
+#
+# If the columns of a CSV file have usual names (``mag_F770W`` and ``magerr_F770W``, or ``F770W`` and
+# ``F770W_err``), no map is needed: ``miricigale fit mine.csv --flux-unit ABmag``, or in Python
+# ``BayesFitter().fit(table, unit="ABmag")``.
 #
 # Catalogs of CANDELS, 3D-HST, JADES, DJA, COSMOS2020 and CEERS have ready maps: ``read_catalog_photometry(path,
 # "candels")``. See :doc:`/method/filters`.

@@ -33,10 +33,10 @@ for band in bands:
     photometry[f"{band}_err"] = 0.15 * fluxes[band]
 
 # %%
-# The priors of a fit of real galaxies are those of its calibration; ``calibration=None`` makes them flat in the
-# nodes of the grid. ``priors`` takes for each parameter a function of the value,
-# a distribution of scipy, weights of the nodes, or ``"log"``. ``redshift_prior`` is a density of redshift for each
-# object; `~miricigale.fitting.magnitude_prior` makes one of its magnitude.
+# A fit of real galaxies has the priors of its calibration; with ``calibration=None`` they are flat in the nodes of
+# the grid. ``priors`` takes for each parameter a function of the value, a distribution of scipy, weights of the
+# nodes, or ``"log"``. ``redshift_prior`` is a density of redshift for each object;
+# `~miricigale.fitting.magnitude_prior` makes one of its magnitude.
 
 rare_agn = {
     "frac_agn": stats.expon(scale=0.1),

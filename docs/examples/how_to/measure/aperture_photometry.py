@@ -75,5 +75,5 @@ plt.show()
 [round(float(np.median(flux / true)), 2) for flux in fluxes.values()]
 
 # %%
-# Errors of apertures are for white noise. On a drizzled mosaic of the package multiply them by
+# The errors of apertures assume white noise. On a drizzled mosaic of the package, multiply them by
 # ``image.meta["noise_correction"]``. See :doc:`/method/photometry_other` and :doc:`/accuracy/photometry`.

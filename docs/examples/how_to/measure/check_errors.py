@@ -37,7 +37,7 @@ for name in ("low", "high", "mad", "bias", "factor", "factor_err"):
 bins
 
 # %%
-# ``factor`` is what errors must be multiplied by; 1 means that they are right. With so few trials it is
+# Multiply the errors by ``factor``; 1 means that they are right. With so few trials the factor is
 # uncertain by ``factor_err``.
 
 known = calibration.sources
@@ -60,5 +60,5 @@ result = calibration.apply(photometer.measure(*inputs))
 result.to_table()["id", "flux", "flux_err"][:3]
 
 # %%
-# What no profile describes (spiral arms, clumps) is not tested, since injected galaxies are profiles. See
+# Injected galaxies are smooth profiles, so this does not test spiral arms and clumps. See
 # :doc:`/method/photometry_errors` and :doc:`/accuracy/photometry`.

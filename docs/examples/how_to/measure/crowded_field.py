@@ -45,8 +45,8 @@ table["flux"].info.format = table["flux_err"].info.format = ".3f"
 table
 
 # %%
-# Light that is not in one is in the other: their errors are anticorrelated. The sum is known better than
-# either.
+# Light that the fit takes from one source goes to the other, so their errors are anticorrelated. The sum of the
+# two fluxes is known better than either flux.
 
 pair = result.covariance.toarray()[:2, :2]
 print(f"correlation {result.correlation('left', 'right'):.2f}")

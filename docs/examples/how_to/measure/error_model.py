@@ -36,7 +36,7 @@ measured = QTable({"F1000W": (true + noise) * u.uJy})
 simulated = ErrorModel.from_tables(truth, measured, bin_size=150)
 
 # %%
-# ``|`` joins them to one model.
+# The operator ``|`` joins these models to one.
 
 model = exposure | survey | simulated
 fig, ax = plt.subplots(figsize=(6.6, 4.2), layout="constrained")

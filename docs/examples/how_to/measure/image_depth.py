@@ -7,8 +7,8 @@ magnitude) of the image from fits at empty positions.
 """
 
 # %%
-# A simulated field. Sources are those of F160W; forced photometry gives each of them a flux and an error,
-# detected or not.
+# This cell simulates a field. The sources are detected in F160W, and forced photometry gives each of them a flux
+# and an error in F1000W, whether it is detected there or not.
 
 import astropy.units as u
 import matplotlib.pyplot as plt

@@ -28,7 +28,7 @@ psfs = field.psfs["wfc3.f160w"], field.psfs["miri.f770w"]
 kernel = MatchingKernel.from_psfs(*psfs)
 
 # %%
-# Shapes of the known galaxies are those of the catalog here (``template="sersic"``).
+# Here the known galaxies have the shapes that the catalog states (``template="sersic"``).
 
 templates = SourceTemplates.from_catalog(known, template="sersic")
 one_pass = ForcedPhotometer(kernel).measure(image, templates=templates)

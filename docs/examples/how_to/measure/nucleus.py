@@ -47,7 +47,7 @@ image.data += photometer.render(image, hosts, galaxies["flux"]).value
 image.data += photometer.render(image, points, point).value
 
 # %%
-# ``components=2`` fits template and point where that is the better fit. Otherwise ``flux_point`` is NaN.
+# ``components=2`` fits a template and a point where this is the better fit. Otherwise ``flux_point`` is NaN.
 
 result = photometer.replace(components=2).measure(image, templates=hosts)
 columns = ["id", "flux", "flux_err", "flux_point", "flux_point_err", "chi2"]

@@ -37,7 +37,7 @@ for _ in range(4):
     stars.append(Table({"x": x.round(), "y": y.round()}))
 
 # %%
-# Positions need to be good to half a pixel. The light far out is the model's.
+# Positions must be correct to half a pixel. The wings of the PSF are taken from the model.
 
 psf = psf_from_stars(images, stars, model, fov=4 * u.arcsec)
 fig, axes = plt.subplots(1, 3, figsize=(11, 3.8), layout="constrained")
@@ -50,7 +50,7 @@ for ax in axes[1:]:
 plt.show()
 
 # %%
-# What was done, and how well the flux of a point source is known by that:
+# The meta dictionary says what was done, and how accurate the flux of a point source is with this PSF:
 
 for name in ("correction", "width", "wings_4", "flux_err"):
     value = psf.meta[name]

@@ -6,7 +6,8 @@ You have a catalog and the color excess E(B-V) of the Milky Way, one number or a
 """
 
 # %%
-# How much it is, by band. The law of Gordon et al. (2023) is the default: the only one that reaches MIRI.
+# The table has the extinction in each band. The law of Gordon et al. (2023) is the default, because it is the only
+# law here that extends to the MIRI bands.
 
 import astropy.units as u
 import matplotlib.pyplot as plt

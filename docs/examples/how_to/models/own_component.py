@@ -49,7 +49,7 @@ class TwoTemperatures(AGN):
 
 
 # %%
-# It takes the place of the torus in a chain. Inclination and polar dust come with the base class.
+# The new component replaces the torus in a chain. The base class provides the inclination and the polar dust.
 
 paper = SEDModel.yang2021(libraries="bundled")
 parts = [part for part in paper.components if part.role != "agn"]
@@ -69,7 +69,7 @@ ax.legend()
 plt.show()
 
 # %%
-# A grid and a fit take it like any other. The fluxes of one model are fitted with errors of 5 %.
+# Grids and fits use the new component like any other. Here the fluxes of one model are fitted with errors of 5 %.
 
 bands = ["F606W", "F160W", "F356W", "F770W", "F1000W", "F1500W", "F2100W"]
 truth = model(**values, hot_share=0.6)

@@ -7,8 +7,8 @@ You want fluxes of spectra in that band, and to use it in models and fits like a
 """
 
 # %%
-# An array of wavelengths with unit and of throughputs that count photons is enough. The name is that of the flux
-# columns.
+# A filter needs an array of wavelengths with a unit, and an array of throughputs that count photons. Flux columns
+# get the name of the filter.
 
 import astropy.units as u
 import matplotlib.pyplot as plt
@@ -24,8 +24,8 @@ narrow = Filter(wave, curve, "mine.f900n", meta={"source": "a proposal"})
 narrow
 
 # %%
-# A file is read by its suffix. Tables (ECSV, FITS, VOTable as the SVO offers it) have units. A text file has to
-# name that of the wavelengths in a comment, or ``unit`` gives it.
+# The suffix of a file decides how it is read. Tables (ECSV, FITS, and VOTable as the SVO offers it) have units. A
+# text file must name the unit of the wavelengths in a comment, or you give it by ``unit``.
 
 table = QTable({"wave": wave.to(u.AA), "throughput": curve})
 table.write("narrow.ecsv", overwrite=True)
@@ -39,7 +39,7 @@ wide = Filter.read("wide.txt", name="mine.f1290x", unit=u.um)
 FilterSet([from_table, wide]).to_table()
 
 # %%
-# Filters of your own and of the library go into one set. It serves wherever bands are asked for.
+# Your own filters and filters of the library go into one set, which every function that takes bands accepts.
 
 bands = FilterSet(["F770W", narrow, "F1000W", wide, "F1500W"])
 model = SEDModel.yang2021(libraries="bundled")

@@ -30,7 +30,7 @@ for name in ("F770W", "F1000W", "F1500W", "F2100W"):
 QTable(rows)
 
 # %%
-# With a position, the levels are percentiles over the days on which it can be seen.
+# With a position, the levels are percentiles over the days on which the position can be observed.
 
 fields = {"GOODS-S": "53.1 -27.8", "EGS": "214.9 52.8", "COSMOS": "150.1 2.2"}
 for label, place in fields.items():
@@ -39,7 +39,7 @@ for label, place in fields.items():
     print(f"{label:8} {sky:.1f}")
 
 # %%
-# The zodiacal light over the low one, by ecliptic latitude:
+# The figure shows the zodiacal light relative to the low level, by ecliptic latitude:
 
 latitude = np.arange(0, 91, 10)
 ax = plt.subplots(layout="constrained")[1]

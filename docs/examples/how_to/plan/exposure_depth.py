@@ -30,7 +30,8 @@ table.round(2)
 table
 
 # %%
-# The limit by time. It falls with the square root of the time, as long as nothing systematic remains.
+# The figure shows the limit against the exposure time. The limit falls with the square root of the time, as long
+# as no systematic error remains.
 
 times = np.logspace(2.5, 4.8, 7) * u.s
 ax = plt.subplots(layout="constrained")[1]

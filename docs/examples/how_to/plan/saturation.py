@@ -28,8 +28,9 @@ ax.legend()
 plt.show()
 
 # %%
-# The sky fills the well, too, above all at long wavelengths. ``saturation_time`` is when it is full, and
-# ``saturation_forecast`` its share of the well at the end of an exposure. Keep it below 0.6.
+# The sky also fills the well, above all at long wavelengths. ``saturation_time`` is the time at which the well is
+# full, and ``saturation_forecast`` gives the filled share of the well at the end of an exposure. Keep this share
+# below 0.6.
 
 rows = []
 for name in ("F770W", "F1500W", "F2100W", "F2550W"):

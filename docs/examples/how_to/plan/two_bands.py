@@ -30,8 +30,8 @@ planner = Planner(load_plan(overrides=overrides))
 plans = planner.compare()
 
 # %%
-# All sets are compared on the same sources. ``merit`` is what they are ranked by: here AGN found, times purity,
-# for each hour. With 120 sources differences of less than the errors mean nothing.
+# All sets are compared on the same sources. They are ranked by ``merit``: here the number of AGN found, times the
+# purity, for each hour. With 120 sources differences of less than the errors mean nothing.
 
 table = comparison_table(planner, plans)
 columns = ["z_scatter", "frac_scatter", "completeness", "purity", "merit"]
@@ -56,7 +56,7 @@ plt.show()
 plans[-1].band_table()["filter", "time", "groups", "limit", "saturates"]
 
 # %%
-# The command makes a page of it:
+# The command makes a page of this comparison:
 #
 # .. code-block:: console
 #

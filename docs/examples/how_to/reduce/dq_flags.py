@@ -66,7 +66,7 @@ plt.show()
 
 # %%
 # ``read_images("..._cal.fits")[0].image.flags`` gives the flags of a file, and ``ramp.pixel_dq`` and
-# ``ramp.group_dq`` those of a ramp. Bits above 2^31 are conditions that JWST does not distinguish; files keep
+# ``ramp.group_dq`` the flags of a ramp. Bits above 2^31 are conditions that JWST does not distinguish; files keep
 # them in a plane of their own.
 #
 # See :doc:`/method/reduction` for the conventions.

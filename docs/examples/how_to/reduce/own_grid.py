@@ -68,7 +68,7 @@ result.write("mosaic_f770w.fits", overwrite=True)
 result
 
 # %%
-# Settings of the steps are those of the Reducer: ``Reducer(mosaics=MosaicSettings(pixfrac=0.8))``,
+# The Reducer has the settings of all steps: ``Reducer(mosaics=MosaicSettings(pixfrac=0.8))``,
 # ``Reducer(background="dithers")``. The PSF of the mosaic is wider than that of an exposure; see
 # `~miricigale.psf.psf_mosaic`.
 #

@@ -7,7 +7,7 @@ mosaic of each filter.
 """
 
 # %%
-# Here simulated exposures stand for the files. They have the names and the format of those from MAST.
+# Here simulated exposures stand for the files. They have the names and the format of files from MAST.
 
 import astropy.units as u
 import matplotlib.pyplot as plt

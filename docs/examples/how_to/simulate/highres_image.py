@@ -24,7 +24,7 @@ wcs = north_up_wcs(catalog["sky"][600], scale, (400, 400))
 psf = filter_psf("wfc3.f160w", pixel_scale=scale, pa=0 * u.deg)
 
 # %%
-# The depth is that of 5 sigma in an aperture of 0.2" in radius. Three depths of the same field:
+# The depth is the 5-sigma limit in an aperture of 0.2" in radius. The figure shows three depths of the same field:
 
 depths = [25.5, 27.6, 29.0]
 options = {"wcs": wcs, "psf": psf, "seed": 1}

@@ -7,8 +7,8 @@ the next exposures.
 """
 
 # %%
-# The effect is optional. The exposures before are an argument of ``expose``, so that an exposure depends on
-# nothing else.
+# The effect is optional. The earlier exposures are an argument of ``expose``, so that an exposure depends only on
+# its arguments.
 
 import astropy.units as u
 import matplotlib.pyplot as plt
