@@ -5,8 +5,39 @@ import difflib
 from miricigale.utils.caching import cached
 from miricigale.utils.package_tables import declared
 
-#: Names of a message at most.
+#: Most names that a message suggests, and most that it lists if none is near.
 _MAX_NAMES = 4
+_MAX_LISTED = 40
+
+
+class UnknownAttributeError(AttributeError):
+    """
+    An attribute that is not there, with what to write instead.
+
+    Near names are looked up when the message is read: most of such errors only answer ``hasattr``.
+
+    Parameters
+    ----------
+    owner : object
+        What was asked.
+    name : str
+        The attribute.
+    """
+
+    def __init__(self, owner, name):
+        # not `obj`, by which Python would append a suggestion of its own
+        super().__init__(f"{type(owner).__name__!r} object has no attribute {name!r}", name=name)
+        self._owner = owner
+
+    def __str__(self):
+        message = self.args[0]
+        hint = attribute_hint(type(self._owner), self.name, dir(self._owner))
+        if hint:
+            return f"{message}; {hint}"
+        return message
+
+    def __reduce__(self):
+        return type(self), (self._owner, self.name)
 
 
 def attribute_hint(cls, name, names):
@@ -25,8 +56,8 @@ def attribute_hint(cls, name, names):
     Returns
     -------
     hint : str
-        The sentence that ``hints.toml`` has for it, else the name that is spelled alike, or those that share most
-        words with it; empty without any.
+        The sentence that ``hints.toml`` has for it, else the name that is spelled alike, those that share most
+        words with it, or all that a class with few has; empty without any.
 
     Examples
     --------
@@ -35,21 +66,34 @@ def attribute_hint(cls, name, names):
     >>> attribute_hint(Filter, "synthetic_fluxe", ["pivot", "synthetic_flux"])
     "did you mean 'synthetic_flux'?"
     """
-    for base in cls.__mro__:
-        sentence = declared("miricigale.utils", "hints.toml").get(base.__name__, {}).get(name)
-        if sentence is not None:
-            return sentence
+    sentences = {}
+    for base in reversed(cls.__mro__):
+        sentences |= declared("miricigale.utils", "hints.toml").get(base.__name__, {})
+    if name in sentences:
+        return sentences[name]
     public = [candidate for candidate in names if not candidate.startswith("_")]
     close = difflib.get_close_matches(name, public, n=1, cutoff=0.75)
     if close:
         return f"did you mean {close[0]!r}?"
+    near = _sharing_words(name, public)
+    if near:
+        return f"did you mean {' or '.join(map(repr, near[:_MAX_NAMES]))}?"
+    near = _sharing_words(name, sentences)
+    if near:
+        return sentences[near[0]]
+    if len(public) <= _MAX_LISTED:
+        return f"it has {', '.join(public)}"
+    return ""
+
+
+def _sharing_words(name, candidates):
+    """Return the names that share most words with a name, the shortest first; none if no word is shared."""
     wanted = _words(name)
-    shared = {candidate: len(wanted & _words(candidate)) for candidate in public}
+    shared = {candidate: len(wanted & _words(candidate)) for candidate in candidates}
     most = max(shared.values(), default=0)
     if most == 0:
-        return ""
-    near = sorted((n for n in public if shared[n] == most), key=lambda n: (len(n), n))
-    return f"did you mean {' or '.join(map(repr, near[:_MAX_NAMES]))}?"
+        return []
+    return sorted((n for n in shared if shared[n] == most), key=lambda n: (len(n), n))
 
 
 def _words(name):

@@ -3,7 +3,7 @@
 import html
 import operator
 
-from miricigale.utils.attribute_hints import attribute_hint
+from miricigale.utils.attribute_hints import UnknownAttributeError
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import sky_as_angles
@@ -34,13 +34,7 @@ class Interactive:
             return value
         if (value := self._value(name)) is not None:
             return value
-        msg = f"{type(self).__name__!r} object has no attribute {name!r}"
-        hint = attribute_hint(type(self), name, dir(self))
-        if hint:
-            # notebooks show the message alone; `obj` would make Python append a suggestion of its own
-            msg = f"{msg}; {hint}"
-            raise AttributeError(msg, name=name)
-        raise AttributeError(msg, name=name, obj=self)
+        raise UnknownAttributeError(self, name)
 
     def __dir__(self):
         return sorted({*super().__dir__(), *self._value_names()})
