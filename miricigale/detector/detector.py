@@ -57,17 +57,17 @@ class Detector(Interactive):
     Parameters
     ----------
     effects : iterable of `~miricigale.detector.Effect`, optional
-        Those of `miri_imager` by default. In the order of ``miricigale.detector.effects.order.ORDER``: the
-        first act on light; `Photons` makes a ramp of it; `ADConversion` ends. Effects of other kinds stand
-        where they are put.
+        The effects of `miri_imager` by default. They must be in the order of
+        ``miricigale.detector.effects.order.ORDER``: the first ones act on light, `Photons` makes a ramp of it, and
+        `ADConversion` is the last. Effects of other kinds stay where they are put.
     properties : `~miricigale.instrument.DetectorProperties`, optional
         Gain, noise and the rest; `~miricigale.instrument.miri_detector` if not given.
 
     Raises
     ------
     ValueError
-        If an effect is none, one is not in its place, or there is not one Photons, or no
-        ADConversion at the end.
+        If ``effects`` holds something that is no effect, the order is wrong, there is not exactly one `Photons`,
+        or `ADConversion` is not the last.
 
     Examples
     --------

@@ -60,7 +60,8 @@ class Filter(Frozen, Interactive):
     """
     A passband: the response to photons against wavelength.
 
-    ``Filter("F770W")`` is the one of the library (`from_name`); ``filter(wave)`` is the throughput there.
+    ``Filter("F770W")`` is a filter of the library (`from_name`); ``filter(wave)`` is its throughput at
+    wavelengths.
 
     Parameters
     ----------
@@ -75,9 +76,9 @@ class Filter(Frozen, Interactive):
     meta : dict, optional
         Source, citation, flux convention of the catalogs, in words.
     reference_wavelength : `~astropy.units.Quantity`, optional
-        Where catalogs quote fluxes, if these are not AB means; see `catalog_factor`.
+        Wavelength at which catalogs quote fluxes, if these are not AB means; see `catalog_factor`.
     reference_temperature : `~astropy.units.Quantity`, optional
-        Of the black body whose flux is quoted; none: of nu F_nu = const.
+        Temperature of the black body whose flux is quoted; None stands for nu F_nu = const.
 
     Raises
     ------

@@ -109,15 +109,15 @@ class ForcedPhotometer(Interactive):
         From the high-resolution image's PSF (``source``) to the image's (``target``), on the
         pixels of the high-resolution image. ``target`` must be the PSF of the image that is
         measured: that of a drizzled mosaic for a drizzled mosaic. With kernels of several places
-        each source has that of its own; shapes are fitted with the mean of the sources. Of a kernel
-        without PSFs sources are the segments as they are (``template="cutout"``, ``wings=False``),
-        which a warning says; those without a segment are not measured. Files, and arrays with their pixel scale
+        each source has that of its own; shapes are fitted with the mean of the sources. If the
+        kernel has no PSFs, sources are their segments as they are (``template="cutout"``, ``wings=False``), with a
+        warning, and sources without a segment are not measured. Files, and arrays with their pixel scale
         (``(array, 0.03 * u.arcsec)``), are taken by `~miricigale.psf.as_kernel`. For exposures that are fitted
         together a list of kernels, or `ExposureKernels`, one for each.
     psf, highres_psf : `~photutils.psf.ImagePSF`, str or other, optional
-        In place of the kernel the PSFs of the image and of the high-resolution image, in the forms of
-        `~miricigale.psf.MatchingKernel.from_psfs`, which makes the kernel. Of an image without a
-        high-resolution one that of the image alone: sources are points.
+        PSFs of the image and of the high-resolution image, in place of the kernel, in any form that
+        `~miricigale.psf.MatchingKernel.from_psfs` takes; it makes the kernel. Without a high-resolution image,
+        give the PSF of the image alone: sources are then points.
     template : {"auto", "cutout", "psf", "sersic"}, optional
         What sources look like. ``"auto"`` cuts them from the high-resolution image where a
         segment of enough signal-to-noise belongs to them, otherwise takes a point source.
@@ -141,8 +141,8 @@ class ForcedPhotometer(Interactive):
         does not include the response of the pixel.
     components : {1, 2}, optional
         With 2, sources whose template without error fits poorly are fitted once more as their template and
-        a point on top of it, and stay so where chi-square is less than without the point. Column
-        ``components`` of the catalog (1 or 2) says which those are instead. The point is at the catalog's
+        a point on top of it, and stay so where chi-square is less than without the point. A column
+        ``components`` of the catalog (1 or 2) can select these sources instead. The point is at the catalog's
         position, or at the center of the fitted profile if that is more than 3 sigma away.
     second_pass : bool or None, optional
         Whether peaks of the residual above 5 sigma that the catalog lacks are fitted together with it, as
