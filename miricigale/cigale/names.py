@@ -14,7 +14,7 @@ AGN_PARTS = {
 }
 
 
-def cigale_names(modules=None):
+def cigale_names(modules):
     """
     CIGALE's names of what we have: our name to CIGALE's, its unit, and the factor to it from ours.
 

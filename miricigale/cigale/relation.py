@@ -21,7 +21,7 @@ _OBJECTS = 64
 _LEAST = 0.01
 
 
-def near_relation(fitter, photometry, results, max_deviation, *, redshift=None, seed=0):
+def near_relation(fitter, photometry, results, max_deviation, *, redshift, seed):
     """
     Leave out models whose corona is too far from what their disk should have, as X-CIGALE does.
 
@@ -38,9 +38,9 @@ def near_relation(fitter, photometry, results, max_deviation, *, redshift=None, 
         What ``fitter.fit(photometry, redshift=redshift)`` returned.
     max_deviation : float
         Largest distance of alpha_ox from -0.137 log L_nu(2500 A) + 2.638 (Just et al. 2007).
-    redshift : array_like, optional
+    redshift : array_like or None
         Known redshifts.
-    seed : int, optional
+    seed : int
         Seed of the draws, `N_DRAWS` of each object.
 
     Returns

@@ -132,7 +132,7 @@ def name_and_unit(text):
     return text, None
 
 
-def known_filter(label, names, kind="filter"):
+def known_filter(label, names, kind):
     """
     Filter out of some that a user means.
 
@@ -142,7 +142,7 @@ def known_filter(label, names, kind="filter"):
         In any of the forms of `find_filter`.
     names : iterable of str
         Our names of those that may be meant.
-    kind : str, optional
+    kind : str
         What they are called in messages.
 
     Returns

@@ -272,10 +272,10 @@ def band_columns(table, argument="photometry"):
     return names, [name for name in complete if _is_ab(table, columns[name])]
 
 
-def our_names(colnames, argument="photometry"):
+def our_names(colnames):
     """Our names of columns that are fluxes, magnitudes and errors of bands, and ids: dict by their names."""
     out = {}
-    for ours, theirs in _our_names(colnames, FILTERS.names(), argument).items():
+    for ours, theirs in _our_names(colnames, FILTERS.names(), "photometry").items():
         out[theirs] = ours
     return out
 

@@ -359,7 +359,7 @@ def with_shapes(former, sources):
     return rows
 
 
-def image_field(file, inputs, preset, options, n_threads=None):
+def image_field(file, inputs, preset, options, n_threads):
     """The field of an image: a `PriorField` where there is a prior, or an `ImageField`."""
     if inputs is not None:
         return PriorField(inputs, n_threads)

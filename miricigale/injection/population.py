@@ -51,7 +51,7 @@ _STEEPEST = 0.6
 _ATTEMPTS = 50
 
 
-def fitted_shapes(image, segments, sources, psf, n_threads=None):
+def fitted_shapes(image, segments, sources, psf, n_threads):
     """
     Fit profiles to the sources of an image.
 
@@ -65,7 +65,7 @@ def fitted_shapes(image, segments, sources, psf, n_threads=None):
         ``id``, ``sky`` and ``label`` of the sources.
     psf : `~numpy.ndarray`, shape (k, k)
         PSF on the pixels of the image.
-    n_threads : int, optional
+    n_threads : int or None
         Threads.
 
     Returns

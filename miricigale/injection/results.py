@@ -177,7 +177,7 @@ class InjectionResult(Interactive):
             if star.any():
                 yield "stars", 0.0, 0.0, star
             radius = np.asarray(sources["half_light_radius"].value)
-            yield from _classes(radius, chosen & ~star, "arcsec")
+            yield from _classes(radius, chosen & ~star)
         elif by == "place":
             for name in PLACES:
                 member = chosen & (np.asarray(sources["place"]) == name)
@@ -239,7 +239,7 @@ class InjectionResult(Interactive):
         if by == "magnitude":
             bins = _steps(np.asarray(table["magnitude"]), np.isfinite(table["magnitude"]))
         elif by == "size":
-            bins = _classes(np.asarray(table["size"].value), everything, "arcsec")
+            bins = _classes(np.asarray(table["size"].value), everything)
         elif by == "place":
             place = np.asarray(table["place"])
             bins = []
@@ -327,8 +327,8 @@ def _steps(values, chosen):
         yield f"{low:.1f} - {high:.1f}", low, high, chosen & (number == k)
 
 
-def _classes(values, chosen, unit):
-    """Classes of a size that have about as many members each."""
+def _classes(values, chosen):
+    """Classes of a size (arcsec) that have about as many members each."""
     if not chosen.any():
         return
     edges = np.unique(np.quantile(values[chosen], np.linspace(0, 1, _SIZES + 1)))
@@ -341,7 +341,7 @@ def _classes(values, chosen, unit):
             inside = values < high
         member = chosen & (values >= low) & inside
         if member.any():
-            yield f"{low:.2f} - {high:.2f} {unit}", low, high, member
+            yield f"{low:.2f} - {high:.2f} arcsec", low, high, member
 
 
 def _neighbors(light, chosen):

@@ -269,7 +269,7 @@ def _fill_prior_fluxes(sources, base, rng):
     sources["prior_flux"][missing] = flux
 
 
-def run_trial(field, injection, base, sources, image_file=None):
+def run_trial(field, injection, base, sources, image_file):
     """
     Inject sources, detect and measure.
 
@@ -279,7 +279,7 @@ def run_trial(field, injection, base, sources, image_file=None):
         As for `measure_base`, and what it returned.
     sources : `~astropy.table.QTable`
         Of `injected_sources`.
-    image_file : `~miricigale.photometry.MosaicFile`, optional
+    image_file : `~miricigale.photometry.MosaicFile` or None
         An image that shows them already.
 
     Returns

@@ -93,7 +93,7 @@ def write_image(image, path, *, planes=None, rounded=False, overwrite=False):
     write_planes(image, path, planes=planes, rounded=rounded, overwrite=overwrite)
 
 
-def write_planes(image, path, *, planes=None, rounded=False, overwrite=False):
+def write_planes(image, path, *, planes, rounded, overwrite=False):
     """Write what `write_image` writes, under any name: the files of a study are read by the package alone."""
     if image.wcs is not None:
         header = image.wcs.to_header(relax=True)

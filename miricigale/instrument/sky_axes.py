@@ -1,7 +1,6 @@
 """Right ascension and declination of pixels, whatever the frame and the order of the axes of a WCS."""
 
 import astropy.units as u
-import numpy as np
 from astropy.coordinates import ICRS, SkyCoord
 
 from miricigale.utils.exceptions import argument_error
@@ -119,8 +118,3 @@ def _frame(wcs):
 
     wcs.wcs.set()
     return wcs_to_celestial_frame(wcs)
-
-
-def angle_difference(first, second):
-    """Difference of two angles in deg, from -180 to 180."""
-    return (np.asarray(first) - second + 180) % 360 - 180

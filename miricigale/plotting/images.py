@@ -299,7 +299,7 @@ def color_image(red, green, blue):
     return image
 
 
-def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center=None):
+def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None):
     """
     Draw a color image on axes in arcsec.
 
@@ -307,7 +307,7 @@ def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center
     ----------
     red, green, blue
         As in `color_image`.
-    ax, pixel_scale, title, center : optional
+    ax, pixel_scale, title : optional
         As in `plot_image`.
 
     Returns
@@ -315,7 +315,7 @@ def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    _draw(color_image(red, green, blue), ax, pixel_scale, title, center)
+    _draw(color_image(red, green, blue), ax, pixel_scale, title, None)
     return ax
 
 

@@ -78,7 +78,7 @@ def cruciform_fraction(filter_name, *, calibration="flight"):
     return arms / (1 + arms)
 
 
-def halo_share(filter_name, *, calibration="flight"):
+def halo_share(filter_name, *, calibration):
     """
     Share of the scattered light that is in a diffuse halo instead of the cross.
 

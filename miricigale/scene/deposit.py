@@ -44,7 +44,7 @@ def smooth_from(rows, w_zone, w_cut):
     return np.where(w < w_cut, w, np.inf)
 
 
-def deposit_profiles(grid, rows, tables, w_zone, w_smooth, w_cut, land, *, n_threads=None):
+def deposit_profiles(grid, rows, tables, w_zone, w_smooth, w_cut, land, *, n_threads):
     """
     Put Sersic profiles on the grid, in place, and return the light of each that lands on the image.
 

@@ -38,7 +38,7 @@ _LOG_UV = np.log10(np.mean(UV_WINDOWS, axis=1))
 _BAND = {name: i for i, name in enumerate(COLOR_BANDS)}
 
 
-def galaxy_quantities(stars, rows, absorbed, sums, reference_row=0):
+def galaxy_quantities(stars, rows, absorbed, sums, reference_row):
     """
     Derived quantities of n galaxies for one solar mass formed, in the units of `DERIVED`.
 

@@ -37,7 +37,7 @@ TORUS = {"p": 1.0, "q": 1.0, "opening_angle": 40.0, "radius_ratio": 20.0}
 PAH_33 = 0.2
 
 
-def yang2021_components(*, agn=True, xray=False, igm="meiksin2006", libraries="best"):
+def yang2021_components(*, agn, xray, igm, libraries):
     """
     Components of the chain of Yang et al. 2021, and which library each part comes from.
 
@@ -60,7 +60,7 @@ def yang2021_components(*, agn=True, xray=False, igm="meiksin2006", libraries="b
     return parts, notes
 
 
-def survey_components(*, agn=True, igm="meiksin2006", libraries="best"):
+def survey_components(*, agn, igm, libraries):
     """
     Components of the chain for galaxies of a survey, and which library each part comes from.
 
@@ -242,7 +242,7 @@ def grid_name(name, argument="axes"):
     return name
 
 
-def grid_axes(name, *, agn=True):
+def grid_axes(name, *, agn):
     """Axes of a grid in `GRIDS`: new arrays by parameter; without those of AGN if ``agn`` is false."""
     axes = _values(GRIDS[name][1])
     if agn:

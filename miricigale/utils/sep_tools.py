@@ -187,7 +187,7 @@ def extract(
         ) from None
 
 
-def window_positions(data, x, y, width, *, mask=None):
+def window_positions(data, x, y, width, *, mask):
     """
     Windowed centroids of sources, as Source Extractor's ``XWIN_IMAGE``.
 
@@ -199,7 +199,7 @@ def window_positions(data, x, y, width, *, mask=None):
         First positions in pixels.
     width : float
         Standard deviation of the Gaussian window in pixels.
-    mask : array_like of bool, shape (ny, nx), optional
+    mask : array_like of bool, shape (ny, nx) or None
         True where there is no data.
 
     Returns

@@ -163,7 +163,7 @@ def weighed(flux, weight, level, log_prior, bands):
     return Target(flux, weight, log_prior, bands, root32, data32, norm, level, -float(top))
 
 
-def make_limits(limit, inverse, wrong=None):
+def make_limits(limit, inverse, wrong):
     """Bundle the upper limits of one object, wrong by these prior fractions; None if it has none."""
     bands = np.flatnonzero(inverse > 0)
     if bands.size == 0:

@@ -275,7 +275,7 @@ def sample_of(fitter, columns, seed):
     return SourceSample(bands, (fitter.grid.redshift[0], fitter.grid.redshift[-1]), seed)
 
 
-def calibrate_sample(fitter, sample, *, name, density_nodes=None, executor=None):
+def calibrate_sample(fitter, sample, *, name, density_nodes, executor):
     """Do what `calibrate_bands` does, with sources that were chosen; ``density_nodes`` are those of densities."""
     # scores are of the sources that its errors of models and priors were measured on
     first = dataclasses.replace(_calibration_of(fitter), name=name, scores=None)

@@ -195,7 +195,7 @@ def _tables(fits):
         yield table[first + [name for name in table.colnames if name not in first]]
 
 
-def classes_of(fits, step=1):
+def classes_of(fits, step):
     """Compute the columns of `~miricigale.fitting.compare_classes` for every ``step``-th object, by name."""
     parts = [class_columns(class_results) for class_results in _parts(fits, step)]
     return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}

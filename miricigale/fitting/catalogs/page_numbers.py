@@ -19,7 +19,7 @@ def thinned(parts, step):
         first = (first - len(part)) % step
 
 
-def fit_numbers(results, step=1):
+def fit_numbers(results, step):
     """
     Collect the numbers of all objects, or of every ``step``-th, in the order of the catalog.
 
@@ -27,7 +27,7 @@ def fit_numbers(results, step=1):
     ----------
     results : `~miricigale.fitting.FitResultsFiles`
         The fit.
-    step : int, optional
+    step : int
         For catalogs that are longer than memory.
 
     Returns

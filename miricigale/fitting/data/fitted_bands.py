@@ -27,7 +27,7 @@ def bands_of(photometry):
         If there is none.
     """
     table = as_table(photometry, "photometry")
-    ours = our_names(table.colnames, "photometry")
+    ours = our_names(table.colnames)
     bands = bands_with_errors([ours.get(name, name) for name in table.colnames], "photometry")
     catalog_names = {name for name, our in ours.items() if our in bands}
     return bands, unused_bands(table, catalog_names.union(bands))

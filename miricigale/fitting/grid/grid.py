@@ -336,7 +336,7 @@ class GridEngine(Frozen):
                     each(on_nodes)
         return out
 
-    def empty_output(self, n, n_draws=0, joint=()):
+    def empty_output(self, n, n_draws, joint):
         """Make the `GridOutput` of n objects that were not fitted; arguments as of `fit`."""
         # the galaxy's, the AGN model's and the sum of both
         n_quantities = len(self._scales.galaxy) + len(self._scales.agn) - 1

@@ -115,7 +115,7 @@ class ObjectNuclei:
     n_used: int
 
     @classmethod
-    def of_values(cls, bands, values, data, stars, agn_error=0.0):
+    def of_values(cls, bands, values, data, stars, agn_error):
         """
         Nuclei of an object.
 
@@ -129,7 +129,7 @@ class ObjectNuclei:
             Photometry of the object, as of one row.
         stars : float
             Standard deviation of u.
-        agn_error : float, optional
+        agn_error : float
             Error of the AGN's light as a part of it.
         """
         n = len(bands)

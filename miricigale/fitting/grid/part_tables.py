@@ -117,10 +117,9 @@ def _single(table):
     return np.ascontiguousarray(by_redshift, np.float32), offset
 
 
-def empty_part(n_columns, n_z=1):
+def empty_part(n_columns):
     """Make a `_core.Part` without models."""
-    table = np.zeros((0, n_z, n_columns))
-    return make_part((), {}, {}, table, np.arange(n_z, dtype=float), {})
+    return make_part((), {}, {}, np.zeros((0, 1, n_columns)), np.zeros(1), {})
 
 
 def with_columns(part, table):

@@ -99,7 +99,7 @@ class _Group(NamedTuple):
     last: int
 
 
-def fit_mixture(labels, n_peaks, places, n_local=0):
+def fit_mixture(labels, n_peaks, places, n_local):
     """
     Fit a mixture to places.
 
@@ -113,7 +113,7 @@ def fit_mixture(labels, n_peaks, places, n_local=0):
         Number of peaks of redshift.
     places : `Places`
         The places.
-    n_local : int, optional
+    n_local : int
         Number of narrow parts for each label and peak that counts, which needs weights.
 
     Returns

@@ -79,7 +79,7 @@ def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):
     return out
 
 
-def cell_shares(values, pdf, low, high, bounds=(-np.inf, np.inf)):
+def cell_shares(values, pdf, low, high, bounds):
     """
     Integrate distributions that are linear within each cell of `cell_edges` from ``low`` to ``high``.
 

@@ -241,7 +241,7 @@ def _add_axis(axes, name, column, kind, priors, bounds, rows=None, nodes=None):
     return factor
 
 
-def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
+def _axis(name, values, unit, kind, priors, bounds):
     prior = priors.get(name)
     argument = f"priors[{name!r}]"
     if prior is None:

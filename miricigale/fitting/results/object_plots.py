@@ -12,7 +12,7 @@ from miricigale.utils.progress import progress
 _HEIGHT = 3.2
 
 
-def draw_objects(objects, filters, titles=None):
+def draw_objects(objects, filters, titles):
     """
     Draw objects below one another: fluxes with the best model and residuals, and the posterior of the redshift.
 
@@ -22,7 +22,7 @@ def draw_objects(objects, filters, titles=None):
         Single objects that were fitted.
     filters : `~miricigale.filters.FilterSet`
         Bands of the results, for their wavelengths.
-    titles : sequence of str, optional
+    titles : sequence of str or None
         Titles; id, redshift and chi2 by default.
 
     Returns

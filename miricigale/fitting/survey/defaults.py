@@ -121,7 +121,7 @@ def _survey_calibration(bands):
     return calibration
 
 
-def default_calibration(grid, model_error=None, template_error=None, *, bands=None):
+def default_calibration(grid, model_error, template_error, *, bands):
     """
     Choose the calibration of a named grid where none was given.
 
@@ -133,7 +133,7 @@ def default_calibration(grid, model_error=None, template_error=None, *, bands=No
         Errors of the models that were given, which take its place.
     template_error : `TemplateError` or None
         The same, by rest wavelength.
-    bands : list of str or `FilterSet`, optional
+    bands : list of str, `FilterSet` or None
         Bands of the catalog, which get the errors of the prior, for MIRI 3.3 times those of the catalog and 15 %
         of the flux (`~miricigale.fitting.calibrate_bands` measures them). Without them errors are those of the
         catalog.
@@ -153,7 +153,7 @@ def default_calibration(grid, model_error=None, template_error=None, *, bands=No
     return _survey_calibration(tuple(bands.names))
 
 
-def chosen_calibration(calibration, grid, model_error=None, template_error=None, *, bands=None):
+def chosen_calibration(calibration, grid, model_error, template_error=None, *, bands=None):
     """
     Return the calibration that was given, or `default_calibration` where that is asked for.
 

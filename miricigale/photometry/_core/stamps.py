@@ -36,7 +36,7 @@ def _listed(search):
     return pairs
 
 
-def find_pairs(box, grow=0):
+def find_pairs(box, grow):
     """
     List the pairs i < j, (n_pairs, 2), of boxes that overlap after one of them is grown by some pixels.
 

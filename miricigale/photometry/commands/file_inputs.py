@@ -194,7 +194,7 @@ class Inputs:
             photometers[band] = ForcedPhotometer(kernel, psf_stars=stars, **options)
         return photometers
 
-    def find_sources(self, pixels, catalog=None, part=None):
+    def find_sources(self, pixels, catalog, part=None):
         """Find segments and sources (as `~miricigale.photometry.read_prior`); ``part`` is () without a prior."""
         from miricigale.photometry import chi_image, read_prior
         from miricigale.photometry.detection.prior_catalog import (

@@ -466,7 +466,7 @@ def empty_positions(result, seed):
     return QTable({"id": np.arange(1, len(chosen) + 1), "sky": sky})
 
 
-def write_errors_page(path, errors, *, overwrite=False):
+def write_errors_page(path, errors, *, overwrite):
     """Write the page of the errors of an image (`~miricigale.photometry.ImageErrors`)."""
     table = errors.table
     meta = errors.table.meta

@@ -191,7 +191,7 @@ def own_rows(patch, grid, xy):
     return is_kept
 
 
-def join_patches(tables, grid, prior, catalog=None, ids=False):
+def join_patches(tables, grid, prior, catalog, ids):
     """
     Join the tables of patches.
 
@@ -203,9 +203,9 @@ def join_patches(tables, grid, prior, catalog=None, ids=False):
         The patches.
     prior : `~miricigale.photometry.images.mosaic_headers.MosaicHeader`
         That of the prior.
-    catalog : `~astropy.table.QTable`, optional
+    catalog : `~astropy.table.QTable` or None
         ``id`` and ``sky`` of all sources: then the table has these rows.
-    ids : bool, optional
+    ids : bool
         Whether ids are those of segments; otherwise sources are counted, patch by patch.
 
     Returns
@@ -267,7 +267,7 @@ def join_patches(tables, grid, prior, catalog=None, ids=False):
     return joined
 
 
-def measure_patch(inputs, grid, k, catalog=None, n_threads=None):
+def measure_patch(inputs, grid, k, catalog, n_threads):
     """
     Measure the sources of a patch.
 
@@ -279,9 +279,9 @@ def measure_patch(inputs, grid, k, catalog=None, n_threads=None):
         The patches.
     k : int
         Which.
-    catalog : `~astropy.table.QTable`, optional
+    catalog : `~astropy.table.QTable` or None
         ``id`` and ``sky`` of all sources, where there is one.
-    n_threads : int, optional
+    n_threads : int or None
         Number of threads.
 
     Returns

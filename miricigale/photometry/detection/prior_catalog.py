@@ -94,7 +94,7 @@ def read_prior(highres, *, segmentation=None, catalog=None):
     return segments, sources
 
 
-def detected_prior(highres, catalog=None):
+def detected_prior(highres, catalog):
     """
     Detect segments on an image, and return them with its sources: those of a catalog, or the detected ones.
 
@@ -102,7 +102,7 @@ def detected_prior(highres, catalog=None):
     ----------
     highres : `~astropy.nddata.CCDData`
         The image.
-    catalog : optional
+    catalog
         As for `read_prior`.
 
     Returns
@@ -121,7 +121,7 @@ def detected_prior(highres, catalog=None):
     return sources_of(highres, segments.data, catalog)
 
 
-def sources_of(highres, segmentation, catalog=None):
+def sources_of(highres, segmentation, catalog):
     """Read a prior as `read_prior`, from a map (an array) that may be without segments: all are points then."""
     if np.any(np.nan_to_num(segmentation)):
         return read_prior(highres, segmentation=segmentation, catalog=catalog)

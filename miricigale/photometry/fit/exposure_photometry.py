@@ -56,9 +56,7 @@ _REFINED = 2
 _FALSE_RATE = 0.1
 
 
-def measure_exposures(
-    photometer, images, highres=None, segmentation=None, catalog=None, *, templates=None
-):
+def measure_exposures(photometer, images, highres, segmentation, catalog, *, templates):
     """
     Measure the sources of a catalog on exposures that are fitted together.
 

@@ -21,7 +21,7 @@ _ELSEWHERE = 3.0
 _FALSE_RATE = 0.1
 
 
-def fit_image(arrays, bank, settings, catalog, grid_wcs, *, until_new=False):
+def fit_image(arrays, bank, settings, catalog, grid_wcs, *, until_new):
     """
     Fit an image, and once more with second components and sources that the catalog lacks.
 
@@ -33,7 +33,7 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs, *, until_new=False):
         The catalog; ``near_rows`` lists the bank's sources.
     grid_wcs : `~astropy.wcs.WCS`
         Of the grid on which templates are made.
-    until_new : bool, optional
+    until_new : bool
         Whether the work ends where sources that the catalog lacks are found: for their positions alone.
 
     Returns

@@ -97,7 +97,7 @@ class KernelStars:
         return facts
 
 
-def kernel_stars(kernel, image, highres, catalog, *, grid=None, min_stars=1):
+def kernel_stars(kernel, image, highres, catalog, *, grid, min_stars):
     """
     Correct a kernel by the stars of its two images.
 
@@ -109,9 +109,9 @@ def kernel_stars(kernel, image, highres, catalog, *, grid=None, min_stars=1):
         The image and its prior, None without one.
     catalog : `~astropy.table.QTable`
         Columns ``id`` and ``sky``: all sources, stars among them.
-    grid : `~astropy.wcs.WCS`, optional
+    grid : `~astropy.wcs.WCS` or None
         The pixels of the kernel; those of ``highres``, or north up without it.
-    least : int, optional
+    min_stars : int
         Number of stars below which the PSF of an image is not corrected.
 
     Returns
@@ -169,7 +169,7 @@ def kernel_stars(kernel, image, highres, catalog, *, grid=None, min_stars=1):
     return KernelStars(kernel, fits, table)
 
 
-def with_stars(photometer, image, sources, highres=None, grid=None):
+def with_stars(photometer, image, sources, highres, grid=None):
     """
     Return a `~miricigale.photometry.ForcedPhotometer` with the kernel that the stars give, and these.
 

@@ -345,7 +345,7 @@ class _Spread:
         return Block(block.first, box, start, values)
 
 
-def change_matrices(bank, change_bank, inverse_sigma, images=(), correlation=None):
+def change_matrices(bank, change_bank, inverse_sigma, images, correlation=None):
     """
     Build the normal equations of changes of templates: their products with the templates, and with each other.
 

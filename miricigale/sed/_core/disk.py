@@ -39,7 +39,7 @@ def disk_spectrum(wave, delta=0.0, disk="skirtor"):
     return out / total
 
 
-def disk_nodes(disk="skirtor", number=241):
+def disk_nodes(disk, number=241):
     """
     Wavelengths in um that follow a disk: evenly in the logarithm to 30 um, with its breaks.
 

@@ -290,7 +290,7 @@ def exposure_units(config):
     return unit_names(truth_names(config), study_exposures(config))
 
 
-def exposures_of(config, unit=""):
+def exposures_of(config, unit):
     """Return exposures by name of a unit that ends with the name of an exposure or of a band; all without one."""
     name = unit.rpartition("/")[2]
     exposures = study_exposures(config)

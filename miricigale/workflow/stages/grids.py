@@ -157,7 +157,7 @@ def parts_of(unit):
     return truth, band, patch
 
 
-def patch_exposures(config, band, patch=""):
+def patch_exposures(config, band, patch):
     """Return the exposures of a band that see a patch, by name."""
     exposures = study_exposures(config)
     names = study_patches(config)[patch].exposures

@@ -127,7 +127,7 @@ def join_photometry(context, unit):
     context.save_table(f"{truth}/photometry/{band}.ecsv", joined)
 
 
-def photometer_of(context, name, method, patch=""):
+def photometer_of(context, name, method, patch):
     """Return the photometer of one band: of the package, or by the steps of Yang et al. 2021."""
     config = context.config
     if method == "yang2021":
