@@ -6,10 +6,8 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.fit.template_fit import MIN_COVERAGE, duplicates, inner_products
 from miricigale.photometry.images.arrays import pixel_scale
-from miricigale.photometry.images.fields import legendre_terms
 from miricigale.photometry.shapes.shapes import not_fitted
 from miricigale.photometry.templates.free_templates import (
     FreeTemplates,
@@ -85,15 +83,6 @@ class ExposurePart:
         k = len(self.source)
         place = self.row_source, np.arange(k)
         return scipy.sparse.coo_array((np.ones(k), place), shape=(n, k)).tocsr()
-
-    def sky_columns(self, order):
-        """Draw the terms of the sky, a polynomial of an order, in uJy per pixel for 1 MJy/sr."""
-        area = self.arrays.areas()
-        if order == 0:
-            return [area]
-        y, x = np.ogrid[: area.shape[0], : area.shape[1]]
-        terms = legendre_terms(x, y, area.shape, order)
-        return [np.asarray(area * term, np.float32) for term in terms]
 
     def moved(self, shift, like=None):
         """
@@ -194,7 +183,7 @@ class ExposureFit:
         n_common = 0
         for k, part in enumerate(self.parts):
             # common parameters of this exposure: its sky, and its shift if that is fitted
-            columns = part.sky_columns(self.order)
+            columns = part.arrays.sky_columns(self.order)
             places = {"sky": slice(n_common, n_common + len(columns))}
             if gradients is not None and gradients[k]:
                 columns = columns + gradients[k]
@@ -270,9 +259,7 @@ class ExposureFit:
             layers = [(part.bank, row_flux[part.row_source]), (bank, change[numbers])]
         image = part.arrays.new()
         for bank, flux in layers:
-            for block in bank.blocks():
-                part_flux = flux[block.first : block.last]
-                add_model(image, block.values, block.box, block.start, part_flux)
+            bank.add_to(image, flux)
         return image
 
     def sky(self, k):
@@ -280,7 +267,7 @@ class ExposureFit:
         part = self.parts[k]
         values = self.common[self.places[k]["sky"]]
         image = part.arrays.new()
-        for column, value in zip(part.sky_columns(self.order), values, strict=True):
+        for column, value in zip(part.arrays.sky_columns(self.order), values, strict=True):
             image += np.float32(value) * column
         return image
 
@@ -328,7 +315,7 @@ class ExposureFit:
             bank, numbers = self._change_bank(part, sources, changes)
             banks.append((bank, numbers))
             data = part.arrays.whitened(part.arrays.flux)
-            columns = part.sky_columns(self.order)
+            columns = part.arrays.sky_columns(self.order)
             white = list(map(part.arrays.whitened, columns))
             # normal equations of the changes on this exposure
             products, square, projection = change_matrices(
@@ -392,7 +379,7 @@ class ExposureFit:
             if correlation is None:
                 # that of white noise
                 correlation = np.ones((1, 1))
-            white = list(map(part.arrays.whitened, part.sky_columns(self.order)))
+            white = list(map(part.arrays.whitened, part.arrays.sky_columns(self.order)))
             spread = [_spread(column, correlation) for column in white]
             sky = self.places[k]["sky"]
             gather = part.gather(len(self.xy))[self.rows]

@@ -15,8 +15,7 @@ from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.detection.residual_sources import residual_peaks, unexplained_neighbors
 from miricigale.photometry.fit.diagnostics import canceling
 from miricigale.photometry.fit.exposure_fit import gaussian_width
-from miricigale.photometry.fit.result_table import new_source_table
-from miricigale.photometry.fit.results import ForcedPhotometryResult, crowded
+from miricigale.photometry.fit.result_table import result_of_columns
 from miricigale.photometry.fit.template_fit import psf_covariance, row_covariances
 from miricigale.photometry.images.arrays import lengths
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
@@ -198,16 +197,10 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     columns["residual_fraction"] = _spread_over(residual_fraction, place, n_all)
     for name, term in errors.items():
         columns[f"flux_err{name}"] = term * FNU
-    new = None
-    if fit.settings.second_pass or len(new_xy):
-        names = ("flux", "flux_err", "flags", "coverage", "chi2")
-        rows = {name: columns[name][n:] for name in names}
-        new = new_source_table(catalog, new_xy, plane.wcs, rows)
     exposures = _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
     model, residual = _plane_images(plane, models, residuals, inverse, meta)
     sky = exposures.table["sky"]
     weight = exposures.table["sky_err"] ** -2
-    reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
     # mean sky of the exposures, by their errors
     background = {}
     if len(fit.rows):
@@ -223,18 +216,14 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
         east, north = np.average(offsets[0][has_offset], axis=0, weights=weights)
         counted["offset"] = [round(-float(east), 5), round(float(north), 5)]
         counted["offset_err"] = [round(float(np.sum(weights) ** -0.5), 5)] * 2
-    return ForcedPhotometryResult(
-        id=np.array(catalog.id),
-        sky=catalog.sky,
-        **{name: values[:n] for name, values in columns.items()},
+    return result_of_columns(
+        catalog,
+        new_xy,
+        plane.wcs,
+        columns,
+        second_pass=fit.settings.second_pass,
         covariance=joint[:n, :n],
-        template=catalog.template,
-        template_snr=catalog.template_snr,
-        crowded=crowded(catalog.sky, reference),
-        x=catalog.xy[:, 0].copy(),
-        y=catalog.xy[:, 1].copy(),
         **background,
-        new_sources=new,
         psf_fwhm=np.sqrt(8 * np.log(2)) * gaussian_width(fit.settings.mean_kernel) * ANGLE,
         model_image=model,
         residual_image=residual,

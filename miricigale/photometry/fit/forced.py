@@ -10,7 +10,6 @@ from astropy.table import QTable, Table
 from photutils.segmentation import SegmentationImage
 
 from miricigale.instrument import epoch_of
-from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.detection.prior_catalog import detected_prior, read_catalog, read_prior
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels, are_exposures
 from miricigale.photometry.fit.fit_loop import fit_image
@@ -457,9 +456,7 @@ class ForcedPhotometer(Interactive):
             bank = place.bank(place.near_rows, near_templates, executor)
             # fluxes in the order of the bank's rows
             values = flux[place.near_rows][bank.order]
-            for block in bank.blocks():
-                block_flux = values[block.first : block.last]
-                add_model(model, block.values, block.box, block.start, block_flux)
+            bank.add_to(model, values)
         return model / arrays.area * SURFACE_BRIGHTNESS
 
     def _rows(self, sources, place, templates):

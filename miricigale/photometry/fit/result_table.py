@@ -164,30 +164,20 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     columns["residual_fraction"] = residual_fraction
     for name, error in zip(_TERMS, flux_err, strict=True):
         columns[f"flux_err{name}"] = error * FNU
-    new = None
-    if fit.settings.second_pass or len(new_xy):
-        names = ("flux", "flux_err", "flags", "coverage", "chi2")
-        rows = {name: columns[name][n:] for name in names}
-        new = new_source_table(catalog, new_xy, fit.arrays.wcs, rows)
-    reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
     image_meta = {}
     if "filter" in meta:
         image_meta["filter"] = meta["filter"]
     evidence = {}
     if fit.evidence is not None:
         evidence["second_pass"] = fit.evidence
-    return ForcedPhotometryResult(
-        id=np.array(catalog.id),
-        sky=catalog.sky,
-        **{name: values[:n] for name, values in columns.items()},
+    return result_of_columns(
+        catalog,
+        new_xy,
+        fit.arrays.wcs,
+        columns,
+        second_pass=fit.settings.second_pass,
         covariance=joint[:n, :n],
-        template=catalog.template,
-        template_snr=catalog.template_snr,
-        crowded=crowded(catalog.sky, reference),
-        x=catalog.xy[:, 0].copy(),
-        y=catalog.xy[:, 1].copy(),
         noise_correlation=diagnostics.correlation,
-        new_sources=new,
         psf_fwhm=_full_width(fit),
         meta=provenance(
             **meta,
@@ -200,6 +190,48 @@ def package(fit, diagnostics, new_xy, catalog, meta):
         **_components(fit, catalog, joint, place, n_all),
         **_common(fit, common),
         **_images(fit, diagnostics, image_meta),
+    )
+
+
+def result_of_columns(catalog, new_xy, wcs, columns, *, second_pass, **others):
+    """
+    Make a `ForcedPhotometryResult` of columns of all sources, first those of a catalog, then new ones.
+
+    Parameters
+    ----------
+    catalog : `CatalogRows`
+        The catalog.
+    new_xy : `~numpy.ndarray`, shape (m, 2)
+        Pixels of the sources that it lacks.
+    wcs : `~astropy.wcs.WCS`
+        Of these pixels.
+    columns : dict of array
+        ``flux``, ``flags``, ``coverage`` and others by name, shape (n + m,).
+    second_pass : bool
+        Whether new sources were looked for, so that there is a table of them without any too.
+    **others
+        The other fields of the result.
+    """
+    n = len(catalog.id)
+    new = None
+    if second_pass or len(new_xy):
+        names = ("flux", "flux_err", "flags", "coverage", "chi2")
+        rows = {name: columns[name][n:] for name in names}
+        new = new_source_table(catalog, new_xy, wcs, rows)
+    reference = catalog.reference
+    if reference is None:
+        reference = np.nan_to_num(columns["flux"][:n].value)
+    return ForcedPhotometryResult(
+        id=np.array(catalog.id),
+        sky=catalog.sky,
+        template=catalog.template,
+        template_snr=catalog.template_snr,
+        crowded=crowded(catalog.sky, reference),
+        x=catalog.xy[:, 0].copy(),
+        y=catalog.xy[:, 1].copy(),
+        new_sources=new,
+        **{name: values[:n] for name, values in columns.items()},
+        **others,
     )
 
 

@@ -4,9 +4,7 @@ import numpy as np
 import scipy.sparse
 from scipy.signal import oaconvolve
 
-from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.images.arrays import pixel_scale
-from miricigale.photometry.images.fields import legendre_terms
 from miricigale.photometry.shapes.shapes import not_fitted
 from miricigale.photometry.templates.free_templates import free_templates
 from miricigale.photometry.templates.normal_equations import (
@@ -234,7 +232,7 @@ class TemplateFit:
         self.inverse_sigma = arrays.inverse_sigma
         self._background = []
         if settings.background_order is not None:
-            self._background = self._background_columns()
+            self._background = self.arrays.sky_columns(self.settings.background_order)
         self.shift = self.offset_map = self.free = self.source_shifts = self.evidence = None
         if moved is None:
             moved = np.zeros(2)
@@ -248,19 +246,6 @@ class TemplateFit:
             search = settings.max_shift is not None and settings.offset_order is None
         if search and len(self.rows):
             self._find_shift(bank, moved)
-
-    def _background_columns(self):
-        area = self.arrays.areas()
-        order = self.settings.background_order
-        if order == 0:
-            return [area]
-        y, x = np.ogrid[: area.shape[0], : area.shape[1]]
-        terms = legendre_terms(x, y, area.shape, order)
-        columns = []
-        for term in terms:
-            column = self.arrays.new()
-            columns.append(np.multiply(area, term, out=column, casting="same_kind"))
-        return columns
 
     def _solve(self, bank, gradients):
         """Fit fluxes and common parameters with the templates of a bank."""
@@ -434,9 +419,7 @@ class TemplateFit:
             flux[self.rows], change = self.free.amplitudes
             layers = [(self.bank, flux), (self.free.bank, change)]
         for bank, flux in layers:
-            for block in bank.blocks():
-                part = flux[block.first : block.last]
-                add_model(image, block.values, block.box, block.start, part)
+            bank.add_to(image, flux)
         return image
 
     def residual(self, model):

@@ -9,6 +9,7 @@ from astropy.stats import mad_std
 from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
 
 from miricigale.instrument import ImageFacts, north_up_wcs, pixel_area_map
+from miricigale.photometry.images.fields import legendre_terms
 from miricigale.photometry.images.sky_noise import mask_filled
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
@@ -52,6 +53,17 @@ class FitArrays:
         if out is None:
             out = self.new()
         return _areas(self.wcs, out)
+
+    def sky_columns(self, order):
+        """Draw the terms of the sky, a polynomial of an order, in uJy per pixel for 1 MJy/sr."""
+        area = self.areas()
+        if order == 0:
+            return [area]
+        y, x = np.ogrid[: area.shape[0], : area.shape[1]]
+        columns = []
+        for term in legendre_terms(x, y, area.shape, order):
+            columns.append(np.multiply(area, term, out=self.new(), casting="same_kind"))
+        return columns
 
     def whitened(self, image):
         """Divide an image by the noise; zero where not usable."""

@@ -15,6 +15,7 @@ from miricigale.photometry._core.sampling import (
     sample_stamps,
     spline_response,
 )
+from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.detection.cutouts import RIM, convolve_padded
 from miricigale.utils.caching import cached
 from miricigale.utils.parallel import parallel_map
@@ -350,6 +351,12 @@ class TemplateBank:
     def full_light(self):
         """Return the light of a whole point source, by row."""
         return (self._weights @ self.fine.target.sum(axis=(1, 2)))[self.order]
+
+    def add_to(self, image, flux):
+        """Add the templates, times fluxes (uJy, shape (n,)) in their order, to an image."""
+        for block in self.blocks():
+            part = flux[block.first : block.last]
+            add_model(image, block.values, block.box, block.start, part)
 
     def blocks(self):
         """Yield all templates in order, as `Block` of some 16 MB each."""
