@@ -5,7 +5,7 @@ import numpy as np
 from miricigale.instrument import ImageFacts, as_wcs
 from miricigale.reduction.combine.align import align_images
 from miricigale.reduction.images.images import check_images, own_grid, with_data
-from miricigale.reduction.mosaic.mosaic import drizzle_images, pixel_map, weight_map
+from miricigale.reduction.mosaic.mosaic import drizzle_images, pixel_maps_of, weight_map
 from miricigale.reduction.mosaic.outliers import reject_outliers
 from miricigale.reduction.results import ReductionResult
 from miricigale.reduction.sky.background import (
@@ -42,7 +42,7 @@ def drizzle(settings, images, wcs, variances=()):
     images = list(images)
     check_images(images, wcs)
     weights = [weight_map(im) for im in images]
-    maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+    maps = pixel_maps_of(images, wcs)
     if settings.match_sky and len(images) > 1:
         images = match_levels(images, wcs, pixel_maps=maps)
     judged = all(ImageFacts.of(im).n_outliers is not None for im in images)

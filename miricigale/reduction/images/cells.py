@@ -1,6 +1,7 @@
 """Images in square cells of pixels."""
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 #: Pixels along a side of a cell.
 CELL = 4
@@ -13,6 +14,30 @@ def cells_of(values, weight=None, size=CELL):
     total = _added(np.where(weight, values, np.float32(0)), size)
     count = _added(weight.astype(np.uint8), size)
     return total / np.maximum(count, 1), count / np.float32(size**2)
+
+
+def smoothed_cells(cells, share, width):
+    """
+    Smooth cells so that their noise is the same everywhere, also where few cells count, as at the edge.
+
+    Parameters
+    ----------
+    cells, share : `~numpy.ndarray`, shape (ny, nx)
+        Mean of each cell and the share of it that counts, as `cells_of` returns them.
+    width : float
+        Sigma of the Gaussian, in cells.
+
+    Returns
+    -------
+    smooth : `~numpy.ndarray`, shape (ny, nx)
+        The smoothed image.
+    covered : bool `~numpy.ndarray`, shape (ny, nx)
+        Where enough cells count.
+    """
+    smooth = gaussian_filter(cells * share, width, mode="constant")
+    weight = gaussian_filter(share, width, mode="constant")
+    smooth /= np.sqrt(np.maximum(weight, 1e-3))
+    return smooth, (share >= 0.5) & (weight >= 0.3)
 
 
 def _added(values, size):

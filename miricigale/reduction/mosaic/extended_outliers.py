@@ -1,9 +1,9 @@
 """Faint light over many pixels that one dither has alone: afterglow of bright stars, and showers."""
 
 import numpy as np
-from scipy.ndimage import binary_propagation, gaussian_filter
+from scipy.ndimage import binary_propagation
 
-from miricigale.reduction.images.cells import cells_of, pixels_of
+from miricigale.reduction.images.cells import cells_of, pixels_of, smoothed_cells
 
 # sides of cells in pixels, the Gaussian width, in cells, by which they are smoothed, a factor on the threshold: an
 # afterglow is as wide as the image of a star, a shower some tens of pixels; where few pixels add up, errors
@@ -50,11 +50,7 @@ def extended_outliers(excess, good, threshold):
             share = good.astype(np.float32)
         else:
             cells, share = cells_of(values, good, size)
-        weight = gaussian_filter(share, width, mode="constant")
-        smooth = gaussian_filter(cells * share, width, mode="constant")
-        # of one noise also where few cells count, as at the edge
-        smooth /= np.sqrt(np.maximum(weight, 1e-3))
-        covered = (share >= 0.5) & (weight >= 0.3)
+        smooth, covered = smoothed_cells(cells, share, width)
         if np.count_nonzero(covered) < _LEAST:
             continue
         level, sigma = _lower_width(smooth[covered])

@@ -87,6 +87,11 @@ class Mosaic:
         return f"<Mosaic {ny} x {nx} pixels of {int(self.n_images.max())} images>"
 
 
+def pixel_maps_of(images, wcs):
+    """Return the `pixel_map` of each of some images on a grid."""
+    return [pixel_map(image.wcs, wcs, image.shape) for image in images]
+
+
 def pixel_map(wcs_in, wcs_out, shape):
     """
     Where the pixels of one image lie in another.
@@ -327,7 +332,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     check_that(0 < pixfrac <= 1, "pixfrac", "above 0 and at most 1", pixfrac)
     shape = tuple(map(int, wcs.pixel_shape[::-1]))
     if pixel_maps is None:
-        pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+        pixel_maps = pixel_maps_of(images, wcs)
     check_overlap(pixel_maps, shape)
     if weights is None:
         weights = [weight_map(im) for im in images]

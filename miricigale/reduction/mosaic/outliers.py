@@ -13,7 +13,7 @@ from miricigale.reduction.images.images import (
     sigma,
 )
 from miricigale.reduction.mosaic.extended_outliers import extended_outliers
-from miricigale.reduction.mosaic.mosaic import add_image, extent_of, pixel_map, weight_map
+from miricigale.reduction.mosaic.mosaic import add_image, extent_of, pixel_maps_of, weight_map
 from miricigale.utils.options import check_positive
 from miricigale.utils.parallel import chunks
 
@@ -104,7 +104,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     if weights is None:
         weights = [weight_map(im) for im in images]
     if pixel_maps is None:
-        pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+        pixel_maps = pixel_maps_of(images, wcs)
     median, count = _median_of(images, wcs, weights, pixel_maps)
     # where too few images overlap there is nothing to compare with
     judged = count >= 3

@@ -7,7 +7,7 @@ from scipy.ndimage import binary_dilation
 
 from miricigale.instrument import DQ
 from miricigale.reduction.images.images import check_images, own_grid, plain_mask, with_data
-from miricigale.reduction.mosaic.mosaic import drizzle_images, pixel_map
+from miricigale.reduction.mosaic.mosaic import drizzle_images, pixel_maps_of
 from miricigale.reduction.mosaic.outliers import nan_median
 from miricigale.reduction.sky.background import estimate_background, warn_of
 from miricigale.reduction.sky.sky_mesh import sky_boxes
@@ -149,7 +149,7 @@ def _deep_masks(images, backgrounds, wcs):
     check_images(images, wcs)
     pairs = zip(images, backgrounds, strict=True)
     flat = [with_data(im, im.data - background.level) for im, background in pairs]
-    maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+    maps = pixel_maps_of(images, wcs)
     mosaic = drizzle_images(flat, wcs, pixel_maps=maps).image
     sources = binary_dilation(
         estimate_background(mosaic, warn=False).source_mask, iterations=_WIDER

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, label
 from scipy.stats import norm
 
-from miricigale.reduction.images.cells import cells_of, pixels_of
+from miricigale.reduction.images.cells import cells_of, pixels_of, smoothed_cells
 
 # detection of what is masked: standard deviations of the smoothing in pixels (cores, and
 # the wings of bright sources), and the least number of connected pixels: those of the smoothing
@@ -49,11 +49,7 @@ def detect(residual, rms, mask, sources):
     sky = cells_of(sky) >= 0.5
     wide = np.zeros(share.shape, bool)
     for width, area, threshold in _WIDE_TIERS if sky.any() else ():
-        smooth = gaussian_filter(cells * share, width, mode="constant")
-        weight = gaussian_filter(share, width, mode="constant")
-        # of one noise also where few cells count, as at the edge
-        smooth /= np.sqrt(np.maximum(weight, 1e-3))
-        covered = (share >= 0.5) & (weight >= 0.3)
+        smooth, covered = smoothed_cells(cells, share, width)
         wide |= _risen(smooth, covered, sky & covered, threshold, area)
     detected |= pixels_of(wide, mask.shape)
     return detected & ~mask

@@ -3,7 +3,7 @@
 import numpy as np
 
 from miricigale.reduction.images.images import check_images, plain_mask, with_data
-from miricigale.reduction.mosaic.mosaic import pixel_map
+from miricigale.reduction.mosaic.mosaic import pixel_maps_of
 from miricigale.utils.named_values import without_none
 
 # pixels of the grid that are averaged before images are compared
@@ -73,7 +73,7 @@ def sky_offsets(images, wcs, *, pixel_maps=None):
     images = list(images)
     check_images(images, wcs)
     if pixel_maps is None:
-        pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+        pixel_maps = pixel_maps_of(images, wcs)
     means = []
     for im, pixels in zip(images, pixel_maps, strict=True):
         means.append(_means(im, pixels, wcs.pixel_shape[::-1]))
