@@ -91,6 +91,13 @@ def posterior_ranks(true, values, levels, *, seed=None):
     return np.where(good, ranks, np.nan)
 
 
+def interval_share(ranks, level=0.68):
+    """Share of finite ranks, and so of true values, in the central interval of a level."""
+    ranks = ranks[np.isfinite(ranks)]
+    inside = np.count_nonzero(np.abs(ranks - 0.5) <= 0.5 * level)
+    return fraction_interval(inside, ranks.size)[0]
+
+
 def coverage_table(ranks, *, levels=(0.68, 0.95)):
     """
     Share of true values within the central intervals of their posteriors.

@@ -64,17 +64,31 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     >>> table = read_catalog_photometry("egs.fits", "candels")  # doctest: +SKIP
     >>> table = read_catalog_photometry("mine.csv", units={"flux": "ABmag"})  # doctest: +SKIP
     """
-    catalog_map = as_catalog_map(catalog_map, options)
     path = Path(path)
-    table = read_table(path, wanted="a table", hdu=hdu, id_names=catalog_map.id_names)
-    with reading(path, "a catalog"):
-        _, lost = catalog_map.names(table.colnames, path.name)
-        table, coded = catalog_map.convert(table, path.name)
+    table, lost, coded = mapped_table(path, as_catalog_map(catalog_map, options), hdu)
     if "id" in table.colnames:
         warn_of_duplicates(table["id"], path.name, what="fits take the first row of each only")
     for text in catalog_messages(lost, [coded]):
         warn(f"{path.name}: {text}", CatalogWarning)
     return table
+
+
+def mapped_table(path, catalog_map, hdu=None):
+    """
+    Read a table under our names and in our units.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        The table.
+    lost, coded
+        What `catalog_messages` tells of: columns of bands without a filter, and numbers that stand for no value.
+    """
+    table = read_table(path, wanted="a table", hdu=hdu, id_names=catalog_map.id_names)
+    with reading(path, "a catalog"):
+        _, lost = catalog_map.names(table.colnames, path.name)
+        table, coded = catalog_map.convert(table, path.name)
+    return table, lost, coded
 
 
 def as_catalog_map(catalog_map, options=None):

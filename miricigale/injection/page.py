@@ -4,13 +4,12 @@ import numpy as np
 from astropy.stats import mad_std
 from astropy.table import Table
 
-from miricigale.injection.results import BINNED_BY, QUESTIONS
+from miricigale.injection.results import BINNED_BY, QUESTIONS, limit_columns, measured_values
 from miricigale.injection.trials import APART
 from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import new_figure
 from miricigale.utils.named_values import subset
 from miricigale.utils.package_tables import declared
-from miricigale.utils.units import FNU
 
 #: Colors and names of the two questions in figures.
 _LOOKS = {"detection": ("#c2410c", "detection"), "forced": ("#1d4ed8", "forced photometry")}
@@ -90,13 +89,7 @@ def _dicts(table):
 def _headline(result):
     row = {}
     for question in QUESTIONS:
-        curve = result.curve(question)
-        if curve is None:
-            row[f"limit_{question}"] = np.nan
-            row[f"limit_{question}_err"] = np.nan
-        else:
-            row[f"limit_{question}"] = curve.limit
-            row[f"limit_{question}_err"] = curve.limit_err
+        row |= limit_columns(question, result.curve(question))
     row |= result.errors()
     pulls = result.empty_pulls[np.isfinite(result.empty_pulls)]
     if len(pulls):
@@ -138,9 +131,7 @@ def _fluxes(result):
     figure, [[bias_axes, right]] = new_figure(1, 2, size=(5.0, 3.4))
     sources = result.sources
     magnitude = np.asarray(sources["magnitude"])
-    true = np.asarray(sources["flux_true"].to_value(FNU))
-    flux = np.asarray(sources["flux"].to_value(FNU))
-    error = np.asarray(sources["flux_err"].to_value(FNU))
+    true, flux, error = measured_values(sources)
     good = np.isfinite(flux) & (error > 0)
     bias_axes.plot(magnitude[good], (flux / true)[good], ".", ms=3, color="0.5")
     bias_axes.axhline(1.0, color="0.7", lw=0.8, ls=":")

@@ -199,16 +199,10 @@ class InjectionResult(Interactive):
             row[f"{column}_low"] = share_low
             row[f"{column}_high"] = share_high
         for question in QUESTIONS:
+            curve = None
             if limits:
                 curve = self._curve(question, member)
-            else:
-                curve = None
-            if curve is None:
-                row[f"limit_{question}"] = np.nan
-                row[f"limit_{question}_err"] = np.nan
-            else:
-                row[f"limit_{question}"] = curve.limit
-                row[f"limit_{question}_err"] = curve.limit_err
+            row |= limit_columns(question, curve)
         return row | _errors(sources[member])
 
     def purity(self, by="magnitude"):
@@ -344,6 +338,21 @@ def _classes(values, chosen):
             yield f"{low:.2f} - {high:.2f} arcsec", low, high, member
 
 
+def limit_columns(question, curve):
+    """The 50 % limit of a curve and its error; NaN without a curve."""
+    limit = np.nan
+    limit_err = np.nan
+    if curve is not None:
+        limit = curve.limit
+        limit_err = curve.limit_err
+    return {f"limit_{question}": limit, f"limit_{question}_err": limit_err}
+
+
+def measured_values(sources):
+    """True fluxes, fluxes and errors (uJy) of a table, as arrays."""
+    return [np.asarray(sources[name].to_value(FNU)) for name in ("flux_true", "flux", "flux_err")]
+
+
 def _neighbors(light, chosen):
     """On the free sky, and where another source has light."""
     on_source = light > _ON_SOURCE
@@ -364,9 +373,7 @@ def _share(values):
 
 def _errors(sources):
     """Bias and calibration of errors of some sources."""
-    true = np.asarray(sources["flux_true"].to_value(FNU))
-    flux = np.asarray(sources["flux"].to_value(FNU))
-    error = np.asarray(sources["flux_err"].to_value(FNU))
+    true, flux, error = measured_values(sources)
     measured = np.isfinite(flux) & (error > 0)
     pull = (flux[measured] - true[measured]) / error[measured]
     bright = measured & (true > _BRIGHT * error)

@@ -46,7 +46,7 @@ from miricigale.workflow.recorded_inputs import (
     inputs_from_text,
     inputs_text,
 )
-from miricigale.workflow.sections import RunBasics
+from miricigale.workflow.sections import RunBasics, memory_of
 
 #: Bytes of a process with the images of a field, for each pixel, beside those of its photometry.
 _BYTES = 60
@@ -61,12 +61,7 @@ class RunSection(RunBasics):
     name: str = option(
         "injection", "Name of the run; its folder unless --output is given.", folder=True
     )
-    memory: float = option(
-        0.0,
-        "Memory (GB) of trials side by side on a machine; 0 for half of all.",
-        low=0.0,
-        high=1e5,
-    )
+    memory: float = memory_of("trials")
 
 
 class InjectionSection(Section):

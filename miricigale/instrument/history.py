@@ -179,6 +179,14 @@ def _middle_of(header):
 _MIDDLES = ("MJD-AVG", "MJD-MID", "EXPMID", "EXPSTART", "MJD-OBS", "MJD-BEG")
 
 
+def keyword_values(meta):
+    """Values of the keywords that the meta dictionary of an image keeps, without their comments."""
+    values = {}
+    for name, card in meta.get("keywords", {}).items():
+        values[name] = card[0] if isinstance(card, list) else card
+    return values
+
+
 def epoch_of(image):
     """
     When an image was taken.
@@ -203,13 +211,7 @@ def epoch_of(image):
     2024-01-01 00:00:00.000
     """
     meta = getattr(image, "meta", None) or {}
-    keywords = meta.get("keywords", {})
-    header = {}
-    for name, card in keywords.items():
-        if isinstance(card, list):
-            header[name] = card[0]
-        else:
-            header[name] = card
+    header = keyword_values(meta)
     days = [header.get(name) for name in _MIDDLES[:3]]
     days += [meta.get("day"), *map(header.get, _MIDDLES[3:])]
     wcs = getattr(getattr(image, "wcs", None), "wcs", None)

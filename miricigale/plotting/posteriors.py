@@ -311,16 +311,7 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
         rows = [(nu * band).to_value(u.W) for band in bands]
     else:
         rows = [_value(band, u.uJy) for band in bands]
-    style = {"color": color, "linewidth": 0, "alpha": 0.3, **kwargs}
-    n = len(rows)
-    for i in range(n // 2):
-        if i == 0 and n % 2 == 0:
-            text = label
-        else:
-            text = None
-        ax.fill_between(x, rows[i], rows[n - 1 - i], label=text, **style)
-    if n % 2:
-        ax.plot(x, rows[n // 2], color=color, linewidth=1, label=label)
+    _draw_levels(ax, x, rows, color, label, kwargs)
     top = max(float(np.max(row)) for row in rows)
     if rest:
         labels = {"xlabel": "rest wavelength (µm)", "ylabel": r"$\nu L_\nu$ (W)"}
@@ -330,6 +321,18 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
     if top > 0:
         ax.set_ylim(1e-5 * top, 3.0 * top)
     return ax
+
+
+def _draw_levels(ax, x, rows, color, label, options):
+    """Draw pairs of percentiles as bands and a middle one as a line; it or the widest band has the label."""
+    style = {"color": color, "linewidth": 0, "alpha": 0.3, **options}
+    n = len(rows)
+    has_line = n % 2 == 1
+    for i in range(n // 2):
+        band_label = label if i == 0 and not has_line else None
+        ax.fill_between(x, rows[i], rows[n - 1 - i], label=band_label, **style)
+    if has_line:
+        ax.plot(x, rows[n // 2], color=color, linewidth=1, label=label)
 
 
 def plot_history(lookback, bands, *, ax=None, color="tab:blue", label=None, **kwargs):
@@ -358,12 +361,7 @@ def plot_history(lookback, bands, *, ax=None, color="tab:blue", label=None, **kw
     ax = resolve_axes(ax)
     x = _value(lookback, u.Gyr)
     rows = [_value(band, u.Msun / u.yr) for band in bands]
-    n = len(rows)
-    style = {"color": color, "linewidth": 0, "alpha": 0.3, **kwargs}
-    for i in range(n // 2):
-        ax.fill_between(x, rows[i], rows[n - 1 - i], **style)
-    if n % 2:
-        ax.plot(x, rows[n // 2], color=color, linewidth=1, label=label)
+    _draw_levels(ax, x, rows, color, label, kwargs)
     ax.set(xlabel="lookback time (Gyr)", ylabel="star-formation rate (Msun / yr)")
     ax.set(xlim=(0, None), ylim=(0, None))
     return ax

@@ -6,13 +6,12 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters import Filter
-from miricigale.filters.catalog_files import as_catalog_map, catalog_messages
+from miricigale.filters.catalog_files import as_catalog_map, catalog_messages, mapped_table
 from miricigale.filters.surveys import flux_bands
 from miricigale.refdata import locate, resources
 from miricigale.scene.catalog import CatalogFlags, check_catalog
 from miricigale.utils.exceptions import CatalogWarning, DataError, warn
 from miricigale.utils.files import reading, split_extension
-from miricigale.utils.table_files import read_table
 from miricigale.utils.units import ab_magnitude
 
 #: Counts of galaxies in K: AB magnitude and log of the number per magnitude and square degree (Weaver et
@@ -82,11 +81,8 @@ def read_catalog(path, catalog_map=None, **options):
         catalogs = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
         msg = f"no catalog {name!r}: neither a file nor one of {catalogs}"
         raise DataError(msg)
-    catalog_map = as_catalog_map(catalog_map, options)
-    table = read_table(path, wanted="a table", id_names=catalog_map.id_names)
+    table, lost, coded = mapped_table(path, as_catalog_map(catalog_map, options))
     with reading(path, "a catalog"):
-        _, lost = catalog_map.names(table.colnames, path.name)
-        table, coded = catalog_map.convert(table, path.name)
         _flags_of_stars(table)
         catalog = check_catalog(table, argument=path.name)
     texts = list(catalog_messages(lost, [coded]))

@@ -154,6 +154,10 @@ class Chain:
         """Values of all parameters of a role, or of several, as a tuple."""
         return tuple(map(values.get, self.names(roles)))
 
+    def keys(self, rows, roles):
+        """The `key` of each of some rows, dicts of all parameters."""
+        return [self.key(row, roles) for row in rows]
+
     def _dict(self, key, roles):
         """Values of a `key` by the names of the parameters."""
         return dict(zip(self.names(roles), key, strict=True))

@@ -144,9 +144,9 @@ def _factors(model, grid, index):
     galaxies, galaxy = np.unique(index[:, 1], return_inverse=True)
     models, agn = np.unique(index[:, 2], return_inverse=True)
     rows = [row_values(model, grid.galaxy_parameters, g) for g in galaxies.tolist()]
-    stars, history_of_row = chain.stars([chain.key(row, STELLAR) for row in rows])
-    dims = [chain.key(row, "attenuation") for row in rows]
-    dusts = [chain.key(row, "dust") for row in rows]
+    stars, history_of_row = chain.stars(chain.keys(rows, STELLAR))
+    dims = chain.keys(rows, "attenuation")
+    dusts = chain.keys(rows, "dust")
     light, absorbed = chain.attenuated(stars, history_of_row, dims, dusts)
     for i, row in enumerate(rows):
         if (excess := row.get("dust_excess", 1.0)) != 1.0:

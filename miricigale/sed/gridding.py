@@ -91,9 +91,9 @@ class Galaxies:
     def __init__(self, model, rows):
         chain = self.chain = model.chain
         excess = [row.get("dust_excess", 1.0) for row in rows]
-        self.stars, self.star_rows = chain.stars([chain.key(row, STELLAR) for row in rows])
-        dims = [chain.key(row, "attenuation") for row in rows]
-        dusts = [chain.key(row, "dust") for row in rows]
+        self.stars, self.star_rows = chain.stars(chain.keys(rows, STELLAR))
+        dims = chain.keys(rows, "attenuation")
+        dusts = chain.keys(rows, "dust")
         # many galaxies: their spectra are in memory once
         pairs, self.light_rows = distinct(zip(self.star_rows.tolist(), dims, strict=True))
         self.starlight = np.empty((len(pairs), chain.wave.size))

@@ -294,15 +294,20 @@ def sky_with_motions(table, sky, columns, argument):
     return SkyCoord(sky.ra, sky.dec, obstime=Time(years, format="jyear"), **motions)
 
 
+def _known_floats(column, name, argument):
+    """Values of a column as floats, NaN where it has none, infinity or a number that stands for no value."""
+    values = plain_floats(column, name, argument)
+    values[without_codes(values)[0] | np.isinf(values)] = np.nan
+    return values
+
+
 def _motion(table, name, argument):
     """Proper motions, mas / yr, NaN where they are missing."""
     column = table[name]
     unit = u.Unit(getattr(column, "unit", None) or _MOTION)
     if not unit.is_equivalent(_MOTION):
         raise units_error(argument, "a proper motion", unit, column=name)
-    values = plain_floats(column, name, argument)
-    values[without_codes(values)[0] | np.isinf(values)] = np.nan
-    return values * unit.to(_MOTION)
+    return _known_floats(column, name, argument) * unit.to(_MOTION)
 
 
 def _plain_years(column, name, argument):
@@ -374,9 +379,7 @@ def _degrees(table, name, text_unit, argument):
         raise units_error(argument, "an angle", unit, column=name)
     if column.dtype.kind in "OSU" and _is_sexagesimal(column):
         return _of_text(column, name, text_unit, argument)
-    values = plain_floats(column, name, argument)
-    values[without_codes(values)[0] | np.isinf(values)] = np.nan
-    return values * u.Unit(unit).to(u.deg)
+    return _known_floats(column, name, argument) * u.Unit(unit).to(u.deg)
 
 
 def _texts(column):

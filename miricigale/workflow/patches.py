@@ -42,7 +42,7 @@ from miricigale.workflow.recorded_inputs import (
     inputs_from_text,
     inputs_text,
 )
-from miricigale.workflow.sections import RunBasics
+from miricigale.workflow.sections import RunBasics, memory_of
 
 #: Most bytes that a patch may take.
 _MAX_PATCH_BYTES = 2_000_000_000
@@ -56,12 +56,7 @@ class RunSection(RunBasics):
     name: str = option(
         "patches", "Name of the run; its folder unless --output is given.", folder=True
     )
-    memory: float = option(
-        0.0,
-        "Memory (GB) of patches side by side on a machine; 0 for half of all.",
-        low=0.0,
-        high=1e5,
-    )
+    memory: float = memory_of("patches")
 
 
 class FilesSection(Section):

@@ -22,12 +22,16 @@ class RunBasics(Section):
     threads: int = option(0, "Threads; 0 for as many as there are cores.", low=0, high=10000)
 
 
+def memory_of(what):
+    """The option of a run that limits the memory of pieces of its work."""
+    text = f"Memory (GB) of {what} side by side on a machine; 0 for half of all."
+    return option(0.0, text, low=0.0, high=1e5)
+
+
 class RunSection(RunBasics):
     """What the run is called and how it goes."""
 
-    memory: float = option(
-        0.0, "Memory (GB) of steps side by side on a machine; 0 for half of all.", low=0.0, high=1e5
-    )
+    memory: float = memory_of("steps")
     keep_level1b: bool = option(
         False,
         "Whether the level-1b (uncal) files are kept.",

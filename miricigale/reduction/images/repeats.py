@@ -7,7 +7,7 @@ import json
 import numpy as np
 
 from miricigale.instrument import ExposureHistory, joined_header
-from miricigale.instrument.history import ORIGIN
+from miricigale.instrument.history import ORIGIN, keyword_values
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import open_fits
 
@@ -90,14 +90,7 @@ class ExposureRecord:
         data = getattr(exposure, "data", None)
         if data is None or np.ndim(data) < 2:
             return
-        meta = getattr(exposure, "meta", None) or {}
-        keywords = meta.get("keywords", {})
-        header = {}
-        for key, card in keywords.items():
-            if isinstance(card, list):
-                header[key] = card[0]
-            else:
-                header[key] = card
+        header = keyword_values(getattr(exposure, "meta", None) or {})
         if getattr(exposure, "observed", False):
             header = exposure.header
         if ExposureHistory.of(exposure).origin != "other":

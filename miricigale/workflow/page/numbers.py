@@ -14,6 +14,7 @@ from miricigale.evaluation import (
     recovery_metrics,
     sigma_mad,
 )
+from miricigale.evaluation.coverage import interval_share
 from miricigale.instrument import CEERS_FILTERS, ceers_exposures
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.stages.conditions import (
@@ -363,10 +364,8 @@ def truth_metrics(truth, tables, numbers, bands, seed):
         rank = np.empty(0)
         if len(table):
             rank = true_ranks(tables.results[unit], sample, "redshift", seed)
-        rank = rank[np.isfinite(rank)]
-        inside = np.count_nonzero(np.abs(rank - 0.5) <= 0.34)
         # as in the table of the coverage of all parameters
-        fit["redshift_coverage"] = fraction_interval(inside, rank.size)[0]
+        fit["redshift_coverage"] = interval_share(rank)
         fit["conditions"] = fit_conditions(matched, sample["redshift"], table, bands)
         fits[unit] = fit
     return {**truth.values(), "n_sample": len(sample), "fits": fits}

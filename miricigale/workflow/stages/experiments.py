@@ -3,7 +3,8 @@
 import numpy as np
 
 from miricigale import photometry, sed
-from miricigale.evaluation import fraction_interval, photoz_metrics, recovery_metrics
+from miricigale.evaluation import photoz_metrics, recovery_metrics
+from miricigale.evaluation.coverage import interval_share
 from miricigale.fitting import GridSettings
 from miricigale.photometry.errors.error_model import HERSCHEL_DEPTHS
 from miricigale.utils.named_values import convert_values
@@ -170,7 +171,5 @@ def experiment_numbers(sample, table):
         numbers["photoz_outliers"] = np.nan
     for name in RANKED:
         rank = np.asarray(table[f"{name}_rank"], float)
-        rank = rank[np.isfinite(rank)]
-        inside = np.count_nonzero(np.abs(rank - 0.5) <= 0.34)
-        numbers[f"{name}_coverage"] = fraction_interval(inside, rank.size)[0]
+        numbers[f"{name}_coverage"] = interval_share(rank)
     return numbers
