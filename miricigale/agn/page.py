@@ -7,6 +7,7 @@ from miricigale.agn.numbers import FLOOR
 from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.utils.package_tables import declared
+from miricigale.utils.tables import row_dicts
 
 #: Colors of the measured prior, and of the prior of the fits.
 _MEASURED, _SHIPPED = "#1d4ed8", "#c2410c"
@@ -54,8 +55,7 @@ def write_page(result, path, name):
 
 def _rows(table):
     """Rows as dictionaries, with the edges of their bins as text."""
-    unitless = Table(table)
-    rows = [dict(zip(unitless.colnames, row, strict=True)) for row in unitless]
+    rows = row_dicts(Table(table))
     for row in rows:
         for name in ("redshift", "log_luminosity", "frac_agn"):
             if f"{name}_low" in row:

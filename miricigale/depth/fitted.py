@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 import scipy.fft
+from astropy.stats import gaussian_sigma_to_fwhm
 from scipy.ndimage import gaussian_filter
 
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
@@ -11,7 +12,7 @@ from miricigale.instrument import frame_time as read_time
 from miricigale.psf import MIRI_PIXEL_SCALE, instrument_psf, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
-from miricigale.utils.units import ANGLE, check_count, positive, to_array
+from miricigale.utils.units import ANGLE, check_count, positive, scalar
 
 #: Factors on the noise of the sky by name: what surveys in flight lose against an ideal fit, and nothing.
 EXCESS = {"flight": 1.4, "ideal": 1.0}
@@ -143,7 +144,7 @@ def fitted_noise(
     for name, value in (("n_integrations", n_integrations), ("n_dithers", n_dithers)):
         check_that(int(value) == value and value >= 1, name, "an integer of at least 1", value)
     n_frames = check_count(n_frames, "n_frames")
-    step = n_frames * float(to_array(frame_time, u.s, "frame_time"))
+    step = n_frames * scalar(frame_time, u.s, "frame_time")
     n_groups = int(seconds / n_integrations / step * (1 + 1e-9))
     group = "frames" if n_frames == 1 else "groups"
     wanted = f"at least two {group} of {step} s in each integration"
@@ -200,7 +201,7 @@ def psf_of(psf, filter, *, with_pixel=True):
 
 
 def _pixels(angle, name):
-    value = float(to_array(angle, ANGLE, name)) / u.Quantity(MIRI_PIXEL_SCALE, ANGLE).value
+    value = scalar(angle, ANGLE, name) / u.Quantity(MIRI_PIXEL_SCALE, ANGLE).value
     check_that(0 < value < 5, name, "positive and below 0.5 arcsec", angle)
     return value
 
@@ -214,9 +215,9 @@ def _share(filter, psf, size):
     else:
         psf = psf_of(psf, filter, with_pixel=False)
     share = psf_image(psf, pixel_scale=pixel, shape=n + 1 - n % 2) * _SAMPLES**2
-    width = float(to_array(size, ANGLE, "size"))
+    width = scalar(size, ANGLE, "size")
     check_that(width >= 0, "size", "at least 0", size)
-    width = width / np.sqrt(8 * np.log(2)) / pixel.value
+    width = width / gaussian_sigma_to_fwhm / pixel.value
     if width > 0:
         return gaussian_filter(share, width)
     return share

@@ -15,7 +15,7 @@ from miricigale.instrument import Exposure, frame_time, frames_per_group, imager
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
-from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, to_array
+from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, scalar, to_array
 
 # positions of the source's center within the pixel, per axis, over which is averaged
 _PHASES = (np.arange(4) + 0.5) / 4 - 0.5
@@ -45,7 +45,7 @@ def _radii(aperture, annulus, setup):
         radius = setup.radius
     else:
         radius = aperture
-    radius = float(to_array(radius, ANGLE, "aperture", ndim=0, finite=True))
+    radius = scalar(radius, ANGLE, "aperture")
     check_that(0 < radius < 8, "aperture", "between 0 and 8 arcsec", aperture)
     if annulus is None:
         return radius, None
@@ -169,7 +169,7 @@ def aperture_noise(
     filter = setup.filter  # with the instrument's name, if that was left out
     radius, edges = _radii(aperture, annulus, setup)
     amplitude = pattern_amplitude(residual, filter)
-    seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
+    seconds = scalar(time, TIME, "time")
     groups = setup.n_groups if n_groups is None else n_groups
     n_frames = frames_per_group(readout)
     step = n_frames * frame_time(readout, subarray).to_value(TIME)
@@ -312,7 +312,7 @@ def sensitivity(
     form = {name: options.pop(name) for name in names if name in options}
     options |= _ramps(filter, time, n_dithers, **form) | {"n_dithers": n_dithers}
     step = options["n_frames"] * options["frame_time"].to_value(TIME)
-    seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
+    seconds = scalar(time, TIME, "time")
     noise = ExposureNoise(
         filter=filter,
         background=options.get("background"),
@@ -348,7 +348,7 @@ def _ramps(filter, time, n_dithers, *, n_groups=None, readout="FASTR1", subarray
     frame = frame_time(readout, subarray)
     n_frames = frames_per_group(readout)
     step = n_frames * frame.to_value(TIME)
-    seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
+    seconds = scalar(time, TIME, "time")
     _check_time(time, n_groups, step)
     return {
         "n_integrations": round(seconds / (n_groups * step)),
@@ -401,7 +401,7 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=5
         names = imager_filters()
     else:
         names = list(filters)
-    seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
+    seconds = scalar(time, TIME, "time")
     rows = []
     for name in names:
         noise = aperture_noise(name, time, n_sigma=n_sigma, residual=residual, **options)

@@ -19,7 +19,7 @@ from miricigale.psf import MIRI_PIXEL_SCALE
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_kind, check_that
-from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import SURFACE_BRIGHTNESS, scalar
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ class ExposureNoise:
             level = background_level(self.filter)
         else:
             level = self.background
-        value = float(to_array(level, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True))
+        value = scalar(level, SURFACE_BRIGHTNESS, "background")
         check_that(value >= 0, "background", "at least 0", self.background)
         self.__dict__.update(detector=detector, background=value * SURFACE_BRIGHTNESS)
 
@@ -185,7 +185,7 @@ def pattern_amplitude(residual, filter):
         return 0.0
     if isinstance(residual, str):
         return residual_amplitude(filter, residual)
-    value = float(to_array(residual, u.dimensionless_unscaled, "residual", ndim=0))
+    value = scalar(residual, u.dimensionless_unscaled, "residual")
     if residual is True or not 0 <= value < 0.2:
         raise argument_error("residual", "None, a name or a fraction from 0 to 0.2", residual)
     return value

@@ -14,7 +14,7 @@ from miricigale.utils.caching import cached
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.positions import as_position
-from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import SURFACE_BRIGHTNESS, scalar
 
 #: Angles from the Sun, deg, between which the telescope may look.
 _FIELD_OF_REGARD = (85.0, 135.0)
@@ -138,7 +138,7 @@ def sky_background(filter, level="low", *, position=None, date=None):
     """
     if isinstance(level, u.Quantity):
         filter_row(filter)
-        value = float(to_array(level, SURFACE_BRIGHTNESS, "level", ndim=0, finite=True))
+        value = scalar(level, SURFACE_BRIGHTNESS, "level")
         check_that(value >= 0, "level", "at least 0", level)
         for name, argument in (("position", position), ("date", date)):
             check_that(argument is None, name, "left out with a surface brightness", argument)

@@ -9,7 +9,7 @@ from miricigale.detector.ramp import Ramp
 from miricigale.instrument import DQ, aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
-from miricigale.utils.units import TIME, Frozen, frozen_array, to_array
+from miricigale.utils.units import TIME, Frozen, frozen_array, scalar, to_array
 
 # pixels of a ramp without information on the light
 _NO_LIGHT = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
@@ -73,7 +73,7 @@ class Latent(Frozen):
         rate = to_array(self.rate, unit, "rate", ndim=2, finite=True)
         if np.any(rate < 0):
             raise argument_error("rate", "nowhere negative", rate.min())
-        gap = float(to_array(self.gap, TIME, "gap", ndim=0, finite=True))
+        gap = scalar(self.gap, TIME, "gap")
         check_that(gap >= 0, "gap", "at least 0 s", self.gap)
         rate = u.Quantity(frozen_array(rate), unit, copy=False)
         if self.saturated is None:
@@ -130,7 +130,7 @@ class Latent(Frozen):
         -------
         latent : `Latent`
         """
-        step = float(to_array(time, TIME, "time", ndim=0, finite=True))
+        step = scalar(time, TIME, "time")
         return dataclasses.replace(self, gap=self.gap + step * TIME)
 
     def __repr__(self):

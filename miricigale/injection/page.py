@@ -10,6 +10,7 @@ from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import new_figure
 from miricigale.utils.named_values import subset
 from miricigale.utils.package_tables import declared
+from miricigale.utils.tables import row_dicts
 
 #: Colors and names of the two questions in figures.
 _LOOKS = {"detection": ("#c2410c", "detection"), "forced": ("#1d4ed8", "forced photometry")}
@@ -61,14 +62,14 @@ def write_page(path, result, name, *, in_ramps=False):
     page.figure("map", _map(result))
     page.section("recovery")
     for by in BINNED_BY:
-        page.table("table", _dicts(result.recovery(by)), by=_HEADS[by])
+        page.table("table", row_dicts(Table(result.recovery(by))), by=_HEADS[by])
     page.section("purity")
     for by in BINNED_BY:
         if by == "size":
             head = "size (arcsec, rms)"
         else:
             head = _HEADS[by]
-        page.table("table", _dicts(result.purity(by)), by=head)
+        page.table("table", row_dicts(Table(result.purity(by))), by=head)
     has_catalog = np.any(np.asarray(result.sources["row"]) >= 0)
     if has_catalog:
         drawn = "those of the catalog"
@@ -80,10 +81,6 @@ def write_page(path, result, name, *, in_ramps=False):
         noise = "it has no photon noise of its own"
     page.section("method", drawn=drawn, apart=f"{APART:g}", noise=noise)
     report.write(path, overwrite=True)
-
-
-def _dicts(table):
-    return [dict(zip(table.colnames, row, strict=True)) for row in Table(table)]
 
 
 def _headline(result):

@@ -3,6 +3,7 @@
 import numpy as np
 
 from miricigale.instrument.dq import DQ
+from miricigale.instrument.keywords import keyword_text
 from miricigale.utils.exceptions import PhotometryWarning, warn
 
 #: Instruments of JWST, of which cut-outs often lost TELESCOP.
@@ -58,16 +59,16 @@ def bad_pixels(values, header, get, path):
         names = [name for name in _BAD_PLANES if name in planes]
         bits = sum(1 << planes[name] for name in names)
         return values & bits != 0, f"planes {', '.join(names)}"
-    telescope = str(get("TELESCOP") or "").strip().upper()
-    instrument = str(get("INSTRUME") or "").strip().upper()
-    scheme_name = str(header.get("DQSCHEME", "")).strip().upper()
+    telescope = keyword_text(get, "TELESCOP")
+    instrument = keyword_text(get, "INSTRUME")
+    scheme_name = keyword_text(header.get, "DQSCHEME")
     if "JWST" in (telescope, scheme_name) or (not telescope and instrument in _JWST_INSTRUMENTS):
         return values & int(DQ.DO_NOT_USE) != 0, "bit DO_NOT_USE of JWST"
     if telescope == "HST":
-        detector = str(get("DETECTOR") or "").strip().upper()
+        detector = keyword_text(get, "DETECTOR")
         if instrument == "WFC3" and not detector:
             # filters of the two channels have other names: F160W, F606W
-            is_infrared = str(get("FILTER") or "").strip().upper().startswith(("F0", "F1", "G1"))
+            is_infrared = keyword_text(get, "FILTER").startswith(("F0", "F1", "G1"))
             if is_infrared:
                 detector = "IR"
             else:

@@ -18,7 +18,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.positions import as_position
-from miricigale.utils.units import check_count, to_array
+from miricigale.utils.units import check_count, scalar
 
 
 def readout_patterns():
@@ -93,7 +93,7 @@ def frame_time(readout="FASTR1", subarray="FULL"):
 
 def _counts_of(filter, time, group, n_integrations, max_fill=0.6, max_groups=100):
     """Groups and integrations whose time is nearest to the wanted one; the integrations may be given."""
-    seconds = float(to_array(time, u.s, "time", ndim=0, finite=True))
+    seconds = scalar(time, u.s, "time")
     groups = round(seconds / group.value)
     check_that(groups >= 2, "time", f"at least two groups of {group}", time)
     choices = [n_integrations]
@@ -201,7 +201,7 @@ class Exposure(Interactive):
             pointing = as_position(pointing, "pointing")
             if roll is None:
                 roll = 0.0 * u.deg
-            roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True)) % 360 * u.deg
+            roll = scalar(roll, u.deg, "roll") % 360 * u.deg
         elif roll is not None:
             raise argument_error("pointing", "given where 'roll' is", "None")
         values = {"filter": filter, "readout": readout, "subarray": subarray, **counts}

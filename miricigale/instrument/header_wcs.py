@@ -8,6 +8,7 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.instrument.asdf_extension import asdf_wcs, read_gwcs
+from miricigale.instrument.keywords import keyword_text
 from miricigale.utils.exceptions import PhotometryWarning, data_error, warn
 from miricigale.utils.options import check_that
 
@@ -216,7 +217,7 @@ def check_kind_of_exposure(get, path):
     `~miricigale.utils.exceptions.DataError`
         If EXP_TYPE says so.
     """
-    kind = str(get("EXP_TYPE") or "").strip().upper()
+    kind = keyword_text(get, "EXP_TYPE")
     if get("TELESCOP") not in ("JWST", None) or kind in ("", "N/A", "ANY"):
         return
     if _KIND_OF_JWST.match(kind) and not kind.endswith("IMAGE"):

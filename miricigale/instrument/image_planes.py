@@ -3,6 +3,7 @@
 import numpy as np
 from astropy.nddata import StdDevUncertainty
 
+from miricigale.instrument.keywords import keyword_text
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.options import check_data
 
@@ -178,7 +179,7 @@ def noise_kind(hdu):
     `~miricigale.utils.exceptions.DataError`
         If UTYPE is one of an unknown uncertainty.
     """
-    kind_name = str(hdu.header.get("UTYPE", "")).strip().upper()
+    kind_name = keyword_text(hdu.header.get, "UTYPE")
     if kind_name in _UTYPES:
         return _UTYPES[kind_name]
     if kind_name.endswith("UNCERTAINTY"):

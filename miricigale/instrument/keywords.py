@@ -59,9 +59,14 @@ def steps_done(header):
     """
     done = []
     for keyword, step in STEPS.items():
-        if str(header.get(keyword, "")).strip().upper() == "COMPLETE":
+        if keyword_text(header.get, keyword) == "COMPLETE":
             done.append(step)
     return frozenset(done)
+
+
+def keyword_text(get, keyword):
+    """Value of a keyword (``get(keyword)``) as text in upper case; empty without one."""
+    return str(get(keyword) or "").strip().upper()
 
 
 def joined_header(hdus, name="SCI"):

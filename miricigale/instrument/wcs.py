@@ -17,7 +17,7 @@ from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_position
-from miricigale.utils.units import positive, to_array
+from miricigale.utils.units import positive, scalar, to_array
 
 _SIP_ORDER = 5
 _SIP_INVERSE_ORDER = 8
@@ -58,7 +58,7 @@ def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
     '53.100 -27.800'
     """
     ra, dec = _radec(pointing, "pointing")
-    roll = float(to_array(roll, u.deg, "roll", ndim=0))
+    roll = scalar(roll, u.deg, "roll")
     part = aperture(subarray)
     # the reference through the polynomial, so that it looks exactly at the pointing
     v2, v3 = pixel_to_v2v3(*part.reference, subarray=subarray)
@@ -155,7 +155,7 @@ def imager_wcs(pointing, roll, *, subarray="FULL"):
     '53.100 -27.800'
     """
     ra, dec = _radec(pointing, "pointing")
-    roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True))
+    roll = scalar(roll, u.deg, "roll")
     from astropy.wcs import Sip
 
     part = aperture(subarray)
@@ -216,7 +216,7 @@ def tangent_offset(pointing, x_offset, y_offset, pa):
     ra, dec = map(np.radians, _radec(pointing, "pointing"))
     x = to_array(x_offset, u.rad, "x_offset")
     y = to_array(y_offset, u.rad, "y_offset")
-    pa = float(to_array(pa, u.rad, "pa", ndim=0))
+    pa = scalar(pa, u.rad, "pa")
     east = -x * np.cos(pa) + y * np.sin(pa)
     north = x * np.sin(pa) + y * np.cos(pa)
     radial = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])

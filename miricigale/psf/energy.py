@@ -13,7 +13,7 @@ from miricigale.psf.model import enclosed_light, instrument_psf
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_rows
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, scalar
 
 
 def encircled_energy(psf, radius, *, pixel_scale=None):
@@ -51,7 +51,7 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
     psf = instrument_psf(psf)
     data = psf.data
     if pixel_scale is not None:
-        scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+        scale = scalar(pixel_scale, ANGLE, "pixel_scale")
         # sums over cells take them as constant too
         width = math.sqrt(max(scale**2 - psf.cell**2, 0.0)) / psf.pixel_scale.value
         form = {"oversampling": psf.n_cells, "pixel": False}

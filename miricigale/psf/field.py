@@ -10,6 +10,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
 from miricigale.utils.options import check_that
+from miricigale.utils.positions import middle_pixel
 
 
 def psf_grid(psfs, positions):
@@ -56,8 +57,7 @@ def psf_grid(psfs, positions):
         raise argument_error("positions", "each point of a rectangular grid", positions.tolist())
     psfs = alike(psfs, ("oversampling", "frame", "angle", "includes"))
     for i, psf in enumerate(psfs):
-        ny, nx = psf.data.shape
-        if not np.allclose(psf.origin, ((nx - 1) / 2, (ny - 1) / 2)):
+        if not np.allclose(psf.origin, middle_pixel(psf.data.shape)):
             raise argument_error("psfs", "centered on the middle", f"{psf.origin} (psfs[{i}])")
     return PSFGrid(psfs, positions)
 

@@ -16,7 +16,7 @@ from miricigale.utils.file_formats import register
 from miricigale.utils.files import file_place, open_fits, split_extension
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.store import open_parts, write_parts
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, scalar
 
 #: Units of an `InstrumentPSF`'s quantities in files.
 _UNITS = {"pixel_scale": ANGLE, "angle": u.deg, "pa_aper": u.deg}
@@ -144,7 +144,7 @@ class PSFFile:
             if in_header is None:
                 return None
             return in_header * ANGLE
-        scale = float(to_array(user_scale, ANGLE, argument))
+        scale = scalar(user_scale, ANGLE, argument)
         if in_header is not None and abs(scale / in_header - 1) > _SAME_SCALE:
             wanted = f"{in_header:.4g} arcsec, as the header of {self.path} says"
             if oversampling > 1:
@@ -177,7 +177,7 @@ class PSFFile:
             if self.turn is None:
                 return None
             return self.turn * u.deg
-        angle = float(to_array(user_angle, u.deg, argument, finite=True))
+        angle = scalar(user_angle, u.deg, argument)
         if self.turn is not None and abs((angle - self.turn + 180) % 360 - 180) > 0.5:
             wanted = f"{self.turn:.4g} deg, as the header of {self.path} says"
             raise argument_error(argument, wanted, user_angle)

@@ -14,7 +14,7 @@ from miricigale.psf.optics import hst_pupil, polychromatic_psf
 from miricigale.psf.telescope import band_quantiles, checked_grid, odd_cells
 from miricigale.utils.caching import cached
 from miricigale.utils.options import check_that
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, scalar
 
 WFC3_FILTERS = ("wfc3.f105w", "wfc3.f125w", "wfc3.f140w", "wfc3.f160w")
 
@@ -108,11 +108,11 @@ def hst_psf(
     """
     name = known_filter(filter, WFC3_FILTERS, "PSF for the filter")
     oversampling, width = checked_grid(oversampling, fov, 10.0)
-    scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+    scale = scalar(pixel_scale, ANGLE, "pixel_scale")
     sigma = _hst_blur(scale)
     cell = scale / oversampling
     # vanes at 45 deg to +y; on the sky an angle east of north is counter-clockwise
-    turn = float(to_array(angle, u.deg, "angle"))
+    turn = scalar(angle, u.deg, "angle")
     data = _hst_optics(name, cell, odd_cells(width, cell), (45.0 + turn) % 360.0)
     data = _hst_blurred(data, oversampling, scale, sigma) * oversampling**2
     form = {

@@ -16,7 +16,7 @@ from miricigale.psf.wiener import checked_square, gaussian_gain
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.files import split_extension
 from miricigale.utils.options import check_that
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, scalar
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def psf_pair(
     half = min((psfs[k].half_width - 0.5 * scale for k in arrays), default=psfs["lo"].half_width)
     n = 2 * int(half / scale + 1e-6) + 1
     if extent is not None:
-        wanted = 2 * int(float(to_array(extent, ANGLE, "extent")) / scale / 2) + 1
+        wanted = 2 * int(scalar(extent, ANGLE, "extent") / scale / 2) + 1
         text = f"from 5 pixels to the {n * scale:.4g} arcsec of the PSFs"
         check_that(5 <= wanted <= n, "extent", text, extent)
         n = wanted

@@ -16,7 +16,7 @@ from miricigale.utils.file_formats import register
 from miricigale.utils.files import file_place, open_fits, replacing, write_fits
 from miricigale.utils.meta import plain_value
 from miricigale.utils.store import native, open_parts, write_parts
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, scalar
 
 #: Arrays of a `MatchingKernel` in files.
 _ARRAYS = ("array", "source", "target")
@@ -115,7 +115,7 @@ def _check_pixel(path, cell, pixel_scale):
     """Refuse a kernel whose pixel in arcsec is not that of the image that it is for."""
     if pixel_scale is None or cell is None:
         return
-    scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+    scale = scalar(pixel_scale, ANGLE, "pixel_scale")
     if abs(cell / scale - 1) > 0.02:
         msg = (
             f"is a kernel for pixels of {cell:.4g} arcsec, and those of the image that it is for "

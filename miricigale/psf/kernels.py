@@ -19,7 +19,7 @@ from miricigale.utils.file_formats import read_write
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_choice, check_that
-from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
+from miricigale.utils.units import ANGLE, frozen_array, positive, scalar, to_array
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -203,7 +203,7 @@ class MatchingKernel(Interactive):
             pixel_scale = getattr(hi, "pixel_scale", None)
         if pixel_scale is None:
             raise argument_error("pixel_scale", "given where 'hi' does not state it", "None")
-        scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+        scale = scalar(pixel_scale, ANGLE, "pixel_scale")
         check_choice(resampling, "resampling", ("drizzle", None))
         source, target, mended = psf_pair(
             hi, lo, scale, angles=(hi_angle, lo_angle), grid_angle=grid_angle,
@@ -279,7 +279,7 @@ class MatchingKernel(Interactive):
             If the kernel was normalized by more than 0.001, or its core stands more than 0.1
             pixel off the center: it moves images by that.
         """
-        scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+        scale = scalar(pixel_scale, ANGLE, "pixel_scale")
         array, psfs, total = ready_arrays(array, scale, source=source, target=target)
         return cls(array, pixel_scale=pixel_scale, meta={"sum": total, "lost": 0.0}, **psfs)
 
@@ -465,7 +465,7 @@ class MatchingKernel(Interactive):
             Not renormalized: its sum is smaller by ``meta['lost']``. ``source`` and
             ``target`` stay as they are.
         """
-        width = float(to_array(extent, ANGLE, "extent")) / self.pixel_scale.value
+        width = scalar(extent, ANGLE, "extent") / self.pixel_scale.value
         half = int(width // 2)
         old = self.array.shape[0] // 2
         wanted = f"at most {self.array.shape[0] * self.pixel_scale.value:.4g} arcsec"

@@ -16,7 +16,7 @@ from miricigale.utils.files import write_fits
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_that
-from miricigale.utils.units import ANGLE, check_count, positive, to_array
+from miricigale.utils.units import ANGLE, check_count, positive, scalar, to_array
 
 #: Where a PSF's axes may stand: on the detector (angle on the sky not yet known) or the sky.
 FRAMES = ("detector", "sky")
@@ -113,7 +113,7 @@ class InstrumentPSF(ImagePSF):
             data = floats(data)
         super().__init__(data, oversampling=cells, origin=origin, meta=dict(meta or {}))
         if frame == "sky":
-            turn = float(to_array(angle, u.deg, "angle", finite=True))
+            turn = scalar(angle, u.deg, "angle")
         else:
             turn = 0.0
         self.pixel_scale = scale * ANGLE

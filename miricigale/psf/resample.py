@@ -11,7 +11,8 @@ from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_that
-from miricigale.utils.units import ANGLE, check_count, positive, to_array
+from miricigale.utils.positions import middle_pixel
+from miricigale.utils.units import ANGLE, check_count, positive, scalar
 
 _log = logging.getLogger(__name__)
 
@@ -21,7 +22,7 @@ _ANGLES = ("pixel_scale", "angle")
 def _degrees(angle, argument):
     wanted = "the position angle of the detector's +y axis, east of north"
     check_that(angle is not None, argument, wanted, "None: it is unknown where the PSF points")
-    return float(to_array(angle, u.deg, argument, finite=True))
+    return scalar(angle, u.deg, argument)
 
 
 def _turn_by(psf, angle, grid_angle, argument):
@@ -91,7 +92,7 @@ def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
     grid = _degrees(grid_angle, "grid_angle")
     turn = _turn_by(psf, angle, grid, "angle")
     ny, nx = psf.data.shape
-    if turn % 90 == 0 and nx == ny and tuple(psf.origin) == ((nx - 1) / 2, (ny - 1) / 2):
+    if turn % 90 == 0 and nx == ny and tuple(psf.origin) == middle_pixel(psf.data.shape):
         # counter-clockwise with y up
         data = np.rot90(psf.data, -round(turn / 90))
     else:

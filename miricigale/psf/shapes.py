@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.psf.model import make_psf
 from miricigale.psf.telescope import odd_cells
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, scalar
 
 
 def gaussian_psf(fwhm, *, pixel_scale, oversampling=4, fov):
@@ -33,10 +33,10 @@ def gaussian_psf(fwhm, *, pixel_scale, oversampling=4, fov):
     >>> print(f"{psf.fwhm:.3f}, {psf.data.shape}")
     0.300 arcsec, (161, 161)
     """
-    sigma = float(to_array(fwhm, ANGLE, "fwhm")) / math.sqrt(8 * math.log(2))
-    scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+    sigma = scalar(fwhm, ANGLE, "fwhm") / math.sqrt(8 * math.log(2))
+    scale = scalar(pixel_scale, ANGLE, "pixel_scale")
     cell = scale / oversampling
-    n = odd_cells(float(to_array(fov, ANGLE, "fov")), cell)
+    n = odd_cells(scalar(fov, ANGLE, "fov"), cell)
     axis = (np.arange(n) - n // 2) * cell
     r = np.hypot(axis, axis[:, None])
     profile = np.exp(-0.5 * (r / sigma) ** 2) / (2 * math.pi * sigma**2)

@@ -9,7 +9,7 @@ from miricigale.filters import Filter
 from miricigale.psf.optics import jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
 from miricigale.utils.caching import cached
-from miricigale.utils.units import ANGLE, WAVE, check_count, positive, to_array
+from miricigale.utils.units import ANGLE, WAVE, check_count, positive, scalar, to_array
 
 
 @cached(maxsize=64)
@@ -75,7 +75,7 @@ class Telescope:
     @classmethod
     def of(cls, filter, angle, wavefront_error, seed):
         """The telescope of the options of `~miricigale.psf.miri_psf`, checked."""
-        error = float(to_array(wavefront_error, u.nm, "wavefront_error"))
+        error = scalar(wavefront_error, u.nm, "wavefront_error")
         return cls(filter, angle, error, int(seed))
 
     @property

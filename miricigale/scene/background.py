@@ -10,6 +10,7 @@ from scipy.interpolate import RectBivariateSpline
 from miricigale.instrument import background_level
 from miricigale.instrument.sky_axes import pixel_to_radec
 from miricigale.utils.options import check_that
+from miricigale.utils.positions import middle_pixel
 from miricigale.utils.units import SURFACE_BRIGHTNESS, frozen_quantity
 
 
@@ -107,7 +108,7 @@ class Background:
             return np.full(shape, level)
         center = self.center
         if center is None:
-            ra, dec = pixel_to_radec(wcs, (nx - 1) / 2, (ny - 1) / 2)
+            ra, dec = pixel_to_radec(wcs, *middle_pixel(shape))
             center = SkyCoord(ra, dec, unit="deg")
         # smooth, so a coarse grid is enough
         nodes = [np.linspace(-0.5, n - 0.5, 12) for n in (ny, nx)]

@@ -12,6 +12,7 @@ from miricigale.scene.sky import local_jacobian
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.positions import middle_pixel
 from miricigale.utils.units import ANGLE, Frozen, frozen_array, frozen_quantity, positive
 
 # two points of Gauss and Legendre in a cell: the light's variance in it is exact
@@ -73,11 +74,9 @@ class Cutout(Frozen):
             raise argument_error("data", "a finite 2D array with a positive sum", data.shape)
         scale = positive(self.pixel_scale, ANGLE, "pixel_scale") * ANGLE
         angle = frozen_quantity(self.angle, u.deg, "angle", ndim=0, finite=True)
-        ny, nx = data.shape
-        if self.center is None:
-            center = ((nx - 1) / 2, (ny - 1) / 2)
-        else:
-            center = self.center
+        center = self.center
+        if center is None:
+            center = middle_pixel(data.shape)
         if len(center) != 2 or not np.all(np.isfinite(center)):
             raise argument_error("center", "a pixel x, y", self.center)
         center = (float(center[0]), float(center[1]))
@@ -116,9 +115,7 @@ class Cutout(Frozen):
             bad |= np.asarray(image.mask, dtype=bool)
         got = f"{bad.sum()} of {bad.size} pixels that are"
         check_that(not bad.any(), "image", "without masked or infinite pixels (fill them)", got)
-        ny, nx = data.shape
-        x = (nx - 1) / 2
-        y = (ny - 1) / 2
+        x, y = middle_pixel(data.shape)
         # columns: the steps along x and y in (east, north), arcsec
         steps = np.linalg.inv(local_jacobian(image.wcs, x, y))
         sides = np.hypot(steps[0], steps[1])
@@ -132,7 +129,7 @@ class Cutout(Frozen):
         # east of north is counter-clockwise where +x is west of +y
         if np.linalg.det(steps) > 0:
             data = data[:, ::-1]
-            x = nx - 1 - x
+            x = data.shape[1] - 1 - x
         angle = math.degrees(math.atan2(steps[0, 1], steps[1, 1]))
         scale = float(np.sqrt(np.prod(sides)))
         return cls(data, pixel_scale=scale * ANGLE, angle=angle * u.deg, center=(x, y))

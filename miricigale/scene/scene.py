@@ -26,6 +26,7 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import plain_floats
 from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.package_tables import declared
+from miricigale.utils.positions import middle_pixel
 from miricigale.utils.tables import Flags, described_columns
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
@@ -265,8 +266,7 @@ class Scene(Interactive):
         return Background(background)
 
     def _center_jacobian(self):
-        ny, nx = self._shape
-        return local_jacobian(self._wcs, (nx - 1) / 2, (ny - 1) / 2)
+        return local_jacobian(self._wcs, *middle_pixel(self._shape))
 
     def _check_psf(self, psf, scale):
         if not isinstance(psf, _TYPED):

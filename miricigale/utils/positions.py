@@ -294,6 +294,12 @@ def sky_with_motions(table, sky, columns, argument):
     return SkyCoord(sky.ra, sky.dec, obstime=Time(years, format="jyear"), **motions)
 
 
+def middle_pixel(shape):
+    """Pixel (x, y) in the middle of an image of a shape (ny, nx)."""
+    ny, nx = shape
+    return (nx - 1) / 2, (ny - 1) / 2
+
+
 def _known_floats(column, name, argument):
     """Values of a column as floats, NaN where it has none, infinity or a number that stands for no value."""
     values = plain_floats(column, name, argument)

@@ -253,6 +253,11 @@ def unique_ids(ids, argument):
     return ids
 
 
+def row_dicts(table):
+    """Rows of a table as dicts by column."""
+    return [dict(zip(table.colnames, row, strict=True)) for row in table]
+
+
 def read_ids(table, argument="photometry"):
     """
     Ids of a catalog: integers, or text whether it came as such or as bytes (`miricigale.utils.ids`).

@@ -243,9 +243,14 @@ class Frozen:
         return functools.partial(type(self), **values), ()
 
 
+def scalar(value, unit, name):
+    """A finite quantity as a number in ``unit``, after checking that it is one (errors as `to_array`)."""
+    return float(to_array(value, unit, name, ndim=0, finite=True))
+
+
 def positive(value, unit, name):
     """A quantity as a number in ``unit``, after checking that it is one, above 0 (errors as `to_array`)."""
-    number = float(to_array(value, unit, name, ndim=0, finite=True))
+    number = scalar(value, unit, name)
     check_that(number > 0, name, "positive", value)
     return number
 

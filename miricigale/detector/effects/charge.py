@@ -10,7 +10,7 @@ from miricigale.detector._core.readout import clip_well
 from miricigale.detector.effects.base import Effect, check_amounts, check_share
 from miricigale.instrument import DQ, bad_pixel_mask
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import TIME, to_array
+from miricigale.utils.units import TIME, scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,9 +174,7 @@ class Persistence(Effect):
         frame = exposure.frame_time.to_value(TIME)
         step = exposure.group_time.to_value(TIME)
         integration = exposure.integration_time.to_value(TIME) + frame
-        start = float(to_array(gap, TIME, "gap", ndim=0)) + integration * np.arange(
-            exposure.n_integrations
-        )
+        start = scalar(gap, TIME, "gap") + integration * np.arange(exposure.n_integrations)
         start = start[:, None] + step * np.arange(exposure.n_groups)
         return sum(
             a * t * np.exp(-start / t) * -np.expm1(-step / t)

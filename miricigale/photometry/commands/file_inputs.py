@@ -20,6 +20,7 @@ from miricigale.photometry.images.mosaic_headers import stated_filter
 from miricigale.photometry.images.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import file_place
+from miricigale.utils.positions import middle_pixel
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 #: Bytes of a process without images, for each pixel of the prior (or of an image of the detection) and of an
@@ -381,8 +382,7 @@ def _check_images(image, highres):
 
 
 def _middle(header):
-    ny, nx = header.shape
-    return header.wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2).icrs
+    return header.wcs.pixel_to_world(*middle_pixel(header.shape)).icrs
 
 
 def _inside(sky, header):

@@ -22,6 +22,7 @@ from miricigale.plotting.posteriors import plot_pulls
 from miricigale.psf.star_fit import TERMS
 from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.package_tables import declared
+from miricigale.utils.tables import row_dicts
 from miricigale.utils.units import ANGLE, ab_magnitude
 
 #: Largest number of pixels across a drawing of a whole image, rows of a table, arcsec across a source.
@@ -334,7 +335,7 @@ def _stars(page, stars, band):
                 pull[has_data] = star_fit.residual * star_fit.weight
                 plot_image(pull, ax=ax, title=f"{title}, chi2 {star_fit.chi2:.2f}", **pulls)
         page.figure("figure", figure, **facts)
-    rows = [dict(zip(stars.table.colnames, row, strict=True)) for row in stars.table]
+    rows = row_dicts(stars.table)
     for row in rows:
         row["note"] = "not like the PSF" if row["chi2"] > _UNLIKE else ""
     page.table("table", rows)
@@ -474,7 +475,7 @@ def write_errors_page(path, errors, *, overwrite):
     page = SectionWriter(report, declared("miricigale.photometry"))
     facts = {"over": meta["noise_over_stated"], "factor": errors.factor}
     page.section("errors", n_free=errors.n_free, **facts)
-    page.table("table", [dict(zip(table.colnames, row, strict=True)) for row in Table(table)])
+    page.table("table", row_dicts(Table(table)))
     # the map of the first aperture
     aperture, limit = next(iter(errors.limits.items()))
     limit = limit.value

@@ -15,7 +15,7 @@ from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.utils.options import check_that
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.tables import described_table
-from miricigale.utils.units import ANGLE, FNU, positive, to_array
+from miricigale.utils.units import ANGLE, FNU, positive, scalar
 
 #: The paper's PHOT_AUTOPARAMS: factor on the Kron radius, and least radius of the ellipse.
 _KRON = (2.5, 3.5)
@@ -179,7 +179,7 @@ def source_extractor_photometry(
     arrays = image_arrays(image, "image")
     ratio = 1.0
     if stated_on is not None:
-        ratio = float(to_array(stated_on, ANGLE, "stated_on")) / pixel_scale(image.wcs)
+        ratio = scalar(stated_on, ANGLE, "stated_on") / pixel_scale(image.wcs)
     box = max(1, round(_BACKGROUND_BOX * ratio))
     empty = ~arrays.usable if weighted else None
     level, rms = sep_background(arrays.flux, empty, box, _BACKGROUND_FILTER)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 from astropy.coordinates import SkyCoord
+from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import Table
 from astropy.wcs.utils import pixel_to_pixel
 from scipy.special import ndtr
@@ -30,6 +31,7 @@ from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import single_threaded, threads
+from miricigale.utils.positions import middle_pixel
 from miricigale.utils.units import ANGLE
 
 #: Change of an exposure's shift (pixels) at which it is done, and how often it is looked for.
@@ -326,8 +328,7 @@ class _Joint:
         """Convert shifts of exposures (pixels) to arcsec to the east and north."""
         offsets = []
         for part, shift in zip(self._parts, shifts, strict=True):
-            ny, nx = part.arrays.flux.shape
-            middle = np.array([[(nx - 1) / 2, (ny - 1) / 2]])
+            middle = np.array([middle_pixel(part.arrays.flux.shape)])
             turn = self._turns(part, middle)[0]
             offsets.append((turn @ shift) * self._scale * [-1.0, 1.0])
         return np.array(offsets)
@@ -461,7 +462,7 @@ class _Joint:
                 break
             error = np.hypot(error, _OFFSET_FLOOR)
             common = np.median(measured[good], axis=0)
-            if np.hypot(common[0], common[1]) > _COMMON_OFFSET * np.sqrt(8 * np.log(2)) * width:
+            if np.hypot(common[0], common[1]) > _COMMON_OFFSET * gaussian_sigma_to_fwhm * width:
                 break
             # of two normal errors the median distance is 1.18
             distance = np.median(lengths(measured[good])) / 1.1774

@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import scipy.sparse
 from astropy.nddata import StdDevUncertainty
-from astropy.stats import mad_std
+from astropy.stats import gaussian_sigma_to_fwhm, mad_std
 from astropy.table import QTable
 
 from miricigale.instrument import pixel_area_map
@@ -224,7 +224,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
         second_pass=fit.settings.second_pass,
         covariance=joint[:n, :n],
         **background,
-        psf_fwhm=np.sqrt(8 * np.log(2)) * gaussian_width(fit.settings.mean_kernel) * ANGLE,
+        psf_fwhm=gaussian_sigma_to_fwhm * gaussian_width(fit.settings.mean_kernel) * ANGLE,
         model_image=model,
         residual_image=residual,
         exposures=exposures,

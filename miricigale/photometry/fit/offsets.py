@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import scipy.optimize
+from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import QTable
 
 from miricigale.photometry._core.stamps import offset_sums
@@ -276,7 +277,7 @@ def settled(fit, bank, catalog):
         smooth, _ = _robust_field(xy[member], deviation, error, good[good], shape, order)
         x, y = xy[member].T
         smooth = smooth(x, y)
-        if np.abs(smooth).max() > _NOTICED * np.sqrt(8 * np.log(2)) * fit.psf_width:
+        if np.abs(smooth).max() > _NOTICED * gaussian_sigma_to_fwhm * fit.psf_width:
             break
         # of two normal errors the median distance is 1.18
         scatter = (np.median(lengths(deviation)) / 1.1774) ** 2 - np.median(error) ** 2

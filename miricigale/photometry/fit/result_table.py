@@ -7,6 +7,7 @@ import numpy as np
 import scipy.sparse
 from astropy.coordinates import SkyCoord
 from astropy.nddata import StdDevUncertainty
+from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import QTable
 from astropy.units import Quantity
 
@@ -107,7 +108,7 @@ class NewSources:
 
 def _full_width(fit):
     """Return the full width at half maximum of a fit's PSF."""
-    return np.sqrt(8 * np.log(2)) * fit.psf_width * fit.scale * ANGLE
+    return gaussian_sigma_to_fwhm * fit.psf_width * fit.scale * ANGLE
 
 
 def package(fit, diagnostics, new_xy, catalog, meta):

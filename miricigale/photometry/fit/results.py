@@ -10,6 +10,7 @@ import scipy.ndimage
 import scipy.sparse
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
+from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import QTable
 from scipy.special import ndtr, ndtri
 
@@ -271,7 +272,7 @@ class ForcedPhotometryResult(Tabular):
         usable = ~image.mask
         # mean of chi^2 over usable pixels, weighted with a Gaussian
         square = np.where(usable, image.data / image.uncertainty.array, 0.0) ** 2
-        width = self.psf_fwhm.to_value(ANGLE) / pixel_scale(image.wcs) / np.sqrt(8 * np.log(2))
+        width = self.psf_fwhm.to_value(ANGLE) / pixel_scale(image.wcs) / gaussian_sigma_to_fwhm
         total = scipy.ndimage.gaussian_filter(square, width, mode="constant")
         weight = scipy.ndimage.gaussian_filter(usable.astype(float), width, mode="constant")
         chi2 = np.divide(total, weight, out=np.full(total.shape, np.nan), where=usable)

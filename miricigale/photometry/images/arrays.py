@@ -13,8 +13,8 @@ from miricigale.photometry.images.fields import legendre_terms
 from miricigale.photometry.images.sky_noise import mask_filled
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
-from miricigale.utils.positions import plain_positions
-from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.positions import middle_pixel, plain_positions
+from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, scalar
 
 #: uJy per MJy.
 _MICRO = 1e12
@@ -146,7 +146,7 @@ def _checked(image, name):
     if image.wcs is None or not image.wcs.has_celestial:
         raise argument_error(name, "an image with a celestial WCS", "one without")
     unit = FNU if image.unit.is_equivalent(FNU) else SURFACE_BRIGHTNESS
-    factor = float(to_array(1 * image.unit, unit, name))
+    factor = scalar(1 * image.unit, unit, name)
     # pixels with a value, a positive noise, and no mark
     usable = np.isfinite(data)
     if image.mask is not None:
@@ -219,7 +219,7 @@ def sky_pixels(sky, wcs, shape, margin):
     """
     xy = np.full((len(sky), 2), np.nan)
     ny, nx = shape
-    middle = wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2)
+    middle = wcs.pixel_to_world(*middle_pixel(shape))
     # a circle about the image: a WCS may fail, or wrap, far from it
     radius = 1.05 * (np.hypot(nx, ny) / 2 + margin) * pixel_scale(wcs)
     is_near = sky.separation(middle).arcsec < radius

@@ -47,7 +47,7 @@ from miricigale.photometry.images.mosaic_headers import (
 from miricigale.photometry.images.sky_noise import mask_filled, sky_noise
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
 from miricigale.utils.options import check_data, check_that
-from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import SURFACE_BRIGHTNESS, scalar
 
 _log = logging.getLogger(__name__)
 
@@ -277,7 +277,7 @@ class MosaicFile:
             header_angle = np.asarray(header_angle, float) * u.deg
         if self.pa_aper is None:
             return header_angle
-        angle = float(to_array(self.pa_aper, u.deg, "pa_aper", finite=True)) * u.deg
+        angle = scalar(self.pa_aper, u.deg, "pa_aper") * u.deg
         if header_angle is None:
             return angle
         difference = (angle - header_angle).to_value(u.deg)

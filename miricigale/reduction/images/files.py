@@ -29,6 +29,7 @@ from miricigale.instrument import (
 from miricigale.instrument.data_models import is_data_model, read_data_model
 from miricigale.instrument.header_wcs import header_wcs, image_wcs
 from miricigale.instrument.image_planes import noise_kind, plane_data, plane_shape
+from miricigale.instrument.keywords import keyword_text
 from miricigale.instrument.product_files import PLANES
 from miricigale.reduction.images.images import flagged_image, sigma
 from miricigale.utils.exceptions import DataError, argument_error, data_error
@@ -374,7 +375,7 @@ def _meta(header, path):
 def _wcs(hdus, header, meta):
     """World coordinates of an image; None without any."""
     pointed = all(name in meta for name in ("ra", "dec", "roll", "subarray"))
-    done = str(header.get("S_WCS", "")).strip().upper() == "COMPLETE"
+    done = keyword_text(header.get, "S_WCS") == "COMPLETE"
     if pointed and not done and "META" not in header:
         # a rate: the header has the linear part
         pointing = SkyCoord(meta["ra"] * u.deg, meta["dec"] * u.deg)

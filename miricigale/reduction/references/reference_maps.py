@@ -6,6 +6,7 @@ import numpy as np
 
 from miricigale.instrument import DQ, READOUT_NAMES, aperture, frame_pattern, joined_header
 from miricigale.instrument.history import TYPES
+from miricigale.instrument.keywords import keyword_text
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.options import check_data
@@ -53,7 +54,7 @@ def _header(hdus, path, name, extension, exposure=None):
     if name == "flat" and exposure.filter is not None:
         wanted["FILTER"] = exposure.filter.rpartition(".")[2].upper()
     for key, value in wanted.items():
-        keyword_value = str(header.get(key, "")).strip().upper()
+        keyword_value = keyword_text(header.get, key)
         keyword_value = READOUT_NAMES.get(keyword_value, keyword_value)
         if key == "READPATT":
             allowed = patterns

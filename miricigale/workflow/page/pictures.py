@@ -12,6 +12,7 @@ from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_
 from miricigale.plotting.images import filled, mark_sky, plot_color, plot_image, plot_model_residual
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.psf.wiener import energy_error
+from miricigale.utils.positions import middle_pixel
 from miricigale.workflow.labels import band_title
 
 #: Error of the encircled energy (%) that counts as small.
@@ -25,13 +26,13 @@ def _scale(image):
 
 def _directions(image):
     """Return directions (x, y) of north and east at the middle of an image."""
-    ny, nx = image.shape
-    middle = image.wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2)
+    middle_x, middle_y = middle_pixel(image.shape)
+    middle = image.wcs.pixel_to_world(middle_x, middle_y)
     directions = {}
     for name, angle in (("north", 0), ("east", 90)):
         position = middle.directional_offset_by(angle * u.deg, 1 * u.arcsec)
         x, y = image.wcs.world_to_pixel(position)
-        directions[name] = (float(x) - (nx - 1) / 2, float(y) - (ny - 1) / 2)
+        directions[name] = (float(x) - middle_x, float(y) - middle_y)
     return directions
 
 
