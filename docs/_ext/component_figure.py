@@ -3,11 +3,13 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
+from miricigale.refdata import resource
 from miricigale.sed import COMPONENTS
 
-__all__ = ["VARIED", "draw"]
+__all__ = ["VARIED", "draw", "panels_of"]
 
-#: Values that each component is drawn with, by parameter; redshift and age (Myr) are the user's.
+#: Values that a component is drawn with, by parameter; redshift and age (Myr) are the user's. One that is not
+#: here has its first parameters at three values each.
 VARIED = {
     "delayed": {"tau": (0.1, 0.5, 1, 3), "f_burst": (0, 0.05, 0.2)},
     "double_exponential": {"tau": (-3, 1, 3, 6), "f_burst": (0, 0.05, 0.2)},
@@ -99,6 +101,33 @@ def _foreground(part, values):
     return wave, -2.5 * np.log10(part.transmission(wave, values))
 
 
+def panels_of(name):
+    """
+    Values that a component is drawn with, by parameter.
+
+    Parameters
+    ----------
+    name : str
+        The component's ``name``.
+
+    Returns
+    -------
+    panels : dict of str to sequence of float
+        Empty for components whose data users bring.
+    """
+    cls = COMPONENTS.get(name)
+    is_brought = cls.resource and resource(cls.resource).kind == "user"
+    if is_brought or name == "sfh_table":
+        return {}
+    if name in VARIED:
+        return VARIED[name]
+    panels = {}
+    for parameter in list(cls.declared().values())[:3]:
+        low, high = parameter.bounds
+        panels[parameter.name] = np.linspace(low, high, 5)[1:4]
+    return panels
+
+
 _LOGS = {"xscale": "log", "yscale": "log"}
 #: By role: curve, labels and limits of the axes.
 _CURVES = {
@@ -144,7 +173,7 @@ _CURVES = {
 
 def draw(name):
     """
-    Draw a component on a new figure: one panel for each parameter in `VARIED`.
+    Draw a component on a new figure: one panel for each parameter of `panels_of`.
 
     Parameters
     ----------
@@ -161,7 +190,7 @@ def draw(name):
     defaults = {key: par.default for key, par in part.parameters.items()} | {"age_ssp": 1000.0}
     if cls.role == "dust":
         del defaults["age_ssp"]
-    panels = VARIED[name]
+    panels = panels_of(name)
     figure, row = plt.subplots(
         1, len(panels), figsize=(max(6, 2.8 * len(panels)), 3.2), sharey=True, squeeze=False
     )

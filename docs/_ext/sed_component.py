@@ -8,7 +8,7 @@ it reads, options, parameters and a figure; a name that is not registered is an 
 
 import re
 
-from component_figure import VARIED
+from component_figure import panels_of
 from docutils.statemachine import StringList
 from sphinx.util.docutils import SphinxDirective
 
@@ -109,7 +109,7 @@ def figure_lines(name):
     -------
     lines : list of str
     """
-    if name not in VARIED:
+    if not panels_of(name):
         return ["No figure here: the component needs data of yours.", ""]
     return [
         ".. plot::",

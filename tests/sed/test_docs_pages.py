@@ -30,15 +30,16 @@ def test_every_component_has_a_page(name):
 @pytest.mark.parametrize("name", COMPONENTS.names())
 def test_the_figure_of_a_component_shows_what_its_parameters_do(name, monkeypatch):
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
-    from component_figure import VARIED, draw
+    from component_figure import draw, panels_of
 
     data = COMPONENTS.get(name).resource
     brought = name == "sfh_table" or (data and resource(data).kind == "user")
-    assert (name in VARIED) != bool(brought)
+    panels = panels_of(name)
+    assert (not panels) == bool(brought)
     if brought:
         return
     figure = draw(name)
-    for ax, values in zip(figure.axes, VARIED[name].values(), strict=True):
+    for ax, values in zip(figure.axes, panels.values(), strict=True):
         curves = [tuple(map(tuple, line.get_xydata())) for line in ax.lines]
         assert len(set(curves)) == len(values)
         assert len(ax.get_legend().get_texts()) == len(values)
