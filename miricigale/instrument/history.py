@@ -68,10 +68,7 @@ class ExposureHistory:
         steps = self.steps
         if isinstance(steps, str):
             steps = steps.replace(",", " ").split()
-        done = []
-        for name in steps:
-            done.append(str(name).lower())
-        object.__setattr__(self, "steps", frozenset(done))
+        object.__setattr__(self, "steps", frozenset(str(name).lower() for name in steps))
         for name in ("day", "gain"):
             value = getattr(self, name)
             if value is not None and not isinstance(value, numbers.Real):

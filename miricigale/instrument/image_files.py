@@ -181,10 +181,8 @@ def read_image(path, *, planes=()):
     from astropy.nddata import StdDevUncertainty
 
     with open_fits(path, wanted="an image (FITS with SCI)") as hdus:
-        extensions = []
-        for hdu in hdus:
-            extensions.append(hdu.name)
-        check_data("SCI" in hdus, path, f"has no SCI extension, only {extensions}")
+        names = [hdu.name for hdu in hdus]
+        check_data("SCI" in hdus, path, f"has no SCI extension, only {names}")
         header = hdus["SCI"].header
         wcs = header_wcs(header, where=str(path))
         if "ERR" in hdus:

@@ -51,10 +51,7 @@ def columns_of(sources, agn_limit):
         "selected": weight * np.asarray(sources["selected"], bool),
         "found": weight * (agn & np.asarray(sources["selected"], bool)),
     }
-    arrays = {}
-    for name, values in columns.items():
-        arrays[name] = np.asarray(values, float)
-    return arrays
+    return {name: np.asarray(values, float) for name, values in columns.items()}
 
 
 def accuracy(sources, *, agn_limit=0.4, seed=0):

@@ -19,10 +19,9 @@ def _row(planner, plan, numbers):
     detected = planner.common([plan])
     weight = sky_weights(plan.sources, planner.config.agn.limit)
     recovered = agn & detected & np.asarray(plan.sources["selected"], bool)
+    scale = np.nan
     if plan.bands:
         scale = planner.density * plan.area.to_value(u.arcmin**2)
-    else:
-        scale = np.nan
     for name, chosen in (("n_detected", detected), ("n_agn", recovered), ("n_agn_true", agn)):
         share = weighted_share(weight * chosen, weight)
         row |= {name: scale * share.value, f"{name}_err": scale * share.error}

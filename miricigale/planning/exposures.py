@@ -200,11 +200,10 @@ def _band_plan(filter, time, n_dithers, config):
 @cached(maxsize=8)
 def _detector(photom, date):
     """The imager's detector, with the response of a day where one is given."""
-    with of_option("[exposures] photom, date:", ValueError):
-        if photom or date:
+    response = ()
+    if photom or date:
+        with of_option("[exposures] photom, date:", ValueError):
             response = imager_response(photom, date=date)
-        else:
-            response = ()
     return miri_detector().replace(response=response)
 
 
@@ -249,10 +248,9 @@ def band_plans(config, *, share=1.0, bands=None):
     for name, value, dithers in zip(options.bands, values, options.by_band("dithers"), strict=True):
         if bands is not None and name not in bands:
             continue
+        time = value * u.s
         if options.depth:
             time = _time_to(value, name, dithers, config)
-        else:
-            time = value * u.s
         plans[name] = _band_plan(name, share * time, dithers, config)
     return plans
 

@@ -75,24 +75,19 @@ def answer(planner, plans, comparison):
     plan = next(plan for plan in plans if plan.name == row["plan"])
     bands = plan.bands.values()
     facts = {"limit": planner.config.agn.limit}
+    facts["mix"] = ""
     if planner.sources.meta.get("agn") == "mix":
         facts["mix"] = " of a made-up mix"
-    else:
-        facts["mix"] = ""
     facts["bands"] = _bands_in_words(row["plan"], plans)
-    times = []
-    for band in bands:
-        times.append(f"{band.time.to_value(u.s):.0f}")
-    for key, values in {
-        "times": times,
-        "dithers": [str(band.n_dithers) for band in bands],
-        "limits": [f"{band.errors().limiting_magnitude(band.filter).value:.1f}" for band in bands],
-    }.items():
-        is_shared = key != "limits" and len(set(values)) == 1
-        if is_shared:
-            facts[key] = values[0]
-        else:
-            facts[key] = ", ".join(values)
+    limits = [band.errors().limiting_magnitude(band.filter).value for band in bands]
+    facts["limits"] = ", ".join(f"{limit:.1f}" for limit in limits)
+    times = [f"{band.time.to_value(u.s):.0f}" for band in bands]
+    dithers = [str(band.n_dithers) for band in bands]
+    for key, values in (("times", times), ("dithers", dithers)):
+        if len(set(values)) == 1:
+            # the same for all bands
+            values = values[:1]
+        facts[key] = ", ".join(values)
     for name, spec in (("n_agn", ".1f"), ("n_agn_true", ".1f"), ("purity", ".0f %")):
         facts[name] = number(row[name], spec, "not known", error=row[f"{name}_err"])
     facts |= {"area": f"{plan.area.value:.1f}", "hours": f"{plan.time.to_value(u.h):.1f}"}
@@ -143,10 +138,7 @@ def _notices(page, planner):
     page.notice("noise")
     noise = dataclasses.asdict(config.noise)
     page.notice("errors", **noise | {"fractional": 100 * noise["fractional"]})
-    if config.sed.infrared == "ceers":
-        models = "models_ceers"
-    else:
-        models = "models"
+    models = "models_ceers" if config.sed.infrared == "ceers" else "models"
     page.notice(models, model_error=100 * config.fit.model_error)
     page.notice("hours")
     if planner._caller_sources is None:
@@ -160,14 +152,11 @@ def _notices(page, planner):
 def _write_exposures(page, config, plans, full_plan):
     """The section on the exposures of all sets of bands, the one of most bands first."""
     n = config.exposures.pointings
-    hours = []
-    for band in full_plan.bands.values():
-        hours.append(band.time.to_value(u.h))
     page.section(
         "exposures",
         "budget" if config.exposures.hours else "text",
         plan=full_plan.name,
-        light=sum(hours),
+        light=sum(band.time.to_value(u.h) for band in full_plan.bands.values()),
         where="one pointing" if n == 1 else f"each of {n} pointings",
         area=full_plan.area.value,
         time=full_plan.time.to_value(u.h),

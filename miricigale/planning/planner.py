@@ -129,10 +129,9 @@ class Planner:
     """
 
     def __init__(self, config=None, *, sources=None, executor=None):
+        self.config = config
         if config is None:
             self.config = PlanConfig()
-        else:
-            self.config = config
         self.executor = executor
         #: Sources of the caller, if there are any.
         self._caller_sources = sources
@@ -212,10 +211,7 @@ class Planner:
         low = float(np.max(_LEAST * group * dithers / times))
         shortest = charged(low)
         if shortest > exposures.hours:
-            labels = []
-            for name in bands:
-                labels.append(name.removeprefix("miri."))
-            names = ", ".join(labels)
+            names = ", ".join(name.removeprefix("miri.") for name in bands)
             raise config_error(
                 "[exposures] hours",
                 f"must be at least {shortest:.2f} for {names}, got {exposures.hours:g}",
@@ -228,9 +224,7 @@ class Planner:
             middle = np.sqrt(low * high)
             if charged(middle) <= exposures.hours:
                 low = middle
-                high = high
             else:
-                low = low
                 high = middle
         return low
 
@@ -298,8 +292,7 @@ class Planner:
     @property
     def _size(self):
         """Widths of the sources in arcsec, 0 where they are not known."""
-        has_sizes = "size" in self.sources.colnames
-        if has_sizes:
+        if "size" in self.sources.colnames:
             return self.sources["size"].to_value(u.arcsec)
         return np.zeros(len(self.sources))
 
@@ -331,8 +324,7 @@ class Planner:
         config = self.config
         if bands is None:
             bands = config.exposures.bands
-        else:
-            bands = tuple(bands)
+        bands = tuple(bands)
         wanted = f"some of {list(config.exposures.bands)}"
         check_that(set(bands) <= set(config.exposures.bands), "bands", wanted, list(bands))
         planned = self.band_plans(share, bands)
@@ -355,17 +347,13 @@ class Planner:
     def _results(self, results, photometry, plans):
         """The table of sources of a `Plan`."""
         agn = self.config.agn
-        source_columns = ("id", "redshift", "frac_agn", "sky")
-        columns = []
-        for name in source_columns:
-            if name in self.sources.colnames:
-                columns.append(name)
+        columns = ["id", "redshift", "frac_agn"]
+        if "sky" in self.sources.colnames:
+            columns.append("sky")
         table = self.sources[columns]
+        table["n_detected"] = 0
         if plans:
-            detected = detected_bands(photometry, list(plans))
-        else:
-            detected = np.zeros(len(table), int)
-        table["n_detected"] = detected
+            table["n_detected"] = detected_bands(photometry, list(plans))
         for name in ("redshift", "frac_agn"):
             table[f"{name}_mean"] = u.Quantity(results.mean(name)).value
             table[f"{name}_std"] = u.Quantity(results.std(name)).value
@@ -421,17 +409,14 @@ class Planner:
         plans : list of `Plan`
             One for each number of ``[survey] areas``.
         """
-        areas = self.config.survey.areas
-        if not self.config.exposures.hours:
-            return [self.evaluate(bands, name=str(n), share=1.0 / n, pointings=n) for n in areas]
         if bands is None:
-            chosen = self.config.exposures.bands
-        else:
-            chosen = tuple(bands)
+            bands = self.config.exposures.bands
         plans = []
-        for n in areas:
-            share = self.share(chosen, n)
-            plans.append(self.evaluate(chosen, name=str(n), share=share, pointings=n))
+        for n in self.config.survey.areas:
+            share = 1.0 / n
+            if self.config.exposures.hours:
+                share = self.share(bands, n)
+            plans.append(self.evaluate(bands, name=str(n), share=share, pointings=n))
         return plans
 
     def common(self, plans):
@@ -452,8 +437,5 @@ class Planner:
         """
         if chosen is None:
             chosen = self.common([plan])
-        else:
-            chosen = np.asarray(chosen, bool)
-        agn_limit = self.config.agn.limit
-        seed = self.config.plan.seed
-        return accuracy(plan.sources[chosen], agn_limit=agn_limit, seed=seed)
+        sources = plan.sources[np.asarray(chosen, bool)]
+        return accuracy(sources, agn_limit=self.config.agn.limit, seed=self.config.plan.seed)

@@ -98,9 +98,8 @@ def make_sample(config, bands, *, executor=None):
         is_complete = np.isfinite(sources["mass"].value) & np.isfinite(luminosity)
         inside = (luminosity >= options.luminosity[0]) & (luminosity <= options.luminosity[1])
     sources = _cut(sources, is_complete & inside, "[sample] luminosity")
-    if area is None:
-        density = np.nan
-    else:
+    density = np.nan
+    if area is not None:
         density = len(sources) / area.to_value(u.arcmin**2)
     rng = stream(seed, "plan", "sample")
     if options.luminosity_function:
@@ -116,10 +115,7 @@ def make_sample(config, bands, *, executor=None):
     agn = "catalog"
     fractions = sources.columns.get("frac_agn")
     if fractions is None:
-        if config.agn.frac_agn:
-            agn = "mix"
-        else:
-            agn = "field"
+        agn = "mix" if config.agn.frac_agn else "field"
     model = SEDModel.yang2021()
     sources["sky"] = 0
     n_skies = 1
@@ -143,10 +139,7 @@ def make_sample(config, bands, *, executor=None):
     light = library_fluxes(model, sources, list(bands))
     for name in bands:
         sources[name] = light[name]
-    finite = []
-    for name in bands:
-        finite.append(np.isfinite(sources[name].value))
-    usable = np.all(finite, axis=0)
+    usable = np.all([np.isfinite(sources[name].value) for name in bands], axis=0)
     sources = _cut(sources, usable, "the models")
     sources.meta = {"density": density, "agn": agn, "n_skies": n_skies}
     sources.meta["libraries"] = list(model.meta["libraries"])
@@ -203,14 +196,8 @@ def _by_luminosity(sources, options, rng):
     z, logs = (np.linspace(a, b, 201) for a, b in zip(low, high, strict=True))
     z = 0.5 * (z[1:] + z[:-1])
     logs = 0.5 * (logs[1:] + logs[:-1])
-    levels_of_rows = []
-    for row in values:
-        levels_of_rows.append(np.interp(logs, levels, row))
-    at_levels = np.array(levels_of_rows)
-    columns = []
-    for column in at_levels.T:
-        columns.append(np.interp(z, steps, column))
-    fine = np.array(columns).T
+    at_levels = np.array([np.interp(logs, levels, row) for row in values])
+    fine = np.array([np.interp(z, steps, column) for column in at_levels.T]).T
     volume = model.cosmology.differential_comoving_volume(z).to_value(u.Mpc**3 / u.arcmin**2)
     cells = fine * volume[:, None] * (high[0] - low[0]) / 200 * (high[1] - low[1]) / 200
     wanted = "phi of at least 0, and not 0 everywhere"

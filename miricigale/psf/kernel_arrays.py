@@ -27,9 +27,8 @@ def blended(kernels, weights=None):
     """What the weighted mean of kernels is made of, by the arguments of `~miricigale.psf.MatchingKernel`."""
     n = len(kernels)
     names = ("array", "source", "target")
-    if weights is None:
-        w = np.ones(n)
-    else:
+    w = np.ones(n)
+    if weights is not None:
         w = floats(weights)
     if w.shape != (n,) or np.any(w < 0) or not w.sum() > 0:
         raise argument_error("weights", f"{n} non-negative numbers, not all 0", weights)
@@ -39,9 +38,6 @@ def blended(kernels, weights=None):
     mean = {}
     for name in names:
         if getattr(kernels[0], name) is not None:
-            planes = []
-            for k in kernels:
-                planes.append(getattr(k, name))
-            mean[name] = np.tensordot(w, planes, axes=1)
+            mean[name] = np.tensordot(w, [getattr(k, name) for k in kernels], axes=1)
     meta = {"weights": w.tolist(), "lost": float(w @ [k.meta.get("lost", 0) for k in kernels])}
     return {**mean, "pixel_scale": kernels[0].pixel_scale, "meta": meta}

@@ -52,10 +52,8 @@ class Star:
     def halves(self):
         """Two stars, each with every other octant about its position."""
         odd = np.floor(np.arctan2(self.v, self.u) * (4 / np.pi)).astype(int) % 2 == 1
-        out = []
-        for part in (odd, ~odd):
-            out.append(dataclasses.replace(self, sigma=np.where(part, np.inf, self.sigma)))
-        return out
+        sigmas = [np.where(part, np.inf, self.sigma) for part in (odd, ~odd)]
+        return [dataclasses.replace(self, sigma=sigma) for sigma in sigmas]
 
 
 def derivatives(psf, fwhm):
@@ -169,11 +167,10 @@ def fitted_stars(psf, stars, *, slope=None, offsets=None):
     images = np.stack([spline_filter(image) for image in images], axis=-1)
     if slope is None:
         slope = np.zeros((_SLOPED, 2))
+    steps = 1
     if offsets is None:
         steps = _STEPS
         offsets = np.zeros((len(stars), 2))
-    else:
-        steps = 1
     for _ in range(steps):
         fits = []
         for star, offset in zip(stars, offsets, strict=True):

@@ -61,10 +61,7 @@ def check_resources():
     >>> [row.name for row in check_resources() if row.bad]
     []
     """
-    states = []
-    for record in resources().values():
-        states.append(_state(record))
-    return states
+    return list(map(_state, resources().values()))
 
 
 def _state(record):
@@ -87,9 +84,8 @@ def _state(record):
         if file_sha256(path) != wanted:
             return ResourceState(name, "wrong checksum", where, "sha256 differs from its record")
     except OSError as err:
-        if isinstance(err, DataError):
-            message = str(err)
-        else:
+        message = str(err)
+        if not isinstance(err, DataError):
             message = f"{path} cannot be read: {err}"
         return ResourceState(name, "damaged", where, message)
     return ResourceState(name, "ok", where)

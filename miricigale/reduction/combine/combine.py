@@ -61,9 +61,7 @@ def subtract_dithers(reducer, images, single_backgrounds=None, wcs=None):
         for image in images:
             background = estimate_background(image, warn=False, **reducer.background.mesh)
             single_backgrounds.append(background)
-    backgrounds = []
-    for background in dither_backgrounds(images, single_backgrounds, wcs=wcs):
-        backgrounds.append(subtractable(background))
+    backgrounds = list(map(subtractable, dither_backgrounds(images, single_backgrounds, wcs=wcs)))
     subtracted = []
     for image, background in zip(images, backgrounds, strict=True):
         subtracted.append(remove_background(image, background, **reducer.background.negative))
@@ -95,10 +93,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
     wcs = as_wcs(wcs)
     notes = []
     if reducer.mosaics.outlier_threshold is not None and len(images) < 3:
-        if len(images) == 1:
-            number = "a single dither"
-        else:
-            number = "two dithers"
+        number = "a single dither" if len(images) == 1 else "two dithers"
         notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
     if reducer.background.method == "dithers":
         if len(images) >= 3 and len(backgrounds) == len(images):
@@ -112,11 +107,9 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
     if doubts:
         doubt = f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted"
         notes.append(f"{doubt} ({_reasons(doubts)})")
-    has_backgrounds = len(backgrounds) == len(images)
-    if has_backgrounds:
+    unsubtracted = []
+    if len(backgrounds) == len(images):
         unsubtracted = [im.data + b.level for im, b in zip(images, backgrounds, strict=True)]
-    else:
-        unsubtracted = []
     drizzled, images = drizzle(reducer.mosaics, images, wcs, planes)
     mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
     subtracted = mosaic_background.level

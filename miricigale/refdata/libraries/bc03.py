@@ -160,11 +160,10 @@ def _metallicity(part, file):
 
 def _imf(part, file):
     named = {imf for token, imf in IMFS.items() if f"_{token}" in file.name.lower()}
-    # Chabrier's is the only one that is no power law
+    stated_imf = None
     if not part.slopes:
+        # the only one that is no power law
         stated_imf = "Chabrier"
-    else:
-        stated_imf = None
     if len(part.slopes) == 1 and np.isclose(part.slopes[0], 1.35, atol=0.01):
         stated_imf = "Salpeter"
     if len(named) != 1 and stated_imf is None:
@@ -188,11 +187,7 @@ def _check_set(parts):
             "limits of mass": part.mass_limits == first.mass_limits,
             "ages": ages,
         }
-        differing = []
-        for name, is_same in pairs.items():
-            if not is_same:
-                differing.append(name)
-        differ = ", ".join(differing)
+        differ = ", ".join(name for name, is_same in pairs.items() if not is_same)
         check_data(not differ, other_file, f"and {file.name} are not one set: other {differ}")
         if metallicity in files:
             twice = f"the same metallicity as {files[metallicity].name}, {metallicity:g}"
@@ -202,12 +197,9 @@ def _check_set(parts):
 
 def _version(part):
     """Year of the version that made a file, by its second age, or None."""
-    years = []
     for year, age in SECOND_AGE.items():
         if np.isclose(part.age[1], age, rtol=1e-3):
-            years.append(year)
-    if years:
-        return years[0]
+            return year
     return None
 
 
@@ -226,10 +218,7 @@ def _surviving(part, file):
     elif _version(part) is not None:
         take = _version(part) == 2003
     else:
-        ages_of_versions = []
-        for year, second in SECOND_AGE.items():
-            ages_of_versions.append(f"{second:g} yr ({year})")
-        ages = " or ".join(ages_of_versions)
+        ages = " or ".join(f"{age:g} yr ({year})" for year, age in SECOND_AGE.items())
         problem = "does not tell whether its mass of stars includes remnants: wanted a mass of gas"
         raise data_error(file, f"{problem}, or a second age of {ages}, got {part.age[1]:g} yr")
     if take:
@@ -247,10 +236,9 @@ def _refine(wave, spectra):
     """Insert wavelengths beyond 10 um, log-log between neighbors, and go on to 160 um."""
     ends = wave[-1] < LONGEST * (1 - 1e-6)
     target = max(LONGEST, wave[-1])
+    points = wave
     if ends:
         points = np.append(wave, LONGEST)
-    else:
-        points = wave
     pieces = [points[points <= DENSE_FROM]]
     far = points[points > DENSE_FROM]
     if pieces[0].size:

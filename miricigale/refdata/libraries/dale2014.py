@@ -167,10 +167,7 @@ def _check_order(wave, log_power, color, places):
     """Columns belong to the alphas if their colors do (dhcal.dat has those of IRAS bands)."""
     log_fnu = (log_power + np.log10(wave)[:, None]).T
     at = np.log([60.0, 100.0])
-    rises = []
-    for row in log_fnu:
-        rises.append(np.subtract(*np.interp(at, np.log(wave), row)))
-    colors = np.array(rises)
+    colors = np.array([np.subtract(*np.interp(at, np.log(wave), row)) for row in log_fnu])
     worst = np.abs(colors - color).max()
     problem = f"does not fit {places[CALIBRATION]}: log f60/f100 differs by {worst:.2f}"
     check_data(worst <= 0.06, places[SPECTRA], f"{problem}, wanted less than 0.06")

@@ -72,27 +72,20 @@ def read_skirtor(path):
         wave, axes, spectra, files = _read_fits(path)
     else:
         wave, axes, spectra, files = _read_texts(path)
-    keys = []
-    for name in reversed(SKIRTOR_AXES):
-        keys.append(axes[name])
-    order = np.lexsort(keys)
+    order = np.lexsort([axes[name] for name in reversed(SKIRTOR_AXES)])
     axes = {name: np.asarray(axes[name])[order] for name in SKIRTOR_AXES}
     _check_product(path, axes)
     n = len(order)
-    if n == _WHOLE:
-        part = "the whole library"
-    else:
+    part = "the whole library"
+    if n != _WHOLE:
         part = f"a part of the library, {n:,} of {_WHOLE:,}"
     span = f"{wave.size} wavelengths, {wave[0]:g}-{wave[-1]:g} um"
     summary = (f"SKIRTOR 2016: {n:,} spectra ({part}) at {span}",)
-    ordered = {}
-    for name, array in spectra.items():
-        ordered[name] = array[order]
     return LibraryTable(
         name="torus.skirtor2016",
         wave=wave,
         axes=axes,
-        spectra=ordered,
+        spectra={name: array[order] for name, array in spectra.items()},
         units={"opening_angle": "deg", "inclination": "deg", "disk": "um-1", "dust": "um-1"},
         meta={
             "files": files,

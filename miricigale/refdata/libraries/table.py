@@ -143,11 +143,8 @@ class LibraryTable:
         index = dict(zip(places.tolist(), range(self.n_rows), strict=True))
         if len(index) < self.n_rows:
             row = next(i for i, place in enumerate(places.tolist()) if index[place] != i)
-            coordinates_of_row = []
-            for name, column in self.axes.items():
-                coordinates_of_row.append(f"{name} = {column[row]:g}")
-            coordinates = ", ".join(coordinates_of_row)
-            got = f"{coordinates} in rows {row} and {index[places[row]]}"
+            values = ", ".join(f"{name} = {column[row]:g}" for name, column in self.axes.items())
+            got = f"{values} in rows {row} and {index[places[row]]}"
             raise argument_error("axes", "different in every row", got)
         return index
 
