@@ -94,10 +94,9 @@ def best_model_table(
         parts[f"attenuation.stellar.{age}"] = stars[age] * escaping * (factor[age] - 1.0)
     for kind in ("lines", "continuum") if gas else ():
         for age in ("old", "young"):
+            through = of_gas
             if of_gas is None:
                 through = factor[age]
-            else:
-                through = of_gas
             parts[f"attenuation.nebular.{kind}_{age}"] = stars[kind, age] * (through - 1.0)
     parts = {name: mass * light for name, light in parts.items()}
     parts["dust"] = derived["dust_luminosity"] * chain.dust(chain.key(values, "dust"))

@@ -105,9 +105,8 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     check_data(filters, path, f"has no band that is known here, of {', '.join(chosen) or 'none'}")
     left_out = lost + [f"{name} (line)" for name in lines]
     named = {*_OWN, *chosen, *map(error_column, chosen)}
-    if bands is not None:
-        unused = []
-    else:
+    unused = []
+    if bands is None:
         unused = [name for name in table.colnames if name not in named]
     out = QTable()
     out["id"] = read_ids(table, path.name)
@@ -122,10 +121,9 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     no_error = []
     no_limit = []
     for name, band in filters.items():
+        column = None
         if error_column(band) in with_error:
             column = error_column(band)
-        else:
-            column = None
         flux, error = _fluxes(path, table, band, column)
         if column is None:
             no_error.append(band)
@@ -175,9 +173,8 @@ def _is_flux_of_line(column):
 def _fluxes(path, table, band, column):
     """Flux and error of a band in uJy, NaN where they are missing; 10 % of the flux without a column."""
     values = _numbers(path, table, band)
-    if column is None:
-        errors = None
-    else:
+    errors = None
+    if column is not None:
         errors = _numbers(path, table, column)
     missing, no_error = without_codes(values, errors)
     flux = np.where(missing | (values < THRESHOLD), np.nan, values)

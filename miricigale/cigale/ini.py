@@ -63,10 +63,9 @@ def parse_values(value, name):
     expression of numbers, lists and the functions of numpy in `FUNCTIONS`. Nothing is executed: the
     expression is taken apart, and anything else in it, or a value that is there twice, is a ValueError.
     """
+    items = value
     if isinstance(value, str):
         items = [value]
-    else:
-        items = value
     # an expression without quotes was split at its commas
     text = ", ".join(items)
     try:

@@ -52,9 +52,8 @@ def near_relation(fitter, photometry, results, max_deviation, *, redshift, seed)
     """
     new = results._mapped(np.array)
     for rows in chunks(len(results), _OBJECTS):
-        if redshift is None:
-            z = None
-        else:
+        z = None
+        if redshift is not None:
             z = np.asarray(redshift)[rows]
         with warnings.catch_warnings():
             # the fit has given this warning

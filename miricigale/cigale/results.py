@@ -132,10 +132,9 @@ def _columns(results, names, variables):
             mean = results.mean(ours).value * factor
             std = results.std(ours).value * factor
         columns[theirs] = (mean, std, best, unit)
+    wanted = variables
     if variables is None:
         wanted = columns
-    else:
-        wanted = variables
     check_names(wanted, "quantity of the results", columns)
     for name in columns.keys() - set(wanted):
         _, _, best, unit = columns[name]

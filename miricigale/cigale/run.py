@@ -216,9 +216,8 @@ def fit_cigale(
     if output is not None:
         setup.write_results(results, output, overwrite=overwrite)
     if best_models is not None:
+        xray = None
         if setup.xray_bands():
             xray = setup.xray
-        else:
-            xray = None
         write_best_models(results, best_models, xray=xray, overwrite=overwrite)
     return results

@@ -302,10 +302,9 @@ class CigaleSetup:
 
         def fit(redshift=None):
             fits = fitter.fit(photometry, redshift=redshift, **parallel)
+            max_deviation = 0.0
             if "l_2500" in fits.quantities:
                 max_deviation = self.max_dev_alpha_ox
-            else:
-                max_deviation = 0.0
             if not max_deviation:
                 return fits
             return near_relation(

@@ -29,18 +29,16 @@ def fit(args):
         if args.plots:
             from miricigale.fitting.results.object_plots import write_plots
 
-            if args.plots == ["all"]:
-                ids = None
-            else:
+            ids = None
+            if args.plots != ["all"]:
                 ids = args.plots
             options = {"overwrite": True, "progress_bar": args.progress_bar}
             write_plots(results["galaxy"], args.output / "plots", ids, **options)
     except KeyboardInterrupt:
         n_parts = len(list(args.output.glob("part-*.fits")))
+        command = "the same command, without --no-resume,"
         if args.resume:
             command = "the same command"
-        else:
-            command = "the same command, without --no-resume,"
         args.stopped = (
             f"stopped; {n_parts} finished parts are in {args.output}/; {command} resumes here"
         )

@@ -27,10 +27,9 @@ def data_list(args):
         return 1
     width = min(shutil.get_terminal_size((100, 24)).columns, 120)
     for name, record in records.items():
+        path = None
         if record.file:
             path = find_resource(name)
-        else:
-            path = None
         if path is not None:
             state = str(path)
         elif not record.file:

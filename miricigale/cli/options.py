@@ -356,10 +356,9 @@ def _add_options(parser, options, words):
         if option.get("heading", title) != title:
             title = option["heading"]
             section = parser.add_argument_group(title)
+        target = parser
         if flags.startswith("-"):
             target = section
-        else:
-            target = parser
         _add(target, groups, flags, option, words)
 
 

@@ -215,9 +215,8 @@ def bibtex(citations):
             lines = [f"  author = {{{authors}}}", f"  year = {{{match['year']}}}"]
             word += match["year"]
         n_keys[word] += 1
-        if n_keys[word] == 1:
-            key = word
-        else:
+        key = word
+        if n_keys[word] != 1:
             key = f"{word}_{n_keys[word]}"
         note = re.sub(r"([&%#_$])", r"\\\1", text)
         lines.append(f"  note = {{{note}}}")

@@ -71,10 +71,9 @@ def _sentence(err):
     """Return the message of an error in one line."""
     if not isinstance(err, KeyError):
         return " ".join(str(err).split())
+    message = ""
     if err.args:
         message = str(err.args[0])
-    else:
-        message = ""
     if " " in message:
         return " ".join(message.split())
     # the message of a KeyError may be the key alone

@@ -151,9 +151,8 @@ def fitted_noise(
     check_that(n_groups >= 2, "time", wanted, time)
     factor = excess_factor(excess)
     share = _share(filter, psf, size)
-    if mosaic is None:
-        boxes = ()
-    else:
+    boxes = ()
+    if mosaic is not None:
         boxes = (1.0, _pixels(mosaic, "mosaic"))
     weight = extraction_map(share, boxes)
     noise = ExposureNoise(

@@ -41,10 +41,9 @@ def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
 
 def _radii(aperture, annulus, setup):
     """Radii in arcsec, checked."""
+    radius = aperture
     if aperture is None:
         radius = setup.radius
-    else:
-        radius = aperture
     radius = scalar(radius, ANGLE, "aperture")
     check_that(0 < radius < 8, "aperture", "between 0 and 8 arcsec", aperture)
     if annulus is None:
@@ -59,9 +58,8 @@ def _extraction(radius, annulus, psf, correlation, filter):
     """Light in the extraction and noise powers, means over positions within the pixel."""
     psf = psf_of(psf, filter)
     scale = MIRI_PIXEL_SCALE.value
-    if annulus is None:
-        edges = None
-    else:
+    edges = None
+    if annulus is not None:
         edges = tuple(edge / scale for edge in annulus)
     values = []
     for offset in itertools.product(_PHASES, _PHASES):

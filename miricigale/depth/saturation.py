@@ -95,10 +95,9 @@ class SaturationForecast:
         step = exposure.group_time.to_value(u.s)
         group = saturation_group(rate, limit, step)
         good = rate[np.isfinite(rate)]
+        sky = np.nan
         if good.size:
             sky = float(np.median(good))
-        else:
-            sky = np.nan
         return cls(
             exposure,
             sky * u.electron / u.s,

@@ -78,9 +78,8 @@ class Charge(Timed):
     def read_variance(self):
         """Variance of one read in DN squared: read noise and rounding."""
         effect = self._effect(ReadNoise)
-        if effect is None:
-            sigma = 0.0
-        else:
+        sigma = 0.0
+        if effect is not None:
             sigma = effect.deviation(self.properties)
         return sigma**2 + 1 / 12
 
@@ -109,9 +108,8 @@ class Charge(Timed):
     def limit(self, dn):
         """Charge in electrons that reads ``dn`` above the level, or at which the pixel is full."""
         effect = self._effect(Nonlinearity)
-        if effect is None:
-            linear = dn
-        else:
+        linear = dn
+        if effect is not None:
             linear = float(effect.linear_dn(dn, self.properties))
         full = min(effect.limit(self.properties) for effect in self.effects)
         return min(self.properties.gain * linear, full)

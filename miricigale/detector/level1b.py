@@ -159,9 +159,8 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False, ob
         primary["FILENAME"] = filename
         science["BUNIT"] = "DN"
     begun = primary.get("EXPSTART")
-    if begun is None:
-        times = None
-    else:
+    times = None
+    if begun is not None:
         times = _int_times(exposure, begun)
     shape = (exposure.n_integrations, exposure.n_groups) + exposure.shape
     axes = [("NAXIS", len(shape))] + [(f"NAXIS{i + 1}", n) for i, n in enumerate(shape[::-1])]

@@ -157,10 +157,9 @@ class Ramp(Interactive, NDData):
     @property
     def history(self):
         """Who made the counts and what was done to them, `~miricigale.instrument.ExposureHistory`."""
+        header = {}
         if self.observed:
             header = self.header
-        else:
-            header = {}
         history = ExposureHistory.from_header(header, recorded=self.simulated)
         return history.replace(steps=self.steps)
 
@@ -254,9 +253,8 @@ class Ramp(Interactive, NDData):
         x, y = map(operator.index, pixel)
         check_that(0 <= x < nx and 0 <= y < ny, "pixel", f"(x, y) below ({nx}, {ny})", pixel)
         time = (np.arange(self.shape[1]) + 1) * self.group_time
-        if self.group_dq is None:
-            flags = None
-        else:
+        flags = None
+        if self.group_dq is not None:
             flags = self.group_dq[:, :, y, x] != 0
         title = f"pixel ({x}, {y})"
         return plot_ramp(time, self.data[:, :, y, x], flags, ax=ax, title=title, **kwargs)

@@ -83,10 +83,9 @@ def posterior_ranks(true, values, levels, *, seed=None):
     step = last - first > 1
     low = np.where(first > 0, levels[rows, np.minimum(first, k - 1)], 0.0)
     high = np.where(last < k, levels[rows, np.maximum(last - 1, 0)], 1.0)
+    part = 0.5
     if seed is not None:
         part = inside
-    else:
-        part = 0.5
     ranks = np.where(step, low + part * (high - low), ranks)
     return np.where(good, ranks, np.nan)
 

@@ -29,9 +29,8 @@ def _plain_values(values, name, dtype):
     if dtype is float:
         return floats(values)
     values, mask = without_mask(values)
-    if mask is None:
-        n_masked = 0
-    else:
+    n_masked = 0
+    if mask is not None:
         n_masked = int(np.count_nonzero(mask))
     check_that(mask is None, name, "without masked values", f"{n_masked} of them")
     if dtype is bool:
@@ -73,10 +72,9 @@ def sigma_mad(values, *, axis=None, ignore_nan=False):
     values = floats(values)
     if values.size == 0:
         return np.nan
+    median = np.median
     if ignore_nan:
         median = np.nanmedian
-    else:
-        median = np.median
     deviation = np.abs(values - median(values, axis=axis, keepdims=True))
     sigma = 1.48 * median(deviation, axis=axis)
     if axis is None:
@@ -179,10 +177,9 @@ def photoz_metrics(z_true, z_fit):
     good = np.isfinite(z_true) & np.isfinite(z_fit)
     delta = (z_fit[good] - z_true[good]) / (1 + z_true[good])
     n_out = int(np.count_nonzero(np.abs(delta) > OUTLIER))
+    bias = np.nan
     if delta.size:
         bias = float(np.median(delta))
-    else:
-        bias = np.nan
     scatter = sigma_mad(delta)
     share, share_low, share_high = fraction_interval(n_out, delta.size)
     n_bad = int(np.sum(~good))
@@ -288,10 +285,9 @@ def running_median(x, y, *, size=20):
     order = np.argsort(x[good], kind="stable")
     x = x[good][order]
     y = y[good][order]
+    n_bins = 0
     if x.size:
         n_bins = max(1, x.size // size)
-    else:
-        n_bins = 0
     edges = [k * size for k in range(n_bins)] + [x.size]
     bins = [slice(a, b) for a, b in itertools.pairwise(edges)]
     return (

@@ -152,15 +152,13 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None, same_exposure
             row["seed"] = stream(seed, "paper", published.key)
             ours = measure(study, published.quantity, **row, n_draws=n_draws)
         judged = same_exposures or published.quantity == "extra"
+        sigma = np.nan
         if judged:
             sigma = _difference(published, ours)
-        else:
-            sigma = np.nan
         why = reasons.get(published.key, published.why)
+        verdict = OTHER_EXPOSURES
         if judged:
             verdict = _verdict(published, ours, sigma, why)
-        else:
-            verdict = OTHER_EXPOSURES
         description = published.text
         if QUANTITIES.get(published.quantity):
             description = f"{QUANTITIES[published.quantity]}: {description}"

@@ -203,10 +203,9 @@ def _class_share(study, sky, band_set, option, draws):
 
 def _truths(study, sky, column):
     """One truth, or all with an AGN if none is given, that have a column."""
+    truths = (sky,)
     if sky is None:
         truths = study.with_agn
-    else:
-        truths = (sky,)
     return [t for t in truths if column in t.truth.colnames]
 
 
@@ -368,10 +367,9 @@ def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_
     0.25
     """
     check_names([quantity], "quantity", _MEASURES)
+    sky = truth
     if isinstance(truth, (int, float)):
         sky = study.at(truth)
-    else:
-        sky = truth
     if sky is None and not (truth is None and quantity in _OF_ALL + _TRENDS):
         return Estimate(np.nan)
     lacks_fit = sky is not None and quantity in OF_FITS and band_set not in sky.fits

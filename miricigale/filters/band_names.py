@@ -156,9 +156,8 @@ def known_filter(label, names, kind):
         If it is none of them.
     """
     text = str(getattr(label, "name", label))
-    if text in names:
-        name = text
-    else:
+    name = text
+    if text not in names:
         name = find_filter(text)
     if name not in names:
         raise unknown_name(kind, text, names)
@@ -287,9 +286,8 @@ def band_filters(bands, names):
     for band in bands:
         filter_name = names.get(band)
         our_name = filter_of_band(band) or (band if xray_energies(band) else None)
-        if filter_name is None:
-            name = our_name
-        else:
+        name = our_name
+        if filter_name is not None:
             name = filter_name.name
         if is_line(band):
             name = None

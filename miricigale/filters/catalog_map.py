@@ -397,10 +397,9 @@ class CatalogMap:
     def _errors(self, column, name, errors, flux, ab, argument):
         """Errors of fluxes in uJy, from those in the file's unit."""
         has_unit = not ab or name in self.units or "flux" not in self.units
+        unit = u.mag
         if has_unit:
             unit = self._unit_of_column(name, column, not ab, argument)
-        else:
-            unit = u.mag
         factor = self.error_factors.get(name.removesuffix(error_column("")), 1.0)
         if ab and (unit in (None, u.mag, u.dimensionless_unscaled) or _is_ab(unit)):
             return _PER_MAGNITUDE * flux * errors * factor
@@ -450,9 +449,8 @@ def _translated(rows, path):
             if band is None:
                 left_out += [theirs] if kind == "F" else []
                 continue
-            if kind == "F":
-                ours = band
-            else:
+            ours = band
+            if kind != "F":
                 ours = error_column(band)
             problem = f"has two columns for {ours} ({meaning}): {columns.get(ours)} and {theirs}; remove one"
             check_data(ours not in columns, path, problem)
@@ -487,10 +485,9 @@ def _angles(column, unit, name, argument):
 
 def _unit(unit, name):
     """A unit that the caller gave; AB magnitudes by any of their names."""
+    flux = None
     if isinstance(unit, (str, u.UnitBase)):
         flux = flux_unit(unit)
-    else:
-        flux = None
     if flux is not None:
         return flux
     try:

@@ -96,10 +96,9 @@ def read_curve(path, unit=None):
         one that is named, a wavelength is there more than twice, or a throughput is below -5 % of the peak.
     """
     path = Path(path).expanduser()
+    read = _of_text
     if table_suffix(path) in TABLE_FORMATS:
         read = _of_table
-    else:
-        read = _of_text
     wave, throughput, energy, name, options = read(path, unit)
     wave, throughput = _ascending(wave, throughput, path)
     if energy:

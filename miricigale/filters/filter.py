@@ -250,10 +250,9 @@ class Filter(Frozen, Interactive):
         try:
             # text alone may be a unit too
             is_wave = not isinstance(text, str) or re.match(r"\s*[\d.]+\s*[A-Za-zµ]", text)
+            wave = None
             if is_wave:
                 wave = u.Quantity(text)
-            else:
-                wave = None
         except (TypeError, ValueError):
             wave = None
         if wave is None:

@@ -86,10 +86,9 @@ def given_filters(names):
 
 
 def _as_named_filter(band, curve):
+    ends = None
     if isinstance(curve, str):
         ends = xray_energies(curve)
-    else:
-        ends = None
     if ends is not None:
         return Filter(_KEV / np.array(ends)[::-1] * u.um, [1.0, 1.0], name=curve)
     filter_ = as_filter(curve, band, unit=u.AA)

@@ -65,9 +65,8 @@ def read_curve(curve):
 
 
 def _load(name):
-    if name.startswith(SEDPY):
-        metadata = {}
-    else:
+    metadata = {}
+    if not name.startswith(SEDPY):
         metadata = FILTERS.metadata(name)
     curve = metadata.pop("curve", name.removeprefix(SEDPY))
     wave, throughput, n_negative = read_curve(curve)

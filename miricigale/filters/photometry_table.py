@@ -346,9 +346,8 @@ def _band_of(name, bands):
 
 
 def _find(text, bands):
-    if text in bands:
-        band = text
-    else:
+    band = text
+    if text not in bands:
         band = find_filter(text)
     if band in bands:
         return band

@@ -79,9 +79,8 @@ def spectrum_arrays(sed, bands):
     is_converted = unit == FNU
     if unit is not None and (unit * u.sr).is_equivalent(FNU, u.spectral_density(1 * WAVE)):
         raise units_error("sed", "a flux density; multiply by the solid angle", unit)
-    if is_converted:
-        spectral = []
-    else:
+    spectral = []
+    if not is_converted:
         spectral = u.spectral_density(wave * WAVE)
     fnu = to_array(flux, FNU, "sed.fnu", ndim=1, equivalencies=spectral)
     got = f"{fnu.size} for {wave.size} wavelengths"

@@ -151,9 +151,8 @@ class PriorField:
             Of the prior, as the user's photometry takes them.
         """
         inputs = self.inputs
-        if sources is None:
-            n = 0
-        else:
+        n = 0
+        if sources is not None:
             n = len(sources)
         light = prior_light = None
         if n and image_file is None:
@@ -164,10 +163,9 @@ class PriorField:
             prior_light = light_on_file(
                 inputs.highres, sources, sources["prior_flux"], psfs[1], self.n_threads
             )
+        file = image_file
         if image_file is None:
             file = inputs.images[0]
-        else:
-            file = image_file
         pixels = Pixels(inputs.highres.read(prior_light), [], {self.band: file.read(light)})
         segments, catalog = inputs.find_sources(pixels, inputs.catalog)
         detected = inputs.segmentation is None and inputs.catalog is None
@@ -303,9 +301,8 @@ class ImageField:
 
     def measure(self, sources=None, psfs=None, former=None, image_file=None):
         """As `PriorField.measure`; ``former`` are the sources of the field with their shapes."""
-        if sources is None:
-            n = 0
-        else:
+        n = 0
+        if sources is not None:
             n = len(sources)
         light = None
         if n and image_file is None:
@@ -337,10 +334,9 @@ class ImageField:
 
 def with_shapes(former, sources):
     """A catalog of Sersic profiles and points: those of the field, and after them what is injected."""
+    tables = [former, sources]
     if sources is None:
         tables = [former]
-    else:
-        tables = [former, sources]
     rows = QTable()
     ids = np.asarray(former["id"])
     if sources is not None:

@@ -82,9 +82,8 @@ def light_on_image(sources, flux, wcs, shape, psf, n_threads=None):
     rows["id"] = np.arange(1, len(rows) + 1)
     rows["redshift"] = np.full(len(rows), np.nan)
     # light has no color here
-    if psf.filter is None:
-        band = "miri.f770w"
-    else:
+    band = "miri.f770w"
+    if psf.filter is not None:
         band = psf.filter
     rows[band] = flux
     wcs = wcs.deepcopy()

@@ -50,10 +50,9 @@ def write_page(path, result, name, *, in_ramps=False):
     page = SectionWriter(report, declared("miricigale.injection"))
     is_star = np.asarray(result.sources["kind"]) == "star"
     facts = subset(meta, ("n_trials", "preset", "threshold"))
+    positions = "the injected sources, taken as known"
     if meta.get("prior_band"):
         positions = "the prior"
-    else:
-        positions = "the injected sources, taken as known"
     facts |= {"n": len(result.sources), "n_stars": int(is_star.sum()), "positions": positions}
     page.section("answer", **facts)
     page.items(_headline(result))
@@ -65,20 +64,17 @@ def write_page(path, result, name, *, in_ramps=False):
         page.table("table", row_dicts(Table(result.recovery(by))), by=_HEADS[by])
     page.section("purity")
     for by in BINNED_BY:
-        if by == "size":
-            head = "size (arcsec, rms)"
-        else:
+        head = "size (arcsec, rms)"
+        if by != "size":
             head = _HEADS[by]
         page.table("table", row_dicts(Table(result.purity(by))), by=head)
     has_catalog = np.any(np.asarray(result.sources["row"]) >= 0)
+    drawn = "those of the field's sources"
     if has_catalog:
         drawn = "those of the catalog"
-    else:
-        drawn = "those of the field's sources"
+    noise = "it has no photon noise of its own"
     if in_ramps:
         noise = "in ramps it has its photon noise"
-    else:
-        noise = "it has no photon noise of its own"
     page.section("method", drawn=drawn, apart=f"{APART:g}", noise=noise)
     report.write(path, overwrite=True)
 

@@ -271,9 +271,8 @@ def trial_stage(context, unit):
 
 
 def _usable(base, field, task):
-    if task.inputs is None:
-        prior = None
-    else:
+    prior = None
+    if task.inputs is not None:
         prior = task.inputs.highres.read()
     return field.usable(base.model, prior)
 
@@ -345,9 +344,8 @@ def run_injection(
     """Run a `~miricigale.injection.Injection`; see its method ``run``."""
     foreign = sorted(set(options) & set(_FOREIGN))
     check_that(not foreign, "options", f"others than {list(_FOREIGN)}", foreign)
-    if isinstance(image, MosaicFile):
-        file = image
-    else:
+    file = image
+    if not isinstance(image, MosaicFile):
         file = MosaicFile(image)
     inputs = None
     if highres is not None:

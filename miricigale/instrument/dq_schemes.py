@@ -69,10 +69,9 @@ def bad_pixels(values, header, get, path):
         if instrument == "WFC3" and not detector:
             # filters of the two channels have other names: F160W, F606W
             is_infrared = keyword_text(get, "FILTER").startswith(("F0", "F1", "G1"))
+            detector = "UVIS"
             if is_infrared:
                 detector = "IR"
-            else:
-                detector = "UVIS"
         harmless = _HST_HARMLESS.get((instrument, detector), 0)
         return values & ~harmless != 0, f"bits of HST {instrument} without {harmless}"
     bad = values != 0

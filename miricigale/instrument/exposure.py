@@ -185,10 +185,9 @@ class Exposure(Interactive):
         aperture(subarray)
         group = frames_per_group(readout) * frame_time(readout, subarray)
         if (n_groups is None) == (time is None):
+            got = "both"
             if time is None:
                 got = "neither"
-            else:
-                got = "both"
             raise argument_error("n_groups, time", "one of them given", got)
         counts = {"dither": check_count(dither, "dither", 0)}
         if n_integrations is not None:

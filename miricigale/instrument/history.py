@@ -93,10 +93,9 @@ class ExposureHistory:
         -------
         history : `ExposureHistory`
         """
+        origin = "other"
         if header.get("ORIGIN") == ORIGIN:
             origin = "unrecorded"
-        else:
-            origin = "other"
         # the first six letters of the type in CRDS
         words = {name: f"R_{TYPES.get(name, name)[:6].upper()}" for name in REFERENCES}
         stated_files = {name: str(header[word]) for name, word in words.items() if word in header}

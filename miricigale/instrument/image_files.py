@@ -130,10 +130,9 @@ def _unit(header, path):
             return with_adu(u.Unit(text))
     except ValueError:
         pass
+    got = "none"
     if text:
         got = f"BUNIT = {text!r}"
-    else:
-        got = "none"
     wanted = "must state the unit of its pixels, such as MJy/sr, in the keyword BUNIT"
     raise data_error(path, f"{wanted}, got {got}")
 
@@ -185,10 +184,9 @@ def read_image(path, *, planes=()):
         check_data("SCI" in hdus, path, f"has no SCI extension, only {names}")
         header = hdus["SCI"].header
         wcs = header_wcs(header, where=str(path))
+        error = None
         if "ERR" in hdus:
             error = np.array(hdus["ERR"].data, np.float32)
-        else:
-            error = None
         image = Image(
             np.array(hdus["SCI"].data, np.float32),
             unit=_unit(header, path),

@@ -221,10 +221,9 @@ def electron_rate(filter, background=None, *, detector=None, subarray="FULL"):
     """
     if detector is None:
         detector = miri_detector()
+    level = background
     if background is None:
         level = background_level(filter)
-    else:
-        level = background
     level = to_array(level, SURFACE_BRIGHTNESS, "background")
     electrons = electrons_per_brightness(filter, detector, subarray=subarray)
     return level * electrons + detector.dark_current

@@ -124,10 +124,9 @@ class Page:
         shown = []
         for row in rows:
             shown.append([marks[c.reason] if isinstance(c, Missing) else c for c in row])
+        words = text
         if isinstance(text, int):
             words = range(text)
-        else:
-            words = text
         return self._add("table", shown, header, set(words), caption, marks)
 
     def figure(self, figure, caption=""):

@@ -64,10 +64,9 @@ class SectionWriter:
         """Begin a section, with the paragraph ``text`` where it has that."""
         self._section = name
         texts = self.texts[name]
+        paragraph = ""
         if text in texts:
             paragraph = self.sentence(text, **facts)
-        else:
-            paragraph = ""
         title = sentence(texts.get("title", ""), self.facts | facts)
         closed = sentence(texts.get("closed", ""), self.facts | facts)
         self.report.section(title, paragraph, closed=closed)
@@ -102,10 +101,9 @@ class SectionWriter:
         table = self.texts[self._section][name]
         rows = list(rows)
         facts = self.facts | facts
+        keys = ()
         if rows:
             keys = list(rows[0])
-        else:
-            keys = ()
         columns = {}
         for header, *column in table.get("columns", [(key, key) for key in keys]):
             if column[0] in keys:

@@ -81,10 +81,9 @@ def number(value, spec, reason, *, error=None):
     if "{" in spec:
         return spec.format(value)
     spec, percent, unit = spec.partition(" %")
+    scale = 1
     if percent:
         scale = 100
-    else:
-        scale = 1
     text = f"{scale * value:{spec}}"
     if error is not None and np.isfinite(error):
         text += f" ± {scale * error:{spec.lstrip('+')}}"

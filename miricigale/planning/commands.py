@@ -107,10 +107,9 @@ def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=F
     comparison = comparison_table(planner, plans)
     comparison.meta |= {"answer": answer(planner, plans, comparison)}
     comparison.meta |= {"noise": dataclasses.asdict(config.noise)}
+    areas = None
     if config.survey.areas:
         areas = area_table(planner, planner.divide())
-    else:
-        areas = None
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / "plan.toml", overwrite=overwrite) as partial:
         partial.write_text(config.to_toml(), encoding="utf-8")

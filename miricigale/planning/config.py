@@ -388,8 +388,7 @@ def load_plan(path=None, *, overrides=None):
     >>> config.exposures.time
     (900.0,)
     """
-    if path is None:
-        texts = []
-    else:
+    texts = []
+    if path is not None:
         texts = [(str(path), read_text(path))]
     return PlanConfig.from_texts(texts, overrides)

@@ -41,10 +41,9 @@ def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0):
         mid, median, sigma = running
         ax.fill_between(mid, median - sigma, median + sigma, color=SECOND, alpha=0.18, lw=0)
         # a single bin makes no line
+        mark = None
         if len(mid) == 1:
             mark = "o"
-        else:
-            mark = None
         ax.plot(mid, median, color=SECOND, lw=1.8, marker=mark, label="running median, scatter")
         legend(ax, loc="lower left")
     ax.set(ylim=(-limit, limit), title=title)

@@ -26,10 +26,9 @@ def _robust(image):
     middle = float(np.median(values))
     # the darker half knows little of sources
     low = values[values <= middle]
+    sigma = 0.0
     if low.size:
         sigma = 1.4826 * float(np.median(middle - low))
-    else:
-        sigma = 0.0
     return middle, sigma if sigma > 0 else float(values.std()) or 1.0
 
 
@@ -37,10 +36,9 @@ def _limits(image):
     """Values of the ends of the colors: from two sigma below the median to what is bright."""
     middle, sigma = _robust(image)
     finite = image[np.isfinite(image)]
+    high = 1.0
     if finite.size:
         high = np.percentile(finite, 99.7)
-    else:
-        high = 1.0
     return middle - 2 * sigma, max(high, middle + 8 * sigma)
 
 

@@ -72,9 +72,8 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     if truth is not None:
         ax.axvline(truth, color="black", linestyle="--", linewidth=1)
     if label is not None:
-        if unit == u.dimensionless_unscaled:
-            text = ""
-        else:
+        text = ""
+        if unit != u.dimensionless_unscaled:
             text = f" ({unit.to_string()})"
         ax.set_xlabel(f"{label}{text}")
     ax.set_ylabel("probability density" + (" per dex" if log else ""))
@@ -271,10 +270,9 @@ def _points(groups, is_used, limit):
     for name, (color, marker) in zip(dict.fromkeys(names.tolist()), itertools.cycle(_GROUPS)):
         for rows, fill in ((is_used, "full"), (~is_used, "none")):
             style = {"color": color, "marker": marker, "fillstyle": fill, "markersize": 5, "ls": ""}
+            label = None
             if name and fill == "full":
                 label = name
-            else:
-                label = None
             points.append((rows & ~limit & (names == name), label, style))
     return points
 

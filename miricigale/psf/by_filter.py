@@ -148,10 +148,9 @@ def checked_psf(
     ValueError: 'psf' must be a PSF of F1500W, about 0.521 arcsec wide (FWHM), got one of 1.2 arcsec...
     """
     psf = instrument_psf(psf, argument)
+    scale = pixel_scale
     if pixel_scale is None:
         scale = psf.pixel_scale
-    else:
-        scale = pixel_scale
     angle = psf.angle
     form = {"pixel_scale": scale, "grid_angle": angle, "resampling": resampling}
     if psf.frame == "detector":
@@ -185,10 +184,9 @@ def checked_psf(
         unturned = psf_image(unturned, **place)
         _check_turn(psf, (x, y), (stamp, unturned), (width, filter, pa), argument)
     if not 1 - _NARROWER < ratio < 1 + _WIDER:
+        word = "narrower"
         if ratio > 1:
             word = "wider"
-        else:
-            word = "narrower"
         msg = (
             f"'{argument}' is {abs(ratio - 1):.0%} {word} (FWHM {width:.3g} arcsec) than the model of "
             f"{filter}: does it hold the pixel, the drizzling and no more?"
@@ -239,10 +237,9 @@ def _scaled(psf, expected, filter_, argument):
     if psf.total_known:
         return psf
     held = psf.enclosed
+    enclosed = expected
     if held < _UNIT_SUM and abs(held - expected) < _NEAR_SUM:
         enclosed = held
-    else:
-        enclosed = expected
     width = 2 * psf.half_width
     msg = (
         f"'{argument}' sums to {held:.4g} and is taken to hold {enclosed:.3f} of the light on its "

@@ -102,10 +102,9 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", **options):
     >>> grid.data.shape
     (4, 55, 55)
     """
+    side = 0
     if n_psfs >= 4:
         side = round(n_psfs**0.5)
-    else:
-        side = 0
     check_that(side**2 == n_psfs, "n_psfs", "a square number of at least 4", n_psfs)
     part = aperture(subarray)
     ny, nx = part.shape

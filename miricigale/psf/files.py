@@ -136,9 +136,8 @@ class PSFFile:
         ValueError
             If the two differ by more than 2 %.
         """
-        if self.cell is None:
-            in_header = None
-        else:
+        in_header = None
+        if self.cell is not None:
             in_header = self.cell * oversampling
         if user_scale is None:
             if in_header is None:
@@ -227,23 +226,20 @@ class PSFFile:
 
 def _planes(hdu, path, wanted, plane):
     """The image of an extension, or the planes of its cube, shape (n, ny, nx)."""
+    data = None
     if hdu.is_image:
         data = hdu.data
-    else:
-        data = None
     shape = getattr(data, "shape", None)
     if shape is not None and len(shape) == 3 and shape[0] == 1 and plane is None:
         data = data[0]
         shape = data.shape
+    n_axes = 3
     if plane is None:
         n_axes = 2
-    else:
-        n_axes = 3
     if shape is None or len(shape) != n_axes:
+        kind = "a cube"
         if plane is None:
             kind = "an image"
-        else:
-            kind = "a cube"
         hint = "; say FILE[EXTENSION,PLANE] or FILE[EXTENSION,mean] of a cube"
         raise data_error(path, f"must be {kind} with {wanted}, got the shape {shape}{hint}")
     if isinstance(plane, int) and not 0 <= plane < shape[0]:
@@ -337,10 +333,9 @@ def header_grid(header):
     for key in ("PIXELSCL", "PIXSCALE"):
         if isinstance(header.get(key), (int, float)) and header[key] > 0:
             stated[key] = float(header[key])
+    wcs = None
     if "CTYPE1" in header:
         wcs = header_wcs(header, where="the PSF or kernel")
-    else:
-        wcs = None
     if wcs is not None:
         wcs.wcs.set()
         matrix = wcs.pixel_scale_matrix
@@ -455,10 +450,9 @@ def read_psf(
     if pixel_scale is None:
         raise argument_error("pixel_scale", "given where the header does not state it", None)
     if frame is None:
+        frame = "sky"
         if psf_file.on_detector:
             frame = "detector"
-        else:
-            frame = "sky"
     if frame == "detector" and isinstance(header.get("PA_APER"), (int, float)):
         options.setdefault("pa_aper", float(header["PA_APER"]) * u.deg)
     if frame == "sky":

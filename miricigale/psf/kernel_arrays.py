@@ -14,10 +14,9 @@ def convolved(image, array):
     check_that(image.ndim == 2, "image", "2D", f"shape {image.shape}")
     bad = int(np.count_nonzero(~np.isfinite(image)))
     check_that(not bad, "image", "finite", f"{bad} pixels that are NaN or infinite")
+    convolve = fftconvolve
     if min(image.shape) > 2 * array.shape[0]:
         convolve = oaconvolve
-    else:
-        convolve = fftconvolve
     full = convolve(image, array, mode="full")
     h = array.shape[0] // 2
     return full[h : h + image.shape[0], h : h + image.shape[1]]

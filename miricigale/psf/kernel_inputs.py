@@ -82,9 +82,8 @@ def psf_pair(
             text = f"light beyond the PSFs' grids, by their own sums and wings: {text}. The kernel "
             text += "is normalized to 1: fluxes lack what lies beyond. Give the PSFs' 'enclosed' "
             warn(text + "(make_psf, read_psf) or 'normalize'", PSFWarning)
-    if normalize:
-        energy = 1.0
-    else:
+    energy = 1.0
+    if not normalize:
         energy = held[1]
     mended = {"energy": energy, "held": held, "centering": centering}
     return images[0] / held[0], images[1] * (energy / held[1]), mended
@@ -111,10 +110,9 @@ def _from_array(array, name, scale, angle, grid_angle, normalize):
     total = array.sum()
     wanted = "a PSF whose sum is the fraction of light it holds (or 'normalize' True)"
     check_that(0 < total < (np.inf if normalize else 1.02), name, wanted, f"a sum of {total:.6g}")
+    frame = "detector"
     if angle is None:
         frame = "sky"
-    else:
-        frame = "detector"
     try:
         return make_psf(
             array, pixel_scale=scale * ANGLE, frame=frame, angle=grid_angle,
@@ -134,9 +132,8 @@ def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
     if resampling:
         psf = psf_mosaic(psf, scale * ANGLE, angle, grid_angle=grid_angle)
     else:
-        if angle is None:
-            angles = [None]
-        else:
+        angles = [None]
+        if angle is not None:
             angles = list(np.atleast_1d(angle))
         try:
             rotated = [
@@ -162,10 +159,9 @@ def ready_arrays(array, scale, **psfs):
     total = float(array.sum())
     check_that(0.9 <= total <= 1.1, "array", "a kernel whose sum is 1", f"a sum of {total:.6g}")
     array = array / total
+    texts = []
     if abs(total - 1) > 1e-3:
         texts = [f"summed to {total:.4f} and was brought to 1"]
-    else:
-        texts = []
     c = array.shape[0] // 2
     x, y, _ = _core.core_moments(array)
     if not np.hypot(x - c, y - c) < 0.1:

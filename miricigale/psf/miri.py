@@ -97,10 +97,9 @@ def _miri_data(telescope, oversampling, fov, includes, calibration, position=Non
     constants = jwst_constants()
     jitter = 0.0
     if "jitter" in includes:
+        extra = 0.0
         if calibration == "flight":
             extra = _IN_FLIGHT_BLUR.get(name, 0.0)
-        else:
-            extra = 0.0
         jitter = math.hypot(constants["jitter"], extra) / scale
     if "cruciform" in includes:
         form = {"oversampling": oversampling, "calibration": calibration}
@@ -202,15 +201,13 @@ def miri_psf(
     telescope = Telescope.of(name, _V3_ANGLE, wavefront_error, seed)
     # written order, whatever the caller's
     effects = tuple(effect for effect in EFFECTS if effect in includes)
-    if position is None:
-        place = None
-    else:
+    place = None
+    if position is not None:
         place = (*map(float, position), subarray)
     data, scale = _miri_data(telescope, oversampling, width, effects, calibration, place)
+    scattered = 0.0
     if "cruciform" in effects:
         scattered = cruciform_fraction(name, calibration=calibration)
-    else:
-        scattered = 0.0
     meta = {
         "instrument": "MIRI",
         "calibration": calibration,

@@ -112,10 +112,9 @@ class InstrumentPSF(ImagePSF):
             # masked pixels are refused as NaN is
             data = floats(data)
         super().__init__(data, oversampling=cells, origin=origin, meta=dict(meta or {}))
+        turn = 0.0
         if frame == "sky":
             turn = scalar(angle, u.deg, "angle")
-        else:
-            turn = 0.0
         self.pixel_scale = scale * ANGLE
         self.frame = frame
         self.angle = turn * u.deg
@@ -132,14 +131,12 @@ class InstrumentPSF(ImagePSF):
     def __repr__(self):
         ny, nx = self.data.shape
         cells = f"{ny} x {nx} cells of {self.cell:.4g} arcsec"
+        name = ""
         if self.filter:
             name = f"{self.filter}, "
-        else:
-            name = ""
+        held = ""
         if self.includes:
             held = f", with {', '.join(self.includes)}"
-        else:
-            held = ""
         return f"<InstrumentPSF {name}{cells}, frame of the {self.frame}{held}>"
 
     def encircled_energy(self, radius):

@@ -267,9 +267,8 @@ def psf_mosaic(
     check_that(0 < pixfrac <= 1, "pixfrac", "above 0 and at most 1", pixfrac)
     scale = positive(pixel_scale, ANGLE, "pixel_scale")
     grid = _degrees(grid_angle, "grid_angle")
-    if pa is None:
-        angles = [None]
-    else:
+    angles = [None]
+    if pa is not None:
         angles = list(np.atleast_1d(pa))
     turns = [_turn_by(psf, angle, grid, "pa") for angle in angles]
     if oversampling is None:

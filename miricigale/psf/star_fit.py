@@ -285,10 +285,9 @@ class StarPSF:
         psf : `~numpy.ndarray`, shape (n, n)
         """
         terms = self._state[: len(TERMS)]
+        image = model
         if model is None:
             image = self._model
-        else:
-            image = model
         # in steps, since changes are linear for small ones
         for _ in range(_STEPS if terms.any() else 0):
             image = image + np.tensordot(terms / _STEPS, derivatives(image, self._fwhm), 1)

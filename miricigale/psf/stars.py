@@ -124,9 +124,8 @@ def _places(image, stars):
         if not {"x", "y"} <= set(stars.colnames):
             raise argument_error("stars", "tables with 'x' and 'y', or 'sky'", stars.colnames)
         return np.stack([np.asarray(stars[name], float) for name in "xy"], axis=1)
-    if isinstance(stars, SkyCoord):
-        sky = stars
-    else:
+    sky = stars
+    if not isinstance(stars, SkyCoord):
         sky = stars["sky"]
     check_that(image.wcs is not None, "stars", "'x' and 'y' for images without a WCS", "the sky")
     return np.stack(np.atleast_1d(*image.wcs.world_to_pixel(sky)), axis=1)

@@ -37,9 +37,8 @@ def odd_cells(width, cell):
 
 def checked_grid(oversampling, fov, default):
     """Cells per pixel and width in arcsec of a PSF's grid."""
-    if fov is None:
-        width = default
-    else:
+    width = default
+    if fov is not None:
         width = positive(fov, ANGLE, "fov")
     return check_count(oversampling, "oversampling"), width
 

@@ -36,10 +36,9 @@ def checked_square(value, name, *, odd=True):
     """An array as floats, checked: square, odd, finite; ``name`` is the argument's."""
     value = floats(value)
     if value.ndim != 2 or value.shape[0] != value.shape[1] or (odd and value.shape[0] % 2 == 0):
+        wanted = "square"
         if odd:
             wanted = "square with an odd number of pixels"
-        else:
-            wanted = "square"
         raise argument_error(name, wanted, f"shape {value.shape}")
     check_that(np.all(np.isfinite(value)), name, "finite", "NaN or infinite pixels")
     return value

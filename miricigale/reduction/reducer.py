@@ -393,10 +393,9 @@ class Reducer(Interactive):
             exposure = self.fit_ramp(exposure)
         wanted = "a Ramp, a Charge, CCDData or a path"
         check_that(isinstance(exposure, CCDData), "exposure", wanted, type(exposure).__name__)
+        rate = None
         if exposure.unit.is_equivalent(RATE):
             rate = exposure
-        else:
-            rate = None
         if rate is None and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
             wanted = f"in {RATE} or {SURFACE_BRIGHTNESS}"
             raise argument_error("exposure", wanted, exposure.unit)

@@ -169,10 +169,9 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     ids = id_column(catalog.colnames, argument)
     if ids is None:
         looks = likely_ids(catalog)
+        hint = ""
         if looks:
             hint = f" ({looks[0]!r} looks like ids: name it 'id')"
-        else:
-            hint = ""
         raise argument_error(
             argument, "a table with the columns ['id']", f"columns {catalog.colnames}{hint}"
         )
@@ -208,9 +207,8 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
         catalog["star"] = np.zeros(len(catalog), dtype=bool)
     star = catalog["star"]
     if star.dtype != bool or np.any(getattr(star, "mask", False)):
-        if star.dtype == bool:
-            got = "missing values"
-        else:
+        got = "missing values"
+        if star.dtype != bool:
             got = star.dtype
         raise argument_error(argument, "a table with True or False in 'star'", got)
     catalog["flags"] = _flags(catalog)
@@ -235,10 +233,9 @@ def _fill_columns(table, argument):
     table["profile"] = np.where(usable, "sersic", "point")
     n = int(np.count_nonzero(~usable))
     if n:
+        why = "incomplete or not positive shapes"
         if missing:
             why = f"no column {missing[0]!r}"
-        else:
-            why = "incomplete or not positive shapes"
         yield f"{n} of {len(table)} sources are points ({why})"
 
 

@@ -112,10 +112,9 @@ def _missing_fluxes(catalog):
     lost = (catalog["flags"] & int(CatalogFlags.NO_FLUX)) > 0
     if np.any(lost):
         first = ", ".join(map(str, catalog["id"][lost][:5].tolist()))
+        ellipsis = ""
         if lost.sum() > 5:
             ellipsis = ", ..."
-        else:
-            ellipsis = ""
         yield (
             f"{lost.sum()} of {len(catalog)} sources have no usable flux in any band "
             f"(flag no_flux): ids {first}{ellipsis}"

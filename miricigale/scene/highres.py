@@ -50,10 +50,9 @@ def depth_to_rms(depth, *, pixel_area):
     0.01325
     """
     # magnitudes become fluxes
+    flux = depth
     if isinstance(depth, u.Magnitude):
         flux = depth.to(u.uJy)
-    else:
-        flux = depth
     limit = positive(flux, u.uJy, "depth")
     pixel_area = floats(pixel_area)
     n_pixels = math.pi * _APERTURE.to_value(u.rad) ** 2 / pixel_area

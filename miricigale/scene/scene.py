@@ -402,10 +402,9 @@ class Scene(Interactive):
         """
         light = self._painted[0]
         brightness = light * _UJY_TO_MJY / pixel_area_map(self._wcs, self._shape)
+        includes = []
         if isinstance(self.psf, _TYPED):
             includes = list(self.psf.includes)
-        else:
-            includes = []
         n = len(self._catalog)
         meta = provenance(filter=self._filter, psf_includes=includes, n_sources=n)
         if self._background is not None:

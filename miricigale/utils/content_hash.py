@@ -66,9 +66,8 @@ def _feed(digest, value):
         names = [item.name for item in fields(value) if item.name != "meta"]
         _feed(digest, attributes(value, names))
     else:
-        if hasattr(value, "__qualname__"):
-            named = value
-        else:
+        named = value
+        if not hasattr(value, "__qualname__"):
             named = type(value)
         _tag(digest, "name", f"{getattr(named, '__module__', '')}.{named.__qualname__}")
 

@@ -102,10 +102,9 @@ def file_errors(path, problem, *kinds):
         yield
     except (KeyError, IndexError, TypeError, ValueError, *kinds) as err:
         # a name that is missing is quoted, a sentence is not
+        said = err
         if isinstance(err, KeyError) and " " in f"{err}":
             said = err.args[0]
-        else:
-            said = err
         raise data_error(path, f"{problem}: {said}") from err
 
 
@@ -126,10 +125,9 @@ def unknown_name(kind, name, names):
             f"no {kind} {name!r}; the nearest of {len(names)} are {', '.join(suggestions)}"
         )
     close = difflib.get_close_matches(str(name).lower(), lower, n=1, cutoff=0.7)
+    hint = ""
     if close:
         hint = f"; did you mean {lower[close[0]]!r}?"
-    else:
-        hint = ""
     return KeyError(f"no {kind} {name!r}; known: {', '.join(names)}{hint}")
 
 

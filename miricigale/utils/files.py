@@ -224,9 +224,8 @@ def _judge(caught):
 def _check_declared(path, hdus, n_bytes):
     """Refuse headers that declare more data than there are, or than tiles may unpack to."""
     last = hdus[-1].fileinfo()
-    if last is None:
-        wanted = 0
-    else:
+    wanted = 0
+    if last is not None:
         wanted = last["datLoc"] + last["datSpan"]
     if bad := [i for i, hdu in enumerate(hdus) if not _is_sound(hdu)]:
         msg = f"damaged: the header of its extension {bad[0]}"
@@ -425,10 +424,9 @@ def writing(path):
 def unreadable(path, wanted, err):
     """A `DataError` that says which file could not be read as what, and why."""
     if isinstance(err, OSError) and not Path(path).is_file():
+        err = "no such file"
         if Path(path).is_dir():
             err = "it is a folder, wanted is a file"
-        else:
-            err = "no such file"
     lines = str(err).strip().splitlines() or [type(err).__name__]
     return DataError(f"{path} cannot be read as {wanted}: {lines[0]}")
 

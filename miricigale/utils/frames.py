@@ -44,9 +44,8 @@ def frame_columns(data, argument):
     if not hasattr(data, "index"):
         from miricigale.utils.arrow_tables import arrow_table
 
-        if hasattr(data, "to_pylist"):
-            rows = data
-        else:
+        rows = data
+        if not hasattr(data, "to_pylist"):
             rows = data.to_arrow()
         table = arrow_table(rows, where=argument)
         return subset(table, table.colnames)

@@ -313,9 +313,8 @@ class Duplicates:
         """Warn if there are any; ``what`` says what becomes of them."""
         if self.n_rows:
             examples = ", ".join(map(repr, self.first))
-            if self.n_rows == 1:
-                rows = "1 row has"
-            else:
+            rows = "1 row has"
+            if self.n_rows != 1:
                 rows = f"{self.n_rows} rows have"
             text = f"{argument}: {rows} an id that occurred before ({examples}"
             warn(

@@ -48,10 +48,9 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
     named = np.isin(values, further)
     none = np.zeros(np.shape(values), bool)
     if errors is None:
+        zero = none
         if magnitudes:
             zero = values == 0
-        else:
-            zero = none
         return (code & (magnitudes | (values < 0))) | zero | named | beyond, none
     repeats_value = errors == values
     size = np.abs(values)

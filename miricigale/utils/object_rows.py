@@ -109,9 +109,8 @@ class ObjectRows(Interactive):
 
     def _ipython_key_completions_(self):
         """What a session offers in brackets: names of parameters, and ids that are text."""
-        if self.isscalar:
-            ids = []
-        else:
+        ids = []
+        if not self.isscalar:
             ids = [key for key in self.ids.tolist() if isinstance(key, str)]
         return [*getattr(self, "parameters", ()), *ids]
 
@@ -122,10 +121,9 @@ class ObjectRows(Interactive):
 
     def _column(self, name):
         """A column of the table, by name."""
+        table = {}
         if hasattr(self, "to_table"):
             table = self.to_table()
-        else:
-            table = {}
         if name not in getattr(table, "colnames", ()):
             available = [*getattr(table, "colnames", ()), *map(str, self._row_of_id)]
             raise unknown_name("column or id", name, available)
@@ -211,9 +209,8 @@ class ObjectRows(Interactive):
             elif any((mapping is None) != (value is None) for mapping in values):
                 raise argument_error("parts", f"all with {name!r} or all without", "some")
             else:
-                if value is None:
-                    joined = None
-                else:
+                joined = None
+                if value is not None:
                     joined = _joined(values, name)
             new.__dict__[name] = joined
         return new

@@ -60,10 +60,9 @@ class _Lines(contextlib.AbstractContextManager):
                 share = f"{self.n}"
             else:
                 share = f"{self.n} of {self.total}"
+            label = ""
             if self.desc:
                 label = f"{self.desc}: "
-            else:
-                label = ""
             print_line(f"{label}{share} {self.unit}, {self._last - self._begin:.0f} s")
 
     def __iter__(self):

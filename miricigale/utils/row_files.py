@@ -261,10 +261,9 @@ def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
     OSError
         If the file is there and ``overwrite`` is not set.
     """
+    write = _write_fits
     if Path(path).suffix.lower() == ".parquet":
         write = _write_parquet
-    else:
-        write = _write_fits
     with replacing(path, overwrite=overwrite) as partial:
         write(partial, (_same_ids(table, id_width) for table in tables), n_rows)
 

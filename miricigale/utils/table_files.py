@@ -91,10 +91,9 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
             form = _table_format(path)
         if form == "fits":
             with open_fits(path, wanted=wanted) as hdus, silent_units():
+                chosen = hdu
                 if hdu is None:
                     chosen = first_table(hdus)
-                else:
-                    chosen = hdu
                 read = table_read(hdus, chosen)
                 check_names_differ(names_in_header(read))
                 table = Table.read(hdus, format=form, character_as_bytes=False, hdu=chosen)

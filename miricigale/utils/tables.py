@@ -304,10 +304,9 @@ def ascii_ids(ids, argument):
     if ids.dtype.kind in "UO":
         texts = [key for key in ids.tolist() if isinstance(key, str)]
         foreign = [key for key in texts if not key.isascii() or key != key.rstrip(" ")]
+        remainder = ""
         if len(foreign) > 3:
             remainder = f" and {len(foreign) - 3} more"
-        else:
-            remainder = ""
         wanted = "ASCII, with no blank at the end, where they go to a FITS file"
         check_that(not foreign, argument, wanted, ", ".join(map(repr, foreign[:3])) + remainder)
     return ids

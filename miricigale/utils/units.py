@@ -199,9 +199,8 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         # magnitudes and other logarithms
         raise units_error(name, f"convertible to {unit}", value.unit) from None
     except (TypeError, ValueError):
-        if unit == u.dimensionless_unscaled:
-            wanted = "numbers"
-        else:
+        wanted = "numbers"
+        if unit != u.dimensionless_unscaled:
             wanted = f"convertible to {unit}"
         if isinstance(value, (str, list)):
             got = repr(value)
@@ -216,9 +215,8 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     try:
         array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)
     except u.UnitConversionError:
-        if unit == u.dimensionless_unscaled:
-            wanted = "convertible to a number without a unit"
-        else:
+        wanted = "convertible to a number without a unit"
+        if unit != u.dimensionless_unscaled:
             wanted = f"convertible to {unit}"
         raise units_error(name, wanted, getattr(value, "unit", None)) from None
     if mask is not None:
@@ -227,10 +225,9 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         raise argument_error(name, f"an array of {ndim} dimension(s)", f"shape {array.shape}")
     if finite and not np.all(np.isfinite(array)):
         n_bad = int(np.count_nonzero(~np.isfinite(array)))
+        masked = "masked, "
         if mask is None:
             masked = ""
-        else:
-            masked = "masked, "
         raise argument_error(name, "finite values", f"{n_bad} that are {masked}NaN or infinite")
     return array
 

@@ -289,10 +289,9 @@ def _checked(section, key, value, hint, limits):
 def _checked_scalar(section, key, value, hint, limits):
     if isinstance(hint, types.UnionType):
         # a number within the limits, or one of the names
+        hint = float
         if isinstance(value, str):
             hint = str
-        else:
-            hint = float
     if hint is float and type(value) is int:
         value = float(value)
     shown = repr(value)

@@ -218,9 +218,8 @@ def is_compiled(name):
     """Whether the kernels of a job were compiled by this installation, on this machine."""
     marker = _marker(name)
     # the cache may have been emptied without removing the marker
-    if marker.parent.name == "__pycache__":
-        folder = _PACKAGE
-    else:
+    folder = _PACKAGE
+    if marker.parent.name != "__pycache__":
         folder = _numba_folder()
     return marker.is_file() and any(folder.rglob("*.nbi"))
 

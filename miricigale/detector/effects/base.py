@@ -112,10 +112,9 @@ def check_amounts(*, above_zero=False, **values):
         if value is None:
             continue
         if not np.isfinite(value) or value < 0 or (above_zero and value == 0):
+            wanted = "finite and at least 0"
             if above_zero:
                 wanted = "finite and positive"
-            else:
-                wanted = "finite and at least 0"
             raise argument_error(name, wanted, value)
 
 

@@ -100,9 +100,8 @@ def keyed(effects, seed, exposure):
     for effect in effects:
         kind = type(effect).__name__
         counts[kind] = counts.get(kind, 0) + 1
-        if counts[kind] == 1:
-            name = kind
-        else:
+        name = kind
+        if counts[kind] != 1:
             name = f"{kind} {counts[kind]}"
         keyed.append((effect, stream_key(seed, exposure, name)))
     return tuple(keyed)

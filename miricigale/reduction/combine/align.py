@@ -234,10 +234,9 @@ def _positions(catalog, images):
     days = [np.nan if epoch is None else epoch.utc.mjd for epoch in epochs]
     # of any without a time the mean is unknown
     day = np.mean(days)
+    epoch = None
     if np.isfinite(day):
         epoch = Time(day, format="mjd", scale="utc")
-    else:
-        epoch = None
     return at_epoch(catalog, epoch, "catalog")
 
 

@@ -113,7 +113,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
     drizzled, images = drizzle(reducer.mosaics, images, wcs, planes)
     mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
     subtracted = mosaic_background.level
-    if has_backgrounds:
+    if unsubtracted:
         # of the exposures too, and what brought them to one level
         removed = [
             with_data(im, data - im.data) for im, data in zip(images, unsubtracted, strict=True)

@@ -141,18 +141,16 @@ def read_images(path):
         if "SCI" not in hdus or hdus["SCI"].header.get("NAXIS") not in (2, 3):
             raise data_error(path, f"cannot be read as {_WANTED}: it has no image in SCI")
         header = joined_header(hdus)
+        own_meta = None
         if "META" in header:
             own_meta = json.loads(header["META"])
-        else:
-            own_meta = None
         check_imager(path, header, own=own_meta)
         shape = hdus["SCI"].shape
         check_memory(24 * np.prod(shape, dtype=float), f"the image {path}", advice="cut it")
         unit = _unit(hdus["SCI"].header, path)
+        meta = own_meta
         if own_meta is None:
             meta = _meta(header, path)
-        else:
-            meta = own_meta
         meta.setdefault("keywords", kept_keywords(header))
         wcs = _wcs(hdus, header, meta)
         data = _plane(hdus, "SCI", shape, path)
@@ -164,10 +162,9 @@ def read_images(path):
     if error is not None and not np.any(np.isfinite(error) & (error > 0)):
         refused = "has no error in ERR, which is nowhere finite and above 0"
         if not any(name in planes for name in _VARIANCES):
+            hint = "mend it"
             if "WHT" in planes:
                 hint = "photometry.read_mosaic takes the errors of WHT"
-            else:
-                hint = "mend it"
             raise data_error(path, f"{refused}, and no variances: {hint}")
         error = None
     if error is None and (parts := [planes[name] for name in _VARIANCES if name in planes]):
@@ -269,10 +266,9 @@ def _mean(files):
 
 def scaled_planes(planes, before, after):
     """Variances and areas of an image, after it was multiplied as its errors say."""
+    scaled = {}
     if "AREA" in planes:
         scaled = {"AREA": planes["AREA"]}
-    else:
-        scaled = {}
     if before.uncertainty is None:
         return scaled
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -289,10 +285,9 @@ def _unit(header, path):
     """Unit of an image; DN is what astropy's CCDData and this package call adu."""
     text = str(header.get("BUNIT", "")).strip()
     try:
+        unit = None
         if text:
             unit = with_adu(u.Unit(text.replace("counts", "DN")))
-        else:
-            unit = None
     except ValueError:
         unit = None
     for own_unit in (RATE, SURFACE_BRIGHTNESS):
@@ -315,15 +310,13 @@ def _plane(hdus, name, shape, path):
     else:
         last_axes = slice(None)
     if data is None or data.shape[last_axes] != shape[last_axes]:
-        if data is None:
-            got = None
-        else:
+        got = None
+        if data is not None:
             got = data.shape
         raise data_error(path, f"must have {shape} pixels in {name}, as in SCI, got {got}")
+    kind = np.float32
     if data.dtype.kind in "iu":
         kind = data.dtype.newbyteorder("=")
-    else:
-        kind = np.float32
     return np.array(data, kind)
 
 

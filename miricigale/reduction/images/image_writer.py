@@ -64,10 +64,9 @@ def _joined(image, planes):
             files.append(part)
         else:
             files.append(ImageFile(part, {}, fits.Header()))
+    first = None
     if files:
         first = files[0].image
-    else:
-        first = None
     alike = all(
         file.image.shape == first.shape
         and file.image.unit == first.unit

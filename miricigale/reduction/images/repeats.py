@@ -53,10 +53,9 @@ class ExposureRecord:
         """
         data = np.ascontiguousarray(data)
         duplicate = None
+        first = 0
         if data.size:
             first = data.flat[0]
-        else:
-            first = 0
         if not np.all(data == first):
             duplicate = self._data.setdefault(hashlib.sha256(data).hexdigest(), name)
         words = tuple(str(header.get(key)) for key in _NAMES)

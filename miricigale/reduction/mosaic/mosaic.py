@@ -341,10 +341,9 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
         weights = [np.where(np.isnan(weight), 0.0, weight) for weight in weights]
     # drizzle works in float32: weights near one
     medians = [np.median(w[w > 0]) for w in weights if np.any(w > 0)]
+    unit_weight = 1.0
     if medians:
         unit_weight = float(np.median(medians))
-    else:
-        unit_weight = 1.0
 
     sink = Drizzle(
         kernel="square", fillval="NAN", fillval2="NAN", out_shape=shape, disable_ctx=True

@@ -139,10 +139,9 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
         outlier = far & good
         difference = im.data - expected
         # sampling of sources is allowed for, the noise of the median's slopes is none of theirs
+        noise_slope = 0.0
         if good.any():
             noise_slope = np.median(slope[good])
-        else:
-            noise_slope = 0.0
         allowed = _DERIVATIVE * np.maximum(slope - _NOISE_SLOPES * noise_slope, 0.0)
         # wide sources have slopes below the noise, over many pixels
         allowed = np.maximum(allowed, _MISPLACED * map_coordinates(gradient, coords, **options))

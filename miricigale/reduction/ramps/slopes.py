@@ -67,10 +67,9 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False, *, first=0):
         msg = f"at most {n_group - 2} groups together for {n_group} groups"
         raise argument_error("skip_first, skip_last", msg, f"{skip_first}, {skip_last}")
     drift = _anomaly(reducer, ramp, maps, first)
+    factor = 1.0
     if shares_charge(reducer, ramp):
         factor = float(np.sum(detector.ipc_kernel**2))
-    else:
-        factor = 1.0
     part = skip_first, n_group - skip_last
     thresholds = reducer.jump_threshold, reducer.ramps.neighbor_threshold
     if reducer.backend == "jwst":

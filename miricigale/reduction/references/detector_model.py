@@ -223,9 +223,8 @@ def brightness_of(reducer, rate):
             "conversion": photmjsr(facts.filter, gain=detector.gain)
             / detector.relative_response(facts.filter, facts.subarray),
         }
-        if flattened:
-            flat = "done before"
-        else:
+        flat = "done before"
+        if not flattened:
             flat = f"flat field {_OWN}"
         reference_names = {"flat": flat, "photom": f"conversion {_OWN}"}
     else:

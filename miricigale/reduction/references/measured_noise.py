@@ -72,15 +72,13 @@ class MeasuredNoise:
         if name == "read_noise":
             return f"{self.read_noise:.4g} DN (measured on the ramp)"
         if np.isinf(self.gain):
+            slow = ""
             if self.slow_noise:
                 slow = f", {self.slow_noise:.3g} DN a group of the read-out"
-            else:
-                slow = ""
             return f"no photon noise{slow} (measured on the ramp)"
+        kind = ""
         if self.effective:
             kind = ", effective"
-        else:
-            kind = ""
         return f"{self.gain:.4g} e-/DN{kind} (measured on the ramp)"
 
 

@@ -56,10 +56,9 @@ def _header(hdus, path, name, extension, exposure=None):
     for key, value in wanted.items():
         keyword_value = keyword_text(header.get, key)
         keyword_value = READOUT_NAMES.get(keyword_value, keyword_value)
+        allowed = _ANY
         if key == "READPATT":
             allowed = patterns
-        else:
-            allowed = _ANY
         if keyword_value not in (value, *allowed):
             raise _mismatch(path, name, f"its {key} is {keyword_value}, not {value}")
     for key, values in {"NFRAMES": _frame_counts(exposure), "GROUPGAP": (0,)}.items():
@@ -107,10 +106,9 @@ def _flags(path, name, hdus, header, exposure):
     # those of groups and integrations together
     stored = np.bitwise_or.reduce(stored.reshape((-1,) + stored.shape[-2:]), axis=0)
     stored = _cut(path, name, stored, header, exposure).astype(np.int64)
+    table = None
     if "DQ_DEF" in hdus:
         table = hdus["DQ_DEF"].data
-    else:
-        table = None
     if table is None or len(table) == 0:
         return stored & 0xFFFFFFFF
     out = np.zeros(shape, np.int64)

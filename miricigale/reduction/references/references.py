@@ -276,14 +276,12 @@ class ReferenceFiles:
                 continue
             number = isinstance(value, numbers.Real) and not isinstance(value, bool)
             if name not in _NUMBERS or not number or not (np.isfinite(value) and value > 0):
+                unit = ""
                 if name in _NUMBERS:
                     unit = f" or a number above 0 in {_NUMBERS[name]}"
-                else:
-                    unit = ""
+                measured = ""
                 if name in _MEASURED:
                     measured = " or 'measured'"
-                else:
-                    measured = ""
                 raise argument_error(name, f"a path{unit}{measured}", repr(value))
 
     @staticmethod

@@ -117,9 +117,8 @@ class BackgroundSettings:
     @property
     def mesh(self):
         """Options of `estimate_background`: those of single images, also where dithers follow."""
-        if self.method == "dithers":
-            method = "masked"
-        else:
+        method = "masked"
+        if self.method != "dithers":
             method = self.method
         names = ("box", "filter_size", "plane")
         return {"method": method, **attributes(self, names)}

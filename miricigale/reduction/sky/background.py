@@ -116,9 +116,8 @@ class Background:
         return not self.flags
 
     def __repr__(self):
-        if self.trusted:
-            doubt = ""
-        else:
+        doubt = ""
+        if not self.trusted:
             doubt = f", {', '.join(BackgroundFlags.names(self.flags))}"
         return (
             f"<Background median {np.median(self.level):.4g} +- {np.median(self.error):.2g}, rms "
@@ -443,10 +442,9 @@ def remove_background(image, background, *, negative_threshold=10.0, negative_no
     check_positive(negative_threshold, "negative_threshold", optional=True)
     good = ~plain_mask(image)
     error = background.error
+    entries = {}
     if np.isfinite(error).all():
         entries = {"background_error": float(np.median(error[good]))}
-    else:
-        entries = {}
     out = with_data(
         image,
         np.asarray(image.data, np.float32) - background.level,

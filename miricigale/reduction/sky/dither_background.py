@@ -115,10 +115,9 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
         error = boxes.smooth(boxes.error, shape, filter_size=1)
         sky = ~(mask | source)
         remainder = with_data(im, im.data - smooth)
+        constant = level
         if sky.any():
             constant = float(np.median(remainder.data[sky]))
-        else:
-            constant = level
         # what is left is judged as an image is, its mesh is not taken off
         residual = estimate_background(
             remainder, warn=False, box=background.box, filter_size=background.filter_size

@@ -137,10 +137,9 @@ def _set_name(name):
 
 def _metallicity(part, file):
     match = re.search(r"_m(\d{2,3})(?=[_.])", file.name)
+    named = None
     if match:
         named = (PADOVA_1994 | PADOVA_2000).get(int(match[1]))
-    else:
-        named = None
     metallicity = part.metallicity
     wanted = "wanted 'Z=...' in its head or a name like _m62_"
     check_data(

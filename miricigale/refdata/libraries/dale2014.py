@@ -105,10 +105,9 @@ def _find(path):
     wanted = (SPECTRA, CALIBRATION, STARS)
     if not path.is_dir() and not (path.is_file() and is_archive(path)):
         problem = "cannot be read as templates of Dale et al. 2014: wanted a folder or an archive"
+        got = "no such file or folder"
         if path.is_file():
             got = "got another file"
-        else:
-            got = "no such file or folder"
         raise data_error(path, f"{problem} that holds {SPECTRA} and {CALIBRATION}, {got}")
     tables = list(members(path, lambda name: name in wanted))
     folders = [place.parent for place, _, _ in tables if place.name == SPECTRA]

@@ -184,10 +184,9 @@ class _Source:
         """Numbers after their count, which may be known."""
         count = self.integer()
         if not 0 <= count < _MOST_NUMBERS or (n is not None and count != n):
+            wanted = n
             if n is None:
                 wanted = "a count of"
-            else:
-                wanted = n
             raise _foreign(self.path, f"{self.title} must hold {wanted} numbers, got {count}")
         return self.floats(count)
 

@@ -68,9 +68,8 @@ class Report:
             rows.append((name, f"{_listed(values)} {units.get(name, '')}".rstrip()))
         grid = " x ".join(str(values.size) for values in axes.values())
         total = int(np.prod([values.size for values in axes.values()]))
-        if library.complete:
-            missing = "complete"
-        else:
+        missing = "complete"
+        if not library.complete:
             missing = f"{total - n} of {total} not there"
         rows += [("grid", f"{grid}: {missing}")]
         rows += [("found", sentence) for sentence in library.summary]
@@ -200,10 +199,9 @@ def _read(reader, name, path):
     except DataError:
         raise
     except Exception as err:  # readers of different formats raise different exceptions
+        reason = err
         if isinstance(err, KeyError) and err.args:
             reason = err.args[0]
-        else:
-            reason = err
         problem = f"cannot be read as {name!r}: {reason or type(err).__name__}"
         raise data_error(path, problem) from err
 

@@ -47,8 +47,7 @@ class Display:
         spent = self._spent.setdefault(stage.name, [])
         spent.append(seconds)
         if self._lines and len(spent) == len(self._units[stage.name]) and any(spent):
+            units = ""
             if len(spent) > 1:
                 units = f" ({len(spent)})"
-            else:
-                units = ""
             print_line(f"{stage.title}{units}: {sum(spent):.1f} s")

@@ -207,10 +207,9 @@ class StudyRunner:
                 state = "changed"
             else:
                 # making them again gives the same bytes, so that dependent stages stay current
+                state = "lost"
                 if store.is_whole(key):
                     state = "current"
-                else:
-                    state = "lost"
             states[key] = state
             if state in ("new", "changed"):
                 moved.add(key)
@@ -442,10 +441,9 @@ class StudyRunner:
 
         def finish(result):
             products, seconds, warned = result
+            notes = {}
             if warned:
                 notes = {"warnings": [text for _, text in warned]}
-            else:
-                notes = {}
             store.finish(key, digest, products, seconds=round(seconds, 2), **notes)
             for category, text in warned:
                 display.warn(category, text)
@@ -473,10 +471,9 @@ def _values(config):
 def _unused_name(path):
     """Return the first of ``config.edited.toml``, ``config.edited2.toml``, ... that is not there."""
     for n in itertools.count(1):
+        number = ""
         if n > 1:
             number = n
-        else:
-            number = ""
         copy = path.with_name(f"config.edited{number}.toml")
         if not os.path.lexists(copy):
             return copy

@@ -87,9 +87,8 @@ def write_rivals(page, tables):
             band = bands.setdefault(row["band"], band)
             band[label] = cell
             band[f"pulls, {label}"] = number(row["pull_scatter"], ".1f", NO_SOURCE)
-    if SE_BAND in tables:
-        shown = SE_BAND
-    else:
+    shown = SE_BAND
+    if SE_BAND not in tables:
         shown = next(iter(tables))
     page.figure("figure", rival_figure(tables[shown]), band=band_label(shown))
     page.table("groups", groups.values())
@@ -180,10 +179,9 @@ def write_variants(page, matched, limits):
         statistic=config.errors.statistic,
         bin_size=config.errors.bin_size,
     )
+    gradient = ""
     if "gradient" in changes:
         gradient = texts_of("optional")["gradient"]
-    else:
-        gradient = ""
     page.numbers("variants", table, gradient=gradient)
     labels = {name: variant_label(name, changes) for name in (STUDY, *changes)}
     page.figure("figure", variant_figure(table, labels))
@@ -201,10 +199,9 @@ def write_perturbed(page, truths, tables):
     names = set(costs["perturbation"])
     effects = "; ".join(text for name, text in texts["effects"].items() if name in names)
     effects = sentence(effects, {"size": config.perturb})
+    together = ""
     if ALL in names:
         together = " and together"
-    else:
-        together = ""
     page.numbers("perturbations", costs, effects=effects, together=together)
     rows = {}
     for row in costs:
@@ -226,14 +223,12 @@ def _cell(row):
     """Return the text of a value and its change; per cent but for scatter of redshifts and fracAGN."""
     quantity = row["quantity"]
     is_share = "." in quantity or quantity.endswith("outliers")
+    spec = ".4f"
     if is_share:
         spec = ".1f %"
-    else:
-        spec = ".4f"
+    signed = spec
     if quantity.endswith("offset"):
         signed = f"+{spec}"
-    else:
-        signed = spec
     if row["perturbation"] == NONE:
         return number(row["value"], signed, "no source", error=row["value_err"])
     cell = number(row["value"], signed, "no source", error=None)

@@ -75,14 +75,12 @@ def write_detections(page):
             del row["to_proposal"]
         rows.append(row)
     page.section("detections")
+    exposures = ", six bands, other exposures"
     if metrics["as_paper"]:
         exposures = ""
-    else:
-        exposures = ", six bands, other exposures"
+    sigma = ""
     if page.config.errors.statistic == "mad":
         sigma = page.sentence("paper_sigma")
-    else:
-        sigma = ""
     page.table("shares", rows, other_exposures=exposures, paper_sigma=sigma)
     rows = []
     for flag, n in metrics["n_left_out"].items():
@@ -105,9 +103,8 @@ def field_text(config):
     """Return where the telescope looks, in words."""
     centers = study_pointings(config)
     options = config.pointing
-    if len(centers) == 1:
-        field = "a MIRI field"
-    else:
+    field = "a MIRI field"
+    if len(centers) != 1:
         field = f"{len(centers)} MIRI pointings"
     if options.centers:
         return f"{field}, the first at RA {centers[0].ra.deg:.5f}, Dec {centers[0].dec.deg:.5f}"

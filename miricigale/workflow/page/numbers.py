@@ -251,10 +251,9 @@ def _band_numbers(config, tables, name):
         faint = usable & is_complete(matched, name) & (true < 20 * formal) & np.isfinite(flux)
     pulls = (flux[faint] - true[faint]) / formal[faint]
     time = pointing_time(config, name)
+    median = np.nan
     if usable.any():
         median = np.nanmedian(formal[usable])
-    else:
-        median = np.nan
     entry = {
         "n_measured": int(np.count_nonzero(usable & np.isfinite(flux))),
         "formal_limit": float(ab_magnitude(5 * median * u.uJy)),

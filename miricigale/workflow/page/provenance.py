@@ -69,10 +69,9 @@ def stand_ins(config, model):
     if config.exposures.kind == "rates":
         names.append("rates")
     names.append("existing" if all(existing_bands(config).values()) else "own")
+    rays = " and read-out"
     if config.detector.cosmic_rays:
         rays = ", read-out and cosmic rays"
-    else:
-        rays = " and read-out"
     return [sentence(texts[name], {"rays": rays, "residual": residual}) for name in names]
 
 
@@ -82,10 +81,9 @@ def library_rows(model):
     for part in model.components:
         library = "closed form"
         reference = part.reference
+        record = None
         if part.resource:
             record = resources().get(part.resource)
-        else:
-            record = None
         if record:
             library = f"{record.title} ({part.resource})"
             reference = reference or record.citation
@@ -120,10 +118,9 @@ def catalog_facts(config, catalog):
     if n := np.count_nonzero(~has_redshift & ~is_star):
         facts["galaxies without redshift"] = f"{n}: without a model SED, and so on no image"
     existing = existing_bands(config)
+    errors = "the errors of each source in the catalog"
     if all(existing.values()):
         errors = "depths"
-    else:
-        errors = "the errors of each source in the catalog"
     fitted = f"{len(existing)} existing bands, with {errors} ({', '.join(existing)})"
     facts["fitted in the end"] = f"{fitted}, and {len(config.exposures.filters)} of MIRI"
     excess = " or ".join(f"{value:g}" for value in config.fit.dust_excess)

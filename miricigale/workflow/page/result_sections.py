@@ -55,10 +55,9 @@ def write_results(page, numbers):
     _write_redshifts(page, rows)
     _write_fractions(page, rows)
     _write_figure(page, "disk", study_figures.disk_figure(page.study))
+    of_truths = ""
     if len(page.study.with_agn) > 1:
         of_truths = ", of all truths together"
-    else:
-        of_truths = ""
     xrays = study_figures.xray_figure(page.study, page.context.seed)
     _write_figure(page, "xrays", xrays, of_truths=of_truths)
     if len(page.study.truths) > 1:

@@ -241,10 +241,9 @@ def xray_figure(study, seed):
     lower.vlines(place, filled["share_low"], filled["share_high"], color=MEASURED, lw=1.2)
     lower.plot(place, filled["share"], "o", ms=4, color=MEASURED)
     lower.axhline(0.5, color=TRUE, lw=0.8, ls="--")
+    half = None
     if study.with_agn:
         half = measure(study, "xray_half", truth=None, seed=seed)
-    else:
-        half = None
     for ax in (upper, lower):
         if half is not None and np.isfinite(half.value):
             ax.axvspan(half.low, half.high, color=MEASURED, alpha=0.15, lw=0)

@@ -179,10 +179,9 @@ def _read_pointings(table, roll, filters):
 
     def cell(row, name):
         """Value of a column of a row; None without one."""
+        value = None
         if name in columns:
             value = row[columns[name]]
-        else:
-            value = None
         if np.ma.is_masked(value):
             return None
         return value
@@ -215,10 +214,9 @@ def all_exposures(field, options, patterns, stamp):
     units = {}
     for k, name in enumerate(options.filters):
         pattern = patterns[k]
+        n_dithers = None
         if options.n_dithers:
             n_dithers = options.n_dithers[k]
-        else:
-            n_dithers = None
         if not isinstance(pattern, str):
             # offsets of a file
             n_dithers = n_dithers or len(pattern)

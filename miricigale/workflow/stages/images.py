@@ -269,10 +269,9 @@ def make_highres(context, patch):
     config = context.config
     truth = context.table(f"{context.plan['truth']}/truth.ecsv")
     wcs = grid_of(config, config.highres.pixel_scale, patch)
+    noise = None
     if patch:
         noise = patch_noise(config, patch, context.seed)
-    else:
-        noise = None
     image, segmentation, detected = prior_image(config, truth, wcs, seed=context.seed, noise=noise)
     context.save_image(f"{of_patch('f160w', patch)}.fits", image)
     segmentation = np.asarray(segmentation.data, np.int32)

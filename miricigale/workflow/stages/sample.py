@@ -112,10 +112,9 @@ def good_redshifts(catalog, rules):
         require(usable, "fit", "redshift_quality", wanted, f"{rule!r}; {catalog.colnames}")
         values = np.ma.asarray(getattr(catalog[column], "value", catalog[column]))
         is_text = sign == "=" and values.dtype.kind not in "iuf"
+        kind = float
         if is_text:
             kind = str
-        else:
-            kind = float
         with of_option(f"[fit] redshift_quality, {rule!r}:", ValueError):
             values = np.ma.filled(values.astype(kind), kind("nan"))
             good &= _COMPARE[sign](values, kind(limit))

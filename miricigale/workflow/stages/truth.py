@@ -260,10 +260,9 @@ def make_truth(context, name):
     if frac_agn == FIELD:
         add_field_agn(parameters, model, bands[0], context.seed)
     elif model.has_agn:
+        shares = frac_agn
         if frac_agn == CATALOG:
             shares = catalog_fractions(catalog)
-        else:
-            shares = frac_agn
         add_agn(parameters, shares, context.seed)
     if perturbed := perturbed_model(effects, agn=model.has_agn):
         models = (model, perturbed)
