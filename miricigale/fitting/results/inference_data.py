@@ -9,7 +9,7 @@ from miricigale.utils.options import check_names, check_that
 FLUX_UNIT = "uJy"
 
 
-def inference_data(rows, draws, units, texts, photometry=None):
+def inference_data(rows, draws, describe, photometry=None):
     """
     Make the data of ArviZ from draws of equal weight.
 
@@ -19,8 +19,8 @@ def inference_data(rows, draws, units, texts, photometry=None):
         The objects, with their ids, flags and meta.
     draws : dict of str to `~numpy.ndarray`, shape (n, n_draws) or (n_draws,)
         Values by parameter; without the axis of objects if ``rows`` is a single object.
-    units, texts : dict of str to str
-        Units and meanings by parameter.
+    describe : callable
+        Meaning of a parameter by its name.
     photometry : `~miricigale.fitting.FitResults`, optional
         Where the fluxes that were fitted are taken from, with the same objects.
 
@@ -41,7 +41,7 @@ def inference_data(rows, draws, units, texts, photometry=None):
     for name, values in draws.items():
         # a chain of draws, then objects
         columns = np.moveaxis(np.asarray(values, float), -1, 0)[None]
-        attributes = {"units": units[name], "long_name": texts[name]}
+        attributes = {"units": rows.unit(name).to_string(), "long_name": describe(name)}
         posterior[name] = (("chain", "draw", *along), columns, attributes)
     n_draws = next(iter(posterior.values()))[1].shape[1]
     coords = objects | {"chain": [0], "draw": np.arange(n_draws)}
@@ -103,11 +103,8 @@ def of_samples(samples, names=None, *, results=None):
         check_that(hasattr(results, "flux_err"), "results", "FitResults", repr(results))
         same = np.array_equal(np.asarray(samples.ids), np.asarray(results.ids))
         check_that(same, "results", "of the objects of the draws, in their order", "others")
-    names = _checked(samples, names)
-    draws = {name: samples.values(name).value for name in names}
-    texts = {name: samples.description(name) for name in names}
-    units = {name: samples.unit(name).to_string() for name in names}
-    return inference_data(samples, draws, units, texts, results)
+    draws = {name: samples.values(name).value for name in _checked(samples, names)}
+    return inference_data(samples, draws, samples.description, results)
 
 
 def of_results(results, names=None, *, samples=None):
@@ -117,7 +114,7 @@ def of_results(results, names=None, *, samples=None):
     Parameters
     ----------
     names : list of str, optional
-        Parameters and derived quantities; all by default.
+        As for `Samples.to_arviz`.
     samples : `~miricigale.fitting.Samples`, optional
         Draws of the same objects, ``fitter.sample(photometry, 1000, seed=1)``. The results of a sampler have
         their own; those of a grid need them.
@@ -129,10 +126,8 @@ def of_results(results, names=None, *, samples=None):
 
     Raises
     ------
-    ImportError
-        If ArviZ is not installed.
-    KeyError
-        If a name is not one of `parameters`.
+    ImportError, KeyError
+        As `Samples.to_arviz`.
     ValueError
         If these are results of a grid and there are no ``samples``, or they are of other objects.
     """
@@ -141,11 +136,10 @@ def of_results(results, names=None, *, samples=None):
     if results.draws is None:
         msg = "results of a grid hold no draws: to_arviz(samples=fitter.sample(photometry, 1000, seed=1))"
         raise ValueError(msg)
-    names = _checked(results, names)
-    columns = {name: results.draws[..., results.parameters.index(name)] for name in names}
-    texts = {name: results._meaning(name) for name in names}
-    units = {name: results.unit(name).to_string() for name in names}
-    return inference_data(results, columns, units, texts, results)
+    columns = {}
+    for name in _checked(results, names):
+        columns[name] = results.draws[..., results.parameters.index(name)]
+    return inference_data(results, columns, results._meaning, results)
 
 
 def _checked(rows, names):

@@ -281,8 +281,7 @@ class ExposureFit:
         Let templates change as far as they are not known, alike in all exposures, and fit once more.
 
         ``fitted`` (`~miricigale.photometry.shapes.shapes.FITTED`, (k,)) is what is known of the first sources;
-        those
-        after them are points. See `~miricigale.photometry.templates.free_templates.free_templates`.
+        those after them are points. See `~miricigale.photometry.templates.free_templates.free_templates`.
         """
         if self.fit is None or self.settings.errors.size_scatter is None:
             return

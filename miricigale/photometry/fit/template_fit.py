@@ -295,8 +295,7 @@ class TemplateFit:
         Let templates change as far as they are not known, and fit once more.
 
         ``fitted`` (`~miricigale.photometry.shapes.shapes.FITTED`, (k,)) is what is known of the bank's first
-        sources;
-        those after them are points.
+        sources; those after them are points.
         """
         if self.fit is None or self.settings.errors.size_scatter is None:
             return

@@ -41,7 +41,7 @@ IMAGE_RESOURCES = (
     "psf.jwst_pupil",
     "filters.sedpy",
 )
-# residual = "etc" says whose pattern it is, not how strong, and a level whose sky
+# of a residual and of a background that are named, not given as numbers
 EXPOSURE_RESOURCES = IMAGE_RESOURCES + ("instrument.etc", "instrument.zodiacal")
 
 
@@ -193,9 +193,8 @@ def _read_pointings(table, roll, filters):
         row_roll = cell(row, "roll")
         time = cell(row, "time")
         text = cell(row, "bands") or ""
-        bands = []
-        for name in str(text).lower().replace(",", " ").split():
-            bands.append(full_names.get(name.rpartition(".")[2]))
+        names = str(text).lower().replace(",", " ").split()
+        bands = [full_names.get(name.rpartition(".")[2]) for name in names]
         check_that(None not in bands, "bands", wanted, repr(text))
         pointing = Pointing(
             center,
