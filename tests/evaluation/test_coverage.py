@@ -5,6 +5,7 @@ from scipy.stats import norm
 
 from helpers.errors import refuses
 from miricigale.evaluation import coverage_table, posterior_ranks
+from miricigale.evaluation.coverage import interval_share
 
 LEVELS = np.linspace(0.001, 0.999, 999)
 
@@ -15,6 +16,14 @@ def gaussian_case(n, *, bias=0.0, width=1.0, seed=1):
     true = rng.normal(0, 30, n)
     measured = true + rng.normal(size=n) + bias
     return true, measured[:, None] + width * norm.ppf(LEVELS)
+
+
+def test_the_share_of_an_interval_is_that_of_the_table():
+    ranks = np.random.default_rng(2).uniform(size=500)
+    table = coverage_table({"x": ranks}, levels=(0.5, 0.68))
+    shares = [interval_share(ranks, level) for level in (0.5, 0.68)]
+    assert_allclose(shares, table["share"])
+    assert interval_share(np.append(ranks, np.nan)) == shares[1]
 
 
 @pytest.mark.parametrize(("bias", "width"), [(0.0, 1.0), (0.0, 0.5), (1.0, 1.0)])

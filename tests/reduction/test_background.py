@@ -19,12 +19,24 @@ from miricigale.reduction import (
     estimate_background,
     remove_background,
 )
+from miricigale.reduction.images.cells import smoothed_cells
 from miricigale.reduction.images.images import plain_mask
 from miricigale.reduction.sky.sky_mesh import sky_boxes
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import MiricigaleWarning
 
 SHAPE = (400, 420)
+
+
+def test_smoothed_cells_have_the_noise_of_a_gaussian_at_the_edge_too():
+    rng = np.random.default_rng(3)
+    cells = rng.standard_normal((400, 400)).astype(np.float32)
+    smooth, covered = smoothed_cells(cells, np.ones(cells.shape, np.float32), 2.0)
+    # white noise keeps 1 / (4 pi width^2) of its variance, at an edge half of that, which is divided out
+    expected = (4 * np.pi * 2.0**2) ** -0.5
+    assert_allclose(smooth[20:-20, 20:-20].std(), expected, rtol=0.03)
+    assert_allclose(smooth[0].std(), expected, rtol=0.2)
+    assert covered[20:-20, 20:-20].all()
 
 
 def subtracted(image, **options):

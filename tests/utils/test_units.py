@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.utils.units import flux_unit, frozen_array, frozen_quantity, to_array
+from miricigale.utils.units import flux_unit, frozen_array, frozen_quantity, scalar, to_array
 
 
 def test_converts():
@@ -25,6 +25,13 @@ def test_refuses_wrong_shape_and_nan():
     refuses(match, to_array, np.ones((2, 2)) * u.s, u.s, "x", ndim=1)
     match = "'x' must be finite values, got 1 that are NaN"
     refuses(match, to_array, [1, np.nan] * u.s, u.s, "x", finite=True)
+
+
+def test_a_number_is_one_that_is_finite():
+    assert scalar(2 * u.arcmin, u.arcsec, "x") == 120.0
+    assert type(scalar(np.float32(2) * u.s, u.s, "x")) is float
+    refuses("'x' must be", scalar, [1, 2] * u.s, u.s, "x")
+    refuses("'x' must be finite", scalar, np.inf * u.s, u.s, "x")
 
 
 def test_frozen_copies():
