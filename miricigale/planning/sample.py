@@ -73,18 +73,52 @@ def make_sample(config, bands, *, executor=None):
     >>> sources = make_sample(config, ["wfc3.f160w", "miri.f770w"])  # doctest: +SKIP
     >>> sources["redshift", "frac_agn", "miri.f770w"]  # doctest: +SKIP
     """
-    options = config.sample
     seed = config.plan.seed
+    rng = stream(seed, "plan", "sample")
+    sources, density = _catalog_galaxies(config, executor)
+    sources, density = _resampled(sources, density, config.sample, rng)
+    model = SEDModel.yang2021()
+    sources["sky"] = 0
+    n_skies = 1
+    if "frac_agn" in sources.colnames:
+        agn = "catalog"
+        fractions = sources["frac_agn"]
+        add_agn(sources, fractions, seed)
+    elif config.agn.frac_agn:
+        agn = "mix"
+        add_agn(sources, agn_mix(config.agn, len(sources), rng), seed)
+    else:
+        agn = "field"
+        band = next(iter(bands))
+        add_field_agn(sources, model, band, seed)
+        n_other = _DRAWS // len(sources)
+        n_skies += n_other
+        limit = config.agn.limit
+        others, _ = other_skies(sources, model, band, n_other, min_frac_agn=limit, seed=seed)
+        sources = vstack([sources, others], metadata_conflicts="silent")
+    light = library_fluxes(model, sources, list(bands))
+    for name in bands:
+        sources[name] = light[name]
+    usable = np.all([np.isfinite(sources[name].value) for name in bands], axis=0)
+    sources = _cut(sources, usable, "the models")
+    sources.meta = {"density": density, "agn": agn, "n_skies": n_skies}
+    sources.meta["libraries"] = list(model.meta["libraries"])
+    return sources
+
+
+def _catalog_galaxies(config, executor):
+    """Galaxies of the catalog within the cuts, with fitted parameters, and their number per square arcmin."""
+    options = config.sample
     study = StudyConfig(catalog=config.catalog, sed=config.sed)
     catalog = study_catalog(config.catalog)
     catalog = bright_sources(catalog, config.catalog, study.highres.filter)
+    area = catalog_area(config, catalog)
     redshift = np.asarray(catalog["redshift"], float)
     chosen = (redshift >= options.redshift[0]) & (redshift <= options.redshift[1])
-    area = catalog_area(config, catalog)
     catalog = _cut(catalog, chosen & ~np.asarray(catalog["star"], bool), "[sample] redshift")
     fit = {"model_error": config.fit.model_error, "executor": executor}
     results = fit_seds(catalog, config.sed, **fit).to_table()
-    sources = galaxy_parameters(study, catalog, results, seed=seed)
+    sources = galaxy_parameters(study, catalog, results, seed=config.plan.seed)
     sources["luminosity"] = results["dust_luminosity_best"].to(u.Lsun)
     if "dust_excess" in sources.colnames:
         sources["luminosity"] *= sources["dust_excess"]
@@ -101,49 +135,23 @@ def make_sample(config, bands, *, executor=None):
     density = np.nan
     if area is not None:
         density = len(sources) / area.to_value(u.arcmin**2)
-    rng = stream(seed, "plan", "sample")
+    return sources, density
+
+
+def _resampled(sources, density, options, rng):
+    """As many galaxies as are asked for, and the number per square arcmin that they stand for."""
+    n = options.n_sources
     if options.luminosity_function:
-        sources, density = _by_luminosity(sources, options, rng)
-    elif 0 < options.n_sources < len(sources):
-        rows = rng.choice(len(sources), options.n_sources, replace=False)
+        return _by_luminosity(sources, options, rng)
+    if 0 < n < len(sources):
+        rows = rng.choice(len(sources), n, replace=False)
         sources = sources[np.sort(rows)]
-    elif options.n_sources > len(sources):
+    elif n > len(sources):
         # the same galaxies in other skies: with AGN and noise of their own
-        sources = sources[np.arange(options.n_sources) % len(sources)]
+        sources = sources[np.arange(n) % len(sources)]
         sources["template"] = sources["id"]
         sources["id"] = np.arange(1, len(sources) + 1)
-    agn = "catalog"
-    fractions = sources.columns.get("frac_agn")
-    if fractions is None:
-        agn = "mix" if config.agn.frac_agn else "field"
-    model = SEDModel.yang2021()
-    sources["sky"] = 0
-    n_skies = 1
-    if agn == "field":
-        add_field_agn(sources, model, next(iter(bands)), seed)
-        n_skies += _DRAWS // len(sources)
-        sky_rows, _ = other_skies(
-            sources,
-            model,
-            next(iter(bands)),
-            n_skies - 1,
-            min_frac_agn=config.agn.limit,
-            seed=seed,
-        )
-        sources = vstack([sources, sky_rows], metadata_conflicts="silent")
-    else:
-        add_agn(sources, 0.0, seed)
-        if fractions is None:
-            fractions = agn_mix(config.agn, len(sources), rng)
-        sources["frac_agn"] = fractions
-    light = library_fluxes(model, sources, list(bands))
-    for name in bands:
-        sources[name] = light[name]
-    usable = np.all([np.isfinite(sources[name].value) for name in bands], axis=0)
-    sources = _cut(sources, usable, "the models")
-    sources.meta = {"density": density, "agn": agn, "n_skies": n_skies}
-    sources.meta["libraries"] = list(model.meta["libraries"])
-    return sources
+    return sources, density
 
 
 def _cut(table, chosen, reason):
@@ -160,15 +168,8 @@ def agn_mix(options, n, rng):
     return rng.permutation(np.repeat(options.frac_agn, counts))
 
 
-def _by_luminosity(sources, options, rng):
-    """
-    Sources drawn after a luminosity function, and their number per square arcmin.
-
-    Each cell of the function is taken by draws of redshift and luminosity in proportion to phi and the
-    comoving volume; a draw has the SED of the nearest source of the catalog, scaled to its luminosity
-    and moved to its redshift.
-    """
-    model = SEDModel.yang2021()
+def _luminosity_function(options):
+    """Log luminosities, redshifts and phi, shape (n_redshift, n_luminosity), of the table that is asked for."""
     try:
         table = read_table(options.luminosity_function, wanted="a luminosity function")
     except OSError as err:
@@ -190,6 +191,19 @@ def _by_luminosity(sources, options, rng):
         raise argument_error("luminosity_function", wanted, f"{len(table)} rows")
     values = np.empty((len(steps), len(levels)))
     values[np.searchsorted(steps, redshift), np.searchsorted(levels, log_luminosity)] = phi
+    return levels, steps, values
+
+
+def _by_luminosity(sources, options, rng):
+    """
+    Sources drawn after a luminosity function, and their number per square arcmin.
+
+    Each cell of the function is taken by draws of redshift and luminosity in proportion to phi and the
+    comoving volume; a draw has the SED of the nearest source of the catalog, scaled to its luminosity
+    and moved to its redshift.
+    """
+    cosmology = SEDModel.yang2021().cosmology
+    levels, steps, values = _luminosity_function(options)
     # a fine grid within the ranges asked for, phi interpolated linearly
     low = np.maximum(options.redshift[0], steps[0]), np.maximum(options.luminosity[0], levels[0])
     high = np.minimum(options.redshift[1], steps[-1]), np.minimum(options.luminosity[1], levels[-1])
@@ -198,7 +212,7 @@ def _by_luminosity(sources, options, rng):
     logs = 0.5 * (logs[1:] + logs[:-1])
     at_levels = np.array([np.interp(logs, levels, row) for row in values])
     fine = np.array([np.interp(z, steps, column) for column in at_levels.T]).T
-    volume = model.cosmology.differential_comoving_volume(z).to_value(u.Mpc**3 / u.arcmin**2)
+    volume = cosmology.differential_comoving_volume(z).to_value(u.Mpc**3 / u.arcmin**2)
     cells = fine * volume[:, None] * (high[0] - low[0]) / 200 * (high[1] - low[1]) / 200
     wanted = "phi of at least 0, and not 0 everywhere"
     check_that(np.all(cells >= 0) and cells.sum() > 0, "luminosity_function", wanted, "none")
@@ -217,6 +231,6 @@ def _by_luminosity(sources, options, rng):
     out["mass"] = out["mass"] * 10 ** (logs - own_log[nearest])
     out["luminosity"] = 10**logs * u.Lsun
     out["redshift"] = z
-    oldest = _AGE_SHARE * model.cosmology.age(z).to_value(u.Gyr)
+    oldest = _AGE_SHARE * cosmology.age(z).to_value(u.Gyr)
     out["age"] = np.minimum(out["age"].to_value(u.Gyr), oldest) * u.Gyr
     return out, float(cells.sum())
