@@ -600,3 +600,17 @@ def test_a_mosaic_of_visits_has_the_angles_of_all_of_them(write, angles, expecte
     at = {"pixel_scale": 0.1 * u.arcsec, "shape": 41}
     of_all = filter_psf("F770W", pa=expected * u.deg, pixel_scale=0.1 * u.arcsec)
     np.testing.assert_allclose(psf_image(psf, **at), psf_image(of_all, **at), atol=1e-8)
+
+
+def test_the_first_of_several_images_is_named(tmp_path):
+    header = tan().to_header(relax=True)
+    header["BUNIT"] = "MJy/sr"
+    hdus = [fits.ImageHDU(k + noise(), header, name=f"BAND{k}") for k in (1, 2)]
+    hdus.append(fits.ImageHDU(plane(0.1), name="ERR"))
+    path = tmp_path / "c.fits"
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(path)
+    with pytest.warns(PhotometryWarning, match=r"has 2 images \(BAND1, BAND2\): the first is used"):
+        image = read_mosaic(path, error=f"{path}[ERR]")
+    assert np.median(image.data) == pytest.approx(1.0, abs=0.02)
+    image = read_mosaic(f"{path}[BAND2]", error=f"{path}[ERR]")
+    assert np.median(image.data) == pytest.approx(2.0, abs=0.02)

@@ -12,7 +12,7 @@ from astropy.wcs import WCS
 from miricigale.instrument.header_wcs import image_wcs
 from miricigale.instrument.image_planes import plane_shape
 from miricigale.instrument.sky_axes import grid_angle as grid_angle
-from miricigale.utils.exceptions import argument_error, data_error
+from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.options import check_data
 
@@ -143,6 +143,11 @@ def find_image(hdus, extension, path, names, *, no_images=()):
     ------
     `~miricigale.utils.exceptions.DataError`
         If there is no image, more than one of these names, or one that is a cube.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.PhotometryWarning`
+        If the first of several images is taken, by none of these names.
     """
     images = [k for k, hdu in enumerate(hdus) if plane_shape(hdu) is not None]
     if extension is not None:
@@ -158,6 +163,10 @@ def find_image(hdus, extension, path, names, *, no_images=()):
     if not named:
         _check_no_cube(hdus, path, names)
         images = [k for k in images if hdus[k].name not in no_images]
+        if len(images) > 1:
+            labels = [hdus[k].name or str(k) for k in images]
+            text = f"{path} has {len(images)} images ({', '.join(labels)}): the first is used"
+            warn(f"{text}; {path}[{labels[1]}] is another", PhotometryWarning)
     candidates = named or images[:1]
     shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
     check_data(candidates, path, f"has no two-dimensional image, only {shapes}")
