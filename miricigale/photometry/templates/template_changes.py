@@ -22,6 +22,10 @@ _WIDTHS = 4.0
 #: Least power of a change (see `TemplateChanges.of`) below which stamps are larger than that.
 _SEEN = 0.01
 
+#: Largest part of noise in the sum of squares of an image that may have a PSF of another width. The fit subtracts
+#: that part, while changes take up most of the power, of a point's half the width alone: what is left is positive.
+_MAX_NOISE = 1e-3
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Change:
@@ -206,6 +210,9 @@ class TemplateChanges:
         # the derivative to ln width is its variance times the Laplacian
         wider = self._width_error * self._width**2 * scipy.ndimage.laplace(template)
         is_strong = np.sum(wider**2) > min_power**2 * power
+        # noise of the blurred pixels, as white noise has it
+        noise_power = cutout.noise / (4 * np.pi * max(self._blur, 0.5) ** 2)
+        is_strong &= noise_power < _MAX_NOISE * power
         if is_strong and not fitted["covariance"][1, 1]:
             changes.append(Change(Cutout(wider, remainder.origin), float(wider.sum())))
         # each pixel adds to the light, and to what is taken off by the fit
