@@ -1,6 +1,7 @@
 """Tests see neither the data nor the caches of whoever runs them."""
 
 import contextlib
+import gc
 import os
 import shutil
 import subprocess
@@ -43,6 +44,12 @@ def pytest_unconfigure(config):
 def pytest_collection_modifyitems(items):
     """Begin with whole studies, which take longest: the last worker would be alone with them."""
     items.sort(key=lambda item: "integration" not in item.path.parts)
+
+
+def pytest_collection_finish():
+    """Leave modules and collected tests, which stay, out of garbage collections."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)
