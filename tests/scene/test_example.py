@@ -2,7 +2,7 @@
 
 import astropy.units as u
 import numpy as np
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.photometry import ForcedPhotometer
@@ -21,6 +21,20 @@ def test_forced_photometry_gives_the_truth_back():
     assert usable.sum() >= 5
     pulls = ((result.flux - true) / result.flux_err).value[usable]
     assert abs(np.median(pulls)) < 1
+
+
+def test_noise_is_that_of_the_depth_of_candels():
+    """5 sigma at 27.6 AB in F160W, in an aperture of 0.2 arcsec in radius (Stefanon et al. 2017)."""
+    image = example_field(["wfc3.f160w"], size=10 * u.arcsec).images["wfc3.f160w"]
+    pixel = 0.06 * u.arcsec
+    sigma = (np.median(image.uncertainty.array) * image.unit * pixel**2).to(u.uJy)
+    n_pixels = np.pi * (0.2 * u.arcsec / pixel).to_value(u.one) ** 2
+    limit = (5 * sigma * np.sqrt(n_pixels)).to_value(u.ABmag)
+    assert abs(limit - 27.6) < 0.01
+    # and the sky between the sources scatters so
+    faint = image.data[image.data < np.median(image.data)]
+    below = np.median(image.data) - faint
+    assert_allclose(np.median(below) * 1.4826, np.median(image.uncertainty.array), rtol=0.25)
 
 
 def test_one_seed_one_field():

@@ -162,6 +162,8 @@ def test_changes_are_of_the_same_sources():
     assert study["n"] == 380
     assert study["limit"] == pytest.approx(limit, abs=4 * study["limit_err"])
     assert study["scatter"] == pytest.approx(1, abs=4 * study["scatter_err"])
+    # of n numbers with a Gaussian distribution, as many of them as are faint enough
+    assert 1 / np.sqrt(2 * 380) < study["scatter_err"] < 2 / np.sqrt(2 * 100)
     assert np.isnan(study["limit_change"])
     # noise 1.5 times as large: 0.44 mag, better known than the limits
     assert residual["limit_change"] == pytest.approx(-2.5 * np.log10(1.5), abs=0.02)
