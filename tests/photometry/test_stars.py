@@ -82,12 +82,18 @@ def test_a_width_that_is_wrong_is_found_and_mended(tools, stars, factor):
 
 
 def test_a_psf_that_is_right_stays_as_it_is(tools, stars):
-    image, catalog, _ = stars
+    image, catalog, flux = stars
     plain = tools.measured(image, catalog)
     asked = tools.measured(image, catalog, psf_stars=True)
     assert asked.meta["image_psf"] == "model"
     fit = asked.psf_stars.fits["image"]
     assert star_texts(fit) == ["model"]
+    # a Gaussian on white noise, in closed form: the flux over sigma sqrt(4 pi) width / pixel
+    table = asked.psf_stars.table
+    table = table[np.asarray(table["on"]) == "image"]
+    true = flux[np.asarray(table["id"]) - 500] / (SIGMA * np.sqrt(4 * np.pi) * tools.LO / 0.11)
+    assert len(table) > 10
+    assert_allclose(table["snr"], true, rtol=0.03)
     # 2 percent of the light are allowed for on top of the noise
     assert 0.7 < fit.chi2["model"] / fit.dof < 1.1
     assert asked.psf_stars.kernel is tools.kernel
