@@ -1,11 +1,9 @@
 """Memory of the process."""
 
 import ctypes
-import functools
 import sys
 
 
-@functools.cache
 def _malloc_trim():
     """Return glibc's function that gives freed memory back; None for other C libraries."""
     if sys.platform != "linux":
