@@ -27,7 +27,6 @@ from miricigale.photometry import DetectionPreset, MosaicFile
 from miricigale.photometry.commands.file_inputs import Inputs
 from miricigale.psf import read_psf
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import file_place
 from miricigale.utils.meta import provenance
 from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_that
@@ -45,6 +44,7 @@ from miricigale.workflow.recorded_inputs import (
     from_text,
     inputs_from_text,
     inputs_text,
+    path_states,
 )
 from miricigale.workflow.sections import RunBasics, memory_of
 
@@ -161,10 +161,7 @@ def _states(config, unit):
     task = Task.of(config, config.run.seed)
     if task.inputs is not None:
         return file_states(task.inputs, task.files)
-    # paths may name an extension
-    paths = sorted({file_place(path)[0] for path in task.files})
-    states = {path: os.stat(path) for path in paths}
-    return {path: [status.st_size, status.st_mtime_ns] for path, status in states.items()}
+    return path_states(task.files)
 
 
 def _bytes(config, unit):

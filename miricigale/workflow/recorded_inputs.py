@@ -133,6 +133,11 @@ def file_states(inputs, others=()):
     paths = list(inputs.paths) + list(others)
     for file in (inputs.highres, *inputs.images, *inputs.detection):
         paths += [getattr(file, name) for name in PATHS]
+    return path_states(paths)
+
+
+def path_states(paths):
+    """Return size and time of files by path, as `file_states`; paths may name an extension, or be None."""
     files = {str(file_place(path)[0]) for path in paths if path is not None}
     states = {}
     for file in sorted(files):
