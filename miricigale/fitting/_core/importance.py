@@ -39,10 +39,19 @@ _LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 @njit(**PART)
 def _to_unit(space, labels, label, y, x):
-    """Put the place of scores ``y`` in the unit intervals of a `Space`; returns -ln of the proposal's density."""
+    """
+    Put the place of scores ``y`` in the unit intervals of a `Space`.
+
+    Returned is -ln of the proposal's density, but for the ranges of the label (`_log_ranges`).
+    """
     log = 0.0
     for c in range(len(x)):
         first = labels.first[label, c]
+        if labels.count[label, c] == 1 and space.low[c, first] == space.high[c, first]:
+            # the cell is a value, whatever the score
+            x[c] = (first + 0.5) / space.size[c]
+            log -= labels.log_share[c, first]
+            continue
         share_below = labels.below[c]
         last = first + labels.count[label, c] - 1
         start = share_below[first]
@@ -62,7 +71,18 @@ def _to_unit(space, labels, label, y, x):
             part = (t - share_below[low]) / cell_share
         part = min(max(part, _INSIDE), 1.0 - _INSIDE)
         x[c] = (low + part) / space.size[c]
-        log += math.log(range_share) - labels.log_share[c, low]
+        log -= labels.log_share[c, low]
+    return log
+
+
+@njit(**PART)
+def _log_ranges(labels, label):
+    """Ln of the share of the proposal in the cells of a label."""
+    log = 0.0
+    for c in range(len(labels.below)):
+        first = labels.first[label, c]
+        end = first + labels.count[label, c]
+        log += math.log(labels.below[c, end] - labels.below[c, first])
     return log
 
 
@@ -87,8 +107,14 @@ def evaluate_places(space, labels, target, label, y, x, evaluated, work):
     work : `Work`
         Scratch.
     """
+    own_label = -1
+    log_ranges = 0.0
     for i in range(len(y)):
-        log = _to_unit(space, labels, label[i], y[i], x[i])
+        # neighbors share labels
+        if label[i] != own_label:
+            own_label = label[i]
+            log_ranges = _log_ranges(labels, own_label)
+        log = log_ranges + _to_unit(space, labels, label[i], y[i], x[i])
         prior, like, scale, variance = _evaluate(space, target, x[i], work)
         for a in range(labels.n_active[label[i]]):
             score = y[i, labels.axes[label[i], a]]
