@@ -193,6 +193,11 @@ def test_time_in_place_of_groups():
 def test_the_footprint_is_the_field_of_the_array():
     made = Exposure("F770W", n_groups=10, pointing=FIELD)
     corners = made.footprint
+    # half a pixel from the centers of the pixels at the corners
+    ny, nx = made.shape
+    x, y = made.wcs.world_to_pixel(corners)
+    assert_allclose(x, [-0.5, nx - 0.5, nx - 0.5, -0.5], atol=1e-4)
+    assert_allclose(y, [-0.5, -0.5, ny - 0.5, ny - 0.5], atol=1e-4)
     sides = corners.separation(np.roll(corners, -1)).to_value(u.arcsec)
     # 1032 x 1024 pixels of 0.1105 by 0.1113 arcsec
     np.testing.assert_allclose(sides, [114.0, 114.0, 114.0, 114.0], rtol=0.02)
