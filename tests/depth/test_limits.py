@@ -1,5 +1,7 @@
 """Closed-form limits against theory, simulated white noise and published numbers."""
 
+import itertools
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from miricigale.depth import (
     sensitivity,
     sensitivity_table,
 )
+from miricigale.depth.fitted import extraction_map
 from miricigale.depth.limits import extraction_weights
 from miricigale.depth.noise import ExposureNoise, noise_power, ramp_variance
 from miricigale.detector import BadPixels, CosmicRays, Detector, Residual
@@ -118,6 +121,23 @@ def test_the_limit_of_a_fit_solves_its_equation():
     assert_quantity_allclose(
         aperture_limit(NAME, time), aperture_noise(NAME, time, n_sigma=5)["flux"] * u.uJy
     )
+
+
+@pytest.mark.parametrize("boxes", [(), (1.0,), (1.0, 1.3)])
+def test_every_lattice_of_pixels_finds_unit_flux_in_the_mean(boxes):
+    # a Gaussian of 1.5 pixels, sampled four times a side
+    axis = (np.arange(121) - 60) / 4
+    square = axis**2 + axis[:, None] ** 2
+    share = np.exp(-square / (2 * 1.5**2)) / (2 * np.pi * 1.5**2)
+    weight = extraction_map(share, boxes)
+    fluxes = [
+        np.sum(weight[y::4, x::4] * share[y::4, x::4])
+        for y, x in itertools.product(range(4), repeat=2)
+    ]
+    assert_allclose(np.mean(fluxes), 1, rtol=1e-12)
+    # the squared width of the weights: that of the PSF, and of each square twice
+    width = np.sum(weight * square) / np.sum(weight) / 2
+    assert_allclose(width, 1.5**2 + sum(2 * box**2 / 12 for box in boxes), rtol=1e-3)
 
 
 @pytest.mark.parametrize(
