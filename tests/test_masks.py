@@ -43,7 +43,7 @@ from miricigale.fitting import MassFunction, TemplateError
 from miricigale.injection import CompletenessCurve
 from miricigale.instrument import Exposure, north_up_wcs
 from miricigale.utils.exceptions import MiricigaleWarning
-from miricigale.utils.missing_values import floats, without_mask
+from miricigale.utils.missing_values import floats, mask_of, without_mask
 from miricigale.utils.positions import as_positions
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import as_table
@@ -773,6 +773,22 @@ def test_positions_and_redshifts_behind_a_mask_are_missing(kind):
     masked = SkyCoord(X * u.deg, Masked(X * u.deg, mask=mask))
     sky = as_positions(QTable({"sky": masked}), "catalog", missing=True)
     assert np.isnan(sky.dec.deg).tolist() == mask.tolist()
+
+
+@pytest.mark.parametrize("dtype", ["float64", "Float64", "Int64"])
+def test_numbers_of_pandas_are_masked_by_their_missing_values_alone(dtype):
+    # the method ``mask`` of a Series is no mask: redshift=frame["z"] left all galaxies unfitted
+    from miricigale.fitting.posterior.priors import known_redshifts
+
+    pandas = pytest.importorskip("pandas")
+    table = QTable({"id": np.arange(3)})
+    whole = pandas.Series([1, 2, 3], index=[7, 5, 6]).astype(dtype)
+    assert mask_of(whole).tolist() == [False] * 3
+    assert known_redshifts(table, whole).tolist() == [1, 2, 3]
+    part = pandas.Series([1, None, 3], dtype=dtype)
+    for values in (part, part.array):
+        assert mask_of(values).tolist() == [False, True, False]
+        assert np.isnan(known_redshifts(table, values)).tolist() == [False, True, False]
 
 
 def test_positions_behind_a_mask_have_no_color_excess():

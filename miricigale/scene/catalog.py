@@ -10,7 +10,7 @@ from miricigale.profiles import SERSIC_INDEX_RANGE
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.ids import id_column, likely_ids
-from miricigale.utils.missing_values import plain_floats, without_codes
+from miricigale.utils.missing_values import own_mask, plain_floats, without_codes
 from miricigale.utils.named_values import without, without_none
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
@@ -206,7 +206,7 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     if "star" not in catalog.colnames:
         catalog["star"] = np.zeros(len(catalog), dtype=bool)
     star = catalog["star"]
-    if star.dtype != bool or np.any(getattr(star, "mask", False)):
+    if star.dtype != bool or np.any(own_mask(star)):
         got = "missing values"
         if star.dtype != bool:
             got = star.dtype

@@ -12,6 +12,7 @@ from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import BLOCK, dilution, seen_agn
 from miricigale.utils.exceptions import ModelWarning, argument_error, unknown_name, warn
+from miricigale.utils.missing_values import own_mask
 from miricigale.utils.named_values import subset, without
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
@@ -31,7 +32,7 @@ def check_axes(model, axes):
         if name not in model.parameters or name in skipped:
             raise unknown_name("axis", name, [n for n in model.parameters if n not in skipped])
         parameter = model.parameters[name]
-        if np.any(getattr(values, "mask", False)):
+        if np.any(own_mask(values)):
             raise argument_error(name, "values without a mask", values)
         array = parameter.array(values)
         check_that(array.size != 0 and np.all(np.diff(array) > 0), name, "ascending values", array)

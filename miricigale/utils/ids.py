@@ -5,6 +5,7 @@ import re
 import numpy as np
 
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
+from miricigale.utils.missing_values import own_mask
 from miricigale.utils.options import check_that
 
 #: Names of columns of ids, in lower case and without what stands between words; the first is preferred.
@@ -116,7 +117,7 @@ def likely_ids(table):
 def _is_distinct(column):
     """Whether no value of a column occurs twice, and none is missing."""
     values = np.ma.getdata(getattr(column, "unmasked", column)).tolist()
-    return not np.any(getattr(column, "mask", False)) and len(set(values)) == len(values)
+    return not np.any(own_mask(column)) and len(set(values)) == len(values)
 
 
 def counted_ids(table, argument, start=0):
@@ -175,7 +176,7 @@ def ids_and_missing(column, argument):
         If there are several ids in a row, ids of different kinds or that are neither numbers nor text, bytes that
         are not UTF-8 or whole numbers in floats of too few digits, which are not exact.
     """
-    mask = np.asarray(getattr(column, "mask", False))
+    mask = np.asarray(own_mask(column))
     column = getattr(column, "unmasked", column)
     ids = np.ma.getdata(getattr(column, "value", column))
     check_that(ids.ndim == 1, argument, "a table with one id in a row", ids.shape)

@@ -141,6 +141,13 @@ def is_missing_word(texts):
     return np.isin(np.char.lower(np.char.strip(np.asarray(texts, dtype=str))), _WORDS)
 
 
+def own_mask(values):
+    """Mask that values carry, bool or an array of it; the missing values of pandas, whose ``mask`` is a method."""
+    if hasattr(values, "isna"):
+        return np.asarray(values.isna(), dtype=bool)
+    return getattr(values, "mask", False)
+
+
 def mask_of(values):
     """
     Return where values are masked.
@@ -159,7 +166,7 @@ def mask_of(values):
     if not hasattr(values, "dtype") and not hasattr(values, "mask"):
         values = np.asanyarray(values)
     shape = np.shape(values)
-    mask = np.broadcast_to(np.asarray(getattr(values, "mask", False), dtype=bool), shape)
+    mask = np.broadcast_to(np.asarray(own_mask(values), dtype=bool), shape)
     kind = getattr(getattr(values, "dtype", None), "kind", "O")
     if kind == "O" and not hasattr(values, "unit"):
         objects = np.asarray(values, dtype=object)

@@ -8,7 +8,7 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.filters.library import SEDPY
 from miricigale.utils.exceptions import argument_error, units_error
-from miricigale.utils.missing_values import first_word
+from miricigale.utils.missing_values import first_word, own_mask
 from miricigale.utils.named_values import attributes
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
@@ -420,7 +420,7 @@ def limits(table, name):
     if column not in table.colnames:
         return np.zeros(len(table), dtype=bool)
     values = table[column]
-    mask = np.asarray(getattr(values, "mask", False))
+    mask = np.asarray(own_mask(values))
     data_values = np.asarray(getattr(values, "unmasked", np.ma.getdata(values)))
     text = np.char.strip(np.char.lower(data_values.astype(str)))
     is_true = np.isin(text, _TRUE)

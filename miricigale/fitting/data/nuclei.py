@@ -10,6 +10,7 @@ from miricigale.filters.band_names import find_filter
 from miricigale.filters.photometry_table import unit_of_fluxes
 from miricigale.fitting.data.likelihood import NUCLEUS_SUFFIXES, flux_column, limits
 from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.missing_values import own_mask
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, flux_unit
@@ -223,7 +224,7 @@ def _numbers(table, name):
     unit = getattr(column, "unit", None) or u.dimensionless_unscaled
     if not unit.is_equivalent(u.dimensionless_unscaled):
         raise units_error("photometry", "a number without a unit", repr(str(unit)), column=name)
-    mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), (len(table),))
+    mask = np.broadcast_to(np.asarray(own_mask(column)), (len(table),))
     try:
         numbers = np.array(getattr(column, "unmasked", column), float)
     except (TypeError, ValueError):

@@ -12,7 +12,7 @@ from miricigale.fitting.posterior.quantities import column_values
 from miricigale.sed import COMPONENTS
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing_values import floats, without_mask
+from miricigale.utils.missing_values import floats, own_mask, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
 from miricigale.utils.random import stream
 from miricigale.utils.units import to_array
@@ -422,7 +422,7 @@ def read_density(redshift_prior, n):
 
 def _unmasked(value, name):
     """Return numbers as an array, NaN where they are masked."""
-    mask = np.asarray(getattr(value, "mask", False))
+    mask = np.asarray(own_mask(value))
     array = to_array(getattr(value, "unmasked", value), u.dimensionless_unscaled, name)
     return np.where(mask, np.nan, array)
 

@@ -10,6 +10,7 @@ from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter, default_values
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import own_mask
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table
 from miricigale.utils.units import to_array
@@ -263,6 +264,6 @@ def _bins(table):
 
 def _column(table, name, unit):
     column = table[name]
-    if np.any(getattr(column, "mask", False)):
+    if np.any(own_mask(column)):
         raise argument_error(name, "without masked values", f"{np.sum(column.mask)} masked")
     return to_array(column, unit, name, ndim=1, finite=True)
