@@ -88,7 +88,15 @@ def plain_positions(sky):
     -------
     sky : `~astropy.coordinates.SkyCoord`
         Itself if nothing is masked; else directions alone, NaN where they are masked.
+
+    Raises
+    ------
+    ValueError
+        If it is something else, such as a table or pairs of numbers.
     """
+    if not hasattr(sky, "spherical"):
+        wanted = "a SkyCoord, such as SkyCoord(table['ra'], table['dec'], unit='deg')"
+        raise argument_error("sky", wanted, type(sky).__name__)
     place = sky.spherical
     hidden = mask_of(place.lon) | mask_of(place.lat)
     if not hidden.any():

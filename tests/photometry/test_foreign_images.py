@@ -17,7 +17,7 @@ from astropy.wcs import WCS
 from helpers.errors import refuses
 from miricigale.instrument import Image, imager_wcs, pixel_area_map, read_image, write_image
 from miricigale.instrument.sky_axes import grid_angle, pixel_to_radec, radec_axes
-from miricigale.photometry import MosaicFile, read_mosaic
+from miricigale.photometry import MosaicFile, aperture_photometry, read_mosaic
 from miricigale.photometry.commands.kernel_files import image_psf
 from miricigale.photometry.images.arrays import image_arrays
 from miricigale.psf import filter_psf, psf_image
@@ -614,3 +614,16 @@ def test_the_first_of_several_images_is_named(tmp_path):
     assert np.median(image.data) == pytest.approx(1.0, abs=0.02)
     image = read_mosaic(f"{path}[BAND2]", error=f"{path}[ERR]")
     assert np.median(image.data) == pytest.approx(2.0, abs=0.02)
+
+
+@pytest.mark.parametrize("positions", [[(53.1, -27.8)], {"ra": [53.1], "dec": [-27.8]}])
+def test_positions_that_are_no_coordinates_are_refused(positions):
+    error = StdDevUncertainty(plane(0.1))
+    image = Image(noise(), unit="MJy/sr", uncertainty=error, wcs=tan(), filter="F770W")
+    refuses(
+        "'sky' must be a SkyCoord, such as",
+        aperture_photometry,
+        image,
+        positions,
+        1 * u.arcsec,
+    )
