@@ -310,7 +310,7 @@ def test_our_own_files_are_read(files, tmp_path):
         ({"segmentation": "moved"}, "is not on the pixels of"),
         ({"segmentation": "absent.fits"}, "no file absent.fits ('segmentation')"),
         ({"psf": None, "filter": "miri.f770w"}, "--pa-aper must be given (or --psf), for the header of"),
-        ({"psf": None, "filter": None}, "does not name it; --pa-aper must be given (or --psf), for that of"),
+        ({"psf": None, "filter": None}, "does not name it; --pa-aper must be given (or --psf), for the header of"),
         ({"highres-psf": None}, "there is no model PSF for nircam.f430m"),
         ({"highres-psf": None, "highres": "f444w"}, "--highres-pa-aper must be given (or --highres-psf), for the"),
         ({"psf": None, "filter": "nircam.f480m"}, "there is no model PSF for nircam.f480m"),

@@ -332,7 +332,8 @@ def _check_headers(images, highres, kernels):
         is_turned = name is None or (name in MODEL_FILTERS and not name.startswith("wfc3."))
         if is_modeled and is_turned and file.header.pa_aper is None:
             lacking.append(
-                f"'{prefix}pa_aper' must be given (or '{prefix}psf'), for that of {file.path} has no PA_APER"
+                f"'{prefix}pa_aper' must be given (or '{prefix}psf'), for the header of {file.path} has"
+                " no PA_APER"
             )
     # a single one has a message of its own
     if len(lacking) > 1:
