@@ -457,7 +457,11 @@ def _translated(rows, path):
             columns[ours] = theirs
             if kind == "E" and float(factor) != 1.0:
                 factors[band] = float(factor)
-        elif not meaning.upper().startswith("TOT"):
+        elif meaning.upper().startswith("TOT"):
+            msg = f"{path}: {meaning} ({theirs}) is not applied: masses and luminosities are those of the "
+            msg += "catalog's apertures; multiply fluxes and errors by total over aperture flux beforehand"
+            warn(msg, CatalogWarning)
+        else:
             wanted = "F or E and a number, id, z_spec, ra, dec or TOT"
             raise data_error(path, f"must have {wanted} after {theirs}, got {meaning!r}")
     return {"columns": columns, "error_factors": factors, "left_out": left_out}

@@ -19,13 +19,18 @@ from miricigale.utils.options import check_that
 from miricigale.utils.units import angle_unit
 
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
-#: Columns of right ascension and declination, in lower case and without ``_j2000``.
+#: Columns of right ascension and declination, in lower case and without ``_j2000``: those of surveys, VizieR and
+#: Source Extractor.
 _PAIRS = (
     ("ra", "dec"),
     ("alpha", "delta"),
     ("alphawin", "deltawin"),
     ("raj2000", "dej2000"),
     ("raj2000", "decj2000"),
+    ("_raj2000", "_dej2000"),
+    ("ra_icrs", "de_icrs"),
+    ("ra_deg", "dec_deg"),
+    ("x_world", "y_world"),
 )
 #: Columns of proper motions, in lower case, and of the time of positions.
 _MOTIONS = (("pmra", "pmdec"), ("pm_ra_cosdec", "pm_dec"), ("pm_ra", "pm_dec"), ("pmra", "pmde"))

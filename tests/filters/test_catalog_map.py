@@ -12,7 +12,7 @@ from helpers.cases import cases_of
 from helpers.errors import refuses
 from miricigale.filters import SURVEYS, CatalogMap, Filter, read_catalog_photometry
 from miricigale.filters.catalog_files import MappedRows, codes_of
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import CatalogWarning, DataError, MiricigaleWarning
 from miricigale.utils.missing_values import without_codes
 from miricigale.utils.row_files import open_rows
 
@@ -310,6 +310,16 @@ def test_translate_files_that_cannot_be_used(tmp_path):
     ):
         path.write_text(f"{line}\n")
         refuses(said, CatalogMap.read, path, error=DataError)
+
+
+def test_totals_of_a_translate_file_are_not_applied_and_said(tmp_path):
+    (tmp_path / "z.translate").write_text("id id\nf_160 F205\ne_160 E205\nf_tot TOT205\n")
+    (tmp_path / "c.cat").write_text("# id f_160 e_160 f_tot\n1 2.0 0.1 3.0\n")
+    with pytest.warns(CatalogWarning, match=r"TOT205 .f_tot. is not applied: masses"):
+        table = read_catalog_photometry(
+            tmp_path / "c.cat", tmp_path / "z.translate", units={"flux": "uJy"}
+        )
+    assert table["wfc3.f160w"].to_value(u.uJy) == [2.0]
 
 
 def test_translate_files_name_the_bands_that_have_no_filter_here(tmp_path):

@@ -145,6 +145,21 @@ def test_text_is_hours_and_degrees(ra, dec):
     assert_allclose(sky.dec.deg, [-0.51, np.nan], rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("_RAJ2000", "_DEJ2000"),
+        ("RA_ICRS", "DE_ICRS"),
+        ("X_WORLD", "Y_WORLD"),
+        ("ALPHA_J2000", "DELTA_J2000"),
+        ("ra_deg", "dec_deg"),
+    ],
+)
+def test_columns_of_vizier_and_source_extractor_are_positions(names):
+    sky = as_positions(Table([[53.1], [-27.8]], names=names), "catalog")
+    assert_allclose([sky.ra.deg[0], sky.dec.deg[0]], [53.1, -27.8], rtol=1e-12)
+
+
 @pytest.mark.parametrize("unit", ["h", "hours", "hourangle", '"h:m:s"'])
 def test_units_of_right_ascension_have_many_names(unit):
     table = Table({"ra": [3.5], "dec": [-27.8]})
