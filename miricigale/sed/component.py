@@ -31,6 +31,15 @@ CIGALE_MODULES = {
     "yang20": "xray",
     "redshifting": "meiksin2006",
 }
+#: Modules of CIGALE that have no component, and the components that come closest.
+_NEAREST_TO_CIGALE = {
+    "sfhfromfile": "sfh_table",
+    "m2005": "bc03",
+    "dustatt_2powerlaws": "charlot_fall",
+    "dl2014": "dl07",
+    "themis": "dl07",
+    "fritz2006": "skirtor2016",
+}
 #: Options of components that are those of CIGALE's modules.
 _CIGALE_OPTIONS = {"dustatt_calzleit": {"ebv_scaling": "cigale"}}
 
@@ -54,6 +63,12 @@ def named_component(name, **defaults):
     if name in ROLES and name not in COMPONENTS:
         names = [n for n in COMPONENTS.names() if COMPONENTS.metadata(n)["role"] == name]
         msg = f"{name!r} is a role; its components are {', '.join(names)}"
+        raise KeyError(msg)
+    if name in _NEAREST_TO_CIGALE and name not in COMPONENTS:
+        nearest = _NEAREST_TO_CIGALE[name]
+        msg = (
+            f"no component {name!r}: the component closest to this module of CIGALE is {nearest!r}"
+        )
         raise KeyError(msg)
     options = _CIGALE_OPTIONS.get(name, {}) | defaults
     return COMPONENTS.get(CIGALE_MODULES.get(name, name))(**options)

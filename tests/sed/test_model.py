@@ -10,7 +10,7 @@ from helpers.errors import refuses
 from miricigale.cigale.modules import _MODULES
 from miricigale.filters import Filter, FilterSet
 from miricigale.sed import COSMOLOGY, SED, ModelFlags, Parameter, SEDModel, yang2021_axes
-from miricigale.sed.component import CIGALE_MODULES, COMPONENTS, register
+from miricigale.sed.component import _NEAREST_TO_CIGALE, CIGALE_MODULES, COMPONENTS, register
 from miricigale.sed.components import (
     BC03,
     IGM,
@@ -187,6 +187,14 @@ def test_components_by_their_names_and_those_of_cigale():
     # the setup of CIGALE's files knows them all
     assert set(CIGALE_MODULES) <= set(_MODULES)
     refuses("no component 'sfhdelay'", SEDModel, ["sfhdelay", "bc03"], error=KeyError)
+
+
+@pytest.mark.parametrize("name", sorted(_NEAREST_TO_CIGALE))
+def test_a_module_of_cigale_without_a_component_names_the_closest(name):
+    nearest = _NEAREST_TO_CIGALE[name]
+    assert nearest in COMPONENTS.names()
+    message = f"no component '{name}': the component closest .* is '{nearest}'"
+    refuses(message, SEDModel, [name, "bc03"], error=KeyError)
 
 
 def test_logarithms_of_masses_by_name_and_unit(model, filters):
