@@ -69,8 +69,8 @@ def _outcome(results):
     if not unfitted:
         return text
     counts = Counter(name for value in unfitted for name in FitFlags.names(value))
-    reasons = [f"{name.replace('_', ' ')} {count}" for name, count in counts.most_common()]
-    return f"{text} (not: {', '.join(reasons)})"
+    reasons = [f"{count} with the flag {name.upper()}" for name, count in counts.most_common()]
+    return f"{text} (not fitted: {', '.join(reasons)})"
 
 
 #: Options of `~miricigale.fitting.fit_file`, whose module loads the kernels: a missing file is said without them.

@@ -3,6 +3,7 @@
 import io
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import unquote
 
 import astropy.units as u
@@ -14,7 +15,7 @@ from numpy.testing import assert_allclose
 
 from helpers.commands import command
 from helpers.errors import refuses
-from miricigale.cli import main
+from miricigale.cli import catalogs, main
 from miricigale.fitting import (
     FitFlags,
     SurveyCalibration,
@@ -454,3 +455,12 @@ def test_a_catalog_is_calibrated_by_its_known_redshifts(tmp_path, capsys, monkey
     assert wide.meta["fit"]["agn_error"] == 0.5
     spread = [np.nanmean(some.std("frac_agn").value) for some in (again, wide)]
     assert spread[1] > 1.03 * spread[0]
+
+
+def test_the_sentence_at_the_end_has_the_reason_of_objects_without_a_fit():
+    """The names are those of the page of flags."""
+    flags = Table({"flags": [0, int(FitFlags.NO_BAND), int(FitFlags.FEW_BANDS)]})
+    results = SimpleNamespace(to_table=lambda columns: flags[columns])
+    assert catalogs._outcome(results) == (
+        "3 objects, 1 fitted (not fitted: 1 with the flag NO_BAND, 1 with the flag FEW_BANDS)"
+    )
