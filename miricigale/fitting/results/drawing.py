@@ -273,7 +273,8 @@ def plot_redshift(results, z_spec, ax=None, **kwargs):
     bias = np.median(offset)
     scatter = 1.4826 * np.median(np.abs(offset - bias))
     outliers = np.mean(np.abs(offset) > OUTLIER)
-    text = f"{true.size} objects: bias {bias:+.4f}, $\\sigma_{{MAD}}$ {scatter:.4f}, "
+    n = true.size
+    text = f"{n} object{'s' * (n != 1)}: bias {bias:+.4f}, $\\sigma_{{MAD}}$ {scatter:.4f}, "
     kwargs.setdefault("title", f"{text}{100 * outliers:.1f} % outliers")
     errors = np.stack([middle - low, high - middle])
     ax = plot_redshifts(true, middle, z_err=errors, ax=ax, **kwargs)

@@ -200,7 +200,8 @@ class FitResults(FitRows):
             key = np.asarray(self.ids).item()
             return f"<FitResults of {key!r}, chi2 {self.chi2:.4g} in {self.n_bands} of {bands}>"
         good = int(np.count_nonzero(self.fitted))
-        return f"<FitResults of {len(self)} objects, {good} fitted, {bands}>"
+        n = len(self)
+        return f"<FitResults of {n} object{'s' * (n != 1)}, {good} fitted, {bands}>"
 
     def _repr_html_(self):
         table = self._several()[:_SHOWN].to_table()._repr_html_()

@@ -168,7 +168,8 @@ model : `~miricigale.sed.SEDModel`, optional
     def __repr__(self):
         if self.isscalar:
             return f"<Samples of {np.asarray(self.ids).item()!r}, {self.n_draws} draws>"
-        return f"<Samples of {len(self)} objects, {self.n_draws} draws each>"
+        n = len(self)
+        return f"<Samples of {n} object{'s' * (n != 1)}, {self.n_draws} draws each>"
 
     @property
     def n_draws(self):
