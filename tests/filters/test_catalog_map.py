@@ -70,7 +70,7 @@ def test_units_of_the_file_are_taken(tmp_path):
         warnings.simplefilter("error")
         out = read_catalog_photometry(path, units={"flux": "ABmag"})
     assert out[BAND][0].to_value(u.uJy) == pytest.approx(1)
-    match = "got no unit: say it, such as units="
+    match = "got no unit: give one, such as units="
     refuses(match, convert, {"id": [1], BAND: [1.0]}, error=u.UnitsError)
 
 

@@ -54,7 +54,7 @@ def test_a_table_without_units_is_fitted_in_the_unit_that_is_said(fitter, photom
     plain = {
         name: getattr(photometry[name], "value", photometry[name]) for name in photometry.colnames
     }
-    refuses("got no unit: say it, as unit='uJy'", fitter.fit, plain, error=u.UnitsError)
+    refuses("got no unit: give one, as unit='uJy'", fitter.fit, plain, error=u.UnitsError)
     fitted = fitter.fit(plain, unit="uJy")
     assert_array_equal(fitted.pdf["redshift"], results.pdf["redshift"])
     smaller = fitter.fit(plain, unit="nJy")

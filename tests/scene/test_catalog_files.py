@@ -89,7 +89,7 @@ def test_ids_are_found_by_their_usual_names_or_the_likely_column_is_named(plain,
 
 def test_units_must_be_said_where_the_file_has_none(plain, tmp_path):
     path = write(plain, tmp_path / "c.csv")
-    match = r"'wfc3\.f160w' must be .* uJy, got no unit: say it, such as units="
+    match = r"'wfc3\.f160w' must be .* uJy, got no unit: give one, such as units="
     refuses(match, read_catalog, path, error=u.UnitsError, columns=COLUMNS)
     with pytest.raises(u.UnitsError, match="'half_light_radius' must be convertible to arcsec"):
         read_catalog(path, columns=COLUMNS | SHAPE, units={"flux": "mJy"})

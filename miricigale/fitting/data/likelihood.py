@@ -305,7 +305,7 @@ class PhotometryReader:
         require_columns(table, ["id"] + list(columns), "photometry")
         for name in columns:
             if getattr(table[name], "unit", None) is None:
-                got = "no unit: say it, as unit='uJy' of the fit or --flux-unit uJy of the command"
+                got = "no unit: give one, as unit='uJy' in Python or --flux-unit uJy on the command line"
                 raise units_error("photometry", f"convertible to {FNU}", got, column=name)
         require_columns(table, [], "photometry", units=dict.fromkeys(columns, FNU))
         n = len(table)
