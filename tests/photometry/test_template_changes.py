@@ -137,25 +137,6 @@ def test_sizes_differ_between_bands():
     assert free.of(None, record(3.0, np.zeros(6), point=1.0), 1e-6)[0] == []
 
 
-def test_an_image_may_have_a_psf_of_another_width():
-    """A star whose template is the image: it changes as a Gaussian of the PSF's width does."""
-    free = TemplateChanges(gaussian_image(41, 1.5), gaussian_image(81, 4.0), 0.1, 0.02)
-    rest = Cutout(gaussian_image(101, 1.5), (0, 0))
-    template = Cutout(np.zeros((3, 3)), (49, 49), convolved=False, correction=rest)
-    star = record(0.01, np.zeros(6))
-    star["parameters"][:2] = 50.0
-    (change,), _ = free.of(template, star, 3e-3)
-    step = 1e-3
-    wider = gaussian_image(101, 4.0 * np.exp(step)) - gaussian_image(101, 4.0 * np.exp(-step))
-    expected = 0.02 * wider / (2 * step)
-    assert_allclose(change.cutout.data, expected, atol=0.02 * np.abs(expected).max())
-    assert change.light == pytest.approx(0, abs=1e-6)
-    # a point on top of it is that light
-    star["covariance"][1, 1] = star["covariance"][2, 2] = 1e-4
-    of_pair, _ = free.of(template, star, 0.3)
-    assert of_pair == []
-
-
 def test_a_nucleus_that_the_other_band_lacks_does_not_bias_an_image(tools):
     """A galaxy with a fifth of its light in a point that the high-resolution image does not show."""
     rng, sky, wide = np.random.default_rng(4), tools.places([0.02], [0.03]), 0.4

@@ -2,10 +2,9 @@
 The study by hand
 =================
 
-``miricigale run`` goes through the stages of a study by itself (:doc:`/method/dataflow`). Here you do them one by
-one, in one session, for forty real galaxies on 56" x 56" of the sky (the BRIGHTSKY subarray), two MIRI bands and
-two dithers. The input and the output of each stage are objects that you can look at, plot, write, change, or
-replace by your own.
+``miricigale run`` goes through the stages of a study by itself (:doc:`/method/dataflow`). Here you do them one by one,
+for forty real galaxies on 56" x 56" (the BRIGHTSKY subarray), two MIRI bands and two dithers. The input and the
+output of each stage are objects that you can look at, plot, write, change, or replace by your own.
 """
 
 # %%

@@ -46,7 +46,7 @@ class TemplateError:
     >>> error([0.1, 3.0] * u.um).round(3)
     array([0.15 , 0.169])
     >>> SurveyCalibration.survey().template_error([0.5, 8.0] * u.um).round(3)
-    array([0.059, 0.47 ])
+    array([0.072, 0.574])
     """
 
     wave: u.Quantity

@@ -334,7 +334,7 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
      acs.f814w  40   1.12       0.02
     wfc3.f160w  40    1.0       0.01
       irac.ch1  40    1.2       0.02
-    miri.f770w  40   1.07       1.79
+    miri.f770w  40   1.07       0.84
     """
     flux, _, model, good = _residuals(results)
     if longest is not None:

@@ -19,9 +19,6 @@ from miricigale.utils.parallel import parallel_map
 #: no flux by more of its errors.
 LEAST = 0.3
 
-#: Standard deviation of ln width of an image's PSF, as for stars (`~miricigale.photometry.fit.stars`).
-PSF_WIDTH_ERROR = 0.02
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FreeTemplates:
@@ -215,8 +212,7 @@ def find_changes(fit, fitted, parts, executor):
     """
     plain_fit = fit.fit
     kernel = fit.settings.mean_kernel
-    scatter = fit.settings.errors.size_scatter
-    finder = TemplateChanges(kernel.source, kernel.target, scatter, PSF_WIDTH_ERROR)
+    finder = TemplateChanges(kernel.source, kernel.target, fit.settings.errors.size_scatter)
     # only templates of enough signal can change by more than the noise
     snr = np.abs(plain_fit.flux) * np.sqrt(plain_fit.matrix.diagonal())
     is_known = np.isfinite(fitted["parameters"][:, 0]) & (fitted["galaxy"] == 0)

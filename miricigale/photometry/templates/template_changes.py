@@ -22,10 +22,6 @@ _WIDTHS = 4.0
 #: Least power of a change (see `TemplateChanges.of`) below which stamps are larger than that.
 _SEEN = 0.01
 
-#: Largest part of noise in the sum of squares of an image that may have a PSF of another width. The fit subtracts
-#: that part, while changes take up most of the power, of a point's half the width alone: what is left is positive.
-_MAX_NOISE = 1e-3
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Change:
@@ -93,18 +89,15 @@ class TemplateChanges:
         PSFs of the high-resolution image and of the image, on fine pixels.
     size_scatter : float
         Standard deviation of ln size between the bands of the two images.
-    width_error : float, optional
-        Standard deviation of ln width of the image's PSF, by which templates that are the image itself may change.
     """
 
-    def __init__(self, source, target, size_scatter, width_error=0.0):
+    def __init__(self, source, target, size_scatter):
         self._source = ShapeModels(source)
         self._target = ShapeModels(target)
         target_variance = _gaussian_variance(target)
         self._width = np.sqrt(target_variance)
         self._blur = np.sqrt(max(target_variance - _gaussian_variance(source), 0.0))
         self._size_scatter = size_scatter
-        self._width_error = width_error
 
     def of(self, cutout, fitted, min_power):
         """
@@ -206,15 +199,6 @@ class TemplateChanges:
         is_strong = self._size_scatter**2 * np.sum(middle**2) > min_power**2 * power
         if is_strong and not fitted["covariance"][1, 1]:
             changes.append(Change(Cutout(self._size_scatter * middle, remainder.origin)))
-        # of a source as sharp as the PSF that change is none, but the PSF may be wider or narrower: of a Gaussian
-        # the derivative to ln width is its variance times the Laplacian
-        wider = self._width_error * self._width**2 * scipy.ndimage.laplace(template)
-        is_strong = np.sum(wider**2) > min_power**2 * power
-        # noise of the blurred pixels, as white noise has it
-        noise_power = cutout.noise / (4 * np.pi * max(self._blur, 0.5) ** 2)
-        is_strong &= noise_power < _MAX_NOISE * power
-        if is_strong and not fitted["covariance"][1, 1]:
-            changes.append(Change(Cutout(wider, remainder.origin), float(wider.sum())))
         # each pixel adds to the light, and to what is taken off by the fit
         weight = 1.0 - self._blurred(template) / power
         pixel_variance = cutout.noise / max(np.count_nonzero(core), 1)
