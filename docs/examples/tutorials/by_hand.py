@@ -2,17 +2,16 @@
 The study by hand
 =================
 
-``miricigale run`` goes through the stages of a study by itself (:doc:`/method/dataflow`). Here you do them one by one,
-for forty real galaxies on 56" x 56" (the BRIGHTSKY subarray), two MIRI bands and two dithers. The input and the
-output of each stage are objects that you can look at, plot, write, change, or replace by your own.
+``miricigale run`` goes through the stages of a study by itself (:doc:`/method/dataflow`). Here you do them one by
+one, for forty real galaxies, two MIRI bands and two dithers. The input and the output of each stage are objects
+that you can look at, plot, write, change, or replace by your own.
 """
 
 # %%
 # 1. Catalog
 # ----------
-# A catalog is an astropy table with positions, redshifts, shapes, and fluxes in columns that have the names of
-# filters. The package brings a part of GOODS-S; your own table works in the same way. The exposure decides which
-# part is needed: two integrations of 60 groups at each of two dithers.
+# A catalog is a table with positions, redshifts, shapes, and fluxes in columns that have the names of filters. The
+# package brings a part of GOODS-S, of which 56" x 56" are needed here (the BRIGHTSKY subarray).
 
 import astropy.units as u
 import matplotlib.pyplot as plt
