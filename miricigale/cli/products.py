@@ -1,10 +1,9 @@
 """Commands of single products: show, psf, cite."""
 
-import collections
-import re
 import warnings
 from pathlib import Path
 
+from miricigale.cli.bibliography import bibtex
 from miricigale.utils.options import check_that
 from miricigale.utils.outputs import check_output
 
@@ -177,48 +176,3 @@ def citations_of(path):
             continue
         citations |= dict.fromkeys(getattr(product, "meta", {}).get("citations", ()))
     return list(citations)
-
-
-def bibtex(citations):
-    """
-    Return entries for BibTeX.
-
-    Parameters
-    ----------
-    citations : iterable of str
-        Such as ``"Yang et al. 2021, ApJ 908, 144"``.
-
-    Returns
-    -------
-    text : str
-        An entry ``@misc`` of each, whose note is the citation: authors and year as far as it states them. ADS has
-        the full ones.
-
-    Examples
-    --------
-    >>> from miricigale.cli.products import bibtex
-    >>> print(bibtex(["Yang et al. 2021, ApJ 908, 144"]))
-    @misc{yang2021,
-      author = {Yang and others},
-      year = {2021},
-      note = {Yang et al. 2021, ApJ 908, 144}
-    }
-    """
-    entries = []
-    n_keys = collections.Counter()
-    for text in citations:
-        match = re.match(r"(?P<author>[^,;(]+?),? \(?(?P<year>(?:19|20)\d\d)\b", text)
-        word = re.match(r"\W*(\w+)", text)[1].lower()
-        lines = []
-        if match:
-            authors = match["author"].replace("et al.", "and others").replace(" & ", " and ")
-            lines = [f"  author = {{{authors}}}", f"  year = {{{match['year']}}}"]
-            word += match["year"]
-        n_keys[word] += 1
-        key = word
-        if n_keys[word] != 1:
-            key = f"{word}_{n_keys[word]}"
-        note = re.sub(r"([&%#_$])", r"\\\1", text)
-        lines.append(f"  note = {{{note}}}")
-        entries.append(f"@misc{{{key},\n" + ",\n".join(lines) + "\n}")
-    return "\n".join(entries)
