@@ -24,6 +24,7 @@ def targets(tool):
     return tool.targets()
 
 
+@pytest.mark.slow
 def test_every_module_that_makes_a_number_is_changed(tool, targets):
     package = ROOT / "miricigale"
     changed = {str(path.relative_to(package)) for path in targets}

@@ -101,6 +101,7 @@ def test_two_dask_workers_give_the_numbers_of_one_process(
         assert_array_equal(mine, theirs, err_msg=name)
 
 
+@pytest.mark.slow
 def test_processes_get_the_grid_once(fitter, photometry, whole, process):
     assert len(pickle.dumps(fitter)) > 400_000
     process.n_bytes.clear()

@@ -488,6 +488,7 @@ def test_lockstep_answers_every_task_with_its_own_value():
         failing.map(lambda item: failing.evaluate(np.array([item])), range(4))
 
 
+@pytest.mark.slow
 def test_fits_from_file_to_file_and_without_a_band(engine, tmp_path):
     priors = {"redshift": (0.5, 1.5), "a": (-0.5, 0.5)}
     fitter = linear_fitter(priors, engine, n_live=60, n_effective=60)

@@ -117,6 +117,7 @@ def test_redshifts_go_with_their_rows(fitter, catalog, in_pieces, how):
     assert_joined(in_pieces(catalog, **options).parts(), whole)
 
 
+@pytest.mark.slow
 def test_parquet_gives_the_columns_and_values_of_fits(catalog, in_pieces, tmp_path):
     pytest.importorskip("pyarrow.parquet")
     found = []

@@ -232,6 +232,7 @@ sys.stdout.buffer.write(hdu.data["ASDF_METADATA"][0].tobytes())
 """
 
 
+@pytest.mark.slow
 def test_gwcs_has_the_same_bytes_in_every_process():
     pytest.importorskip("gwcs", reason="needs gwcs: pip install miricigale[gwcs]")
     import asdf

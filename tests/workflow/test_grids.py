@@ -167,6 +167,7 @@ def test_patches_measure_what_the_whole_field_does(runs):
     assert_allclose(np.median(error[1, known] / error[0, known]), 1.0, atol=0.03)
 
 
+@pytest.mark.slow
 def test_mosaics_of_patches_are_parts_of_the_whole(runs):
     config = run_config()
     whole = grid_of(config, NATIVE)

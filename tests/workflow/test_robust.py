@@ -157,6 +157,7 @@ def test_a_write_that_the_system_cuts_off_is_named_and_leaves_what_stood(tmp_pat
     assert (tmp_path / name).stat().st_size > 100_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_no_process_outlives_the_run(tmp_path, how):
     process = start(tmp_path / "run", start_new_session=True)

@@ -90,6 +90,7 @@ def test_what_is_compiled_is_known(tmp_path, monkeypatch):
     assert not warmup.is_compiled("fit")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 def test_compilation_imports_nothing_of_the_folder_and_ends_with_the_process_that_asked(tmp_path):
     (tmp_path / "platform.py").write_text("import os\nopen('ran', 'w')\nos._exit(0)\n")
