@@ -581,7 +581,9 @@ class SEDModel(Interactive):
             # bands alone may stand first
             axes, filters = None, axes
         if values:
-            check_that(axes is None, "axes", "left out beside values of axes by name", "both")
+            # an option that is spelled wrong stands among the values too
+            wanted = f"left out beside values of axes by name ({', '.join(values)})"
+            check_that(axes is None, "axes", wanted, "both")
             axes = values
         if isinstance(filters, Mapping):
             # bands first, as fitters have them

@@ -69,6 +69,14 @@ def is_barred(start):
     return len(lines) > 1 and all(line.startswith("|") and line.endswith("|") for line in lines)
 
 
+def _lines(source, path):
+    """Return the lines of a source, which is the file or its lines."""
+    if not isinstance(source, str):
+        return source
+    with packed_open(path) as stream:
+        return stream.read().decode("utf-8-sig").splitlines()
+
+
 def plain_rows(source, path, separator):
     """
     Leave rules, outer bars and the line of units of VizieR out of a CSV, and name a first column without a name.
@@ -103,10 +111,7 @@ def plain_rows(source, path, separator):
             rule = number
     if not (barred or unnamed or rule):
         return source, {}
-    if isinstance(source, str):
-        with packed_open(path) as stream:
-            source = stream.read().decode("utf-8-sig").splitlines()
-    lines = [line for line in source if line.strip()]
+    lines = [line for line in _lines(source, path) if line.strip()]
     if barred:
         lines = [line.strip()[1:-1] for line in lines]
     cells = list(csv.reader(lines[:3], delimiter=separator))
@@ -138,11 +143,9 @@ def commas_for_tabs(source, path):
     -------
     lines : list of str
     """
-    if isinstance(source, str):
-        with packed_open(path) as stream:
-            source = stream.read().decode("utf-8-sig").splitlines()
+    rows = csv.reader(_lines(source, path), delimiter="\t")
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(csv.reader(source, delimiter="\t"))
+    csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().splitlines()
 
 
@@ -229,13 +232,9 @@ def without_comments(source, path, separator):
         The same if there is no such line: one that begins with ``#`` and has not as many cells as the first line,
         so that ids such as ``#1`` stay.
     """
-    if isinstance(source, str):
-        if not _has_mark(path):
-            return source
-        with packed_open(path) as stream:
-            lines = stream.read().decode("utf-8-sig").splitlines()
-    else:
-        lines = source
+    if isinstance(source, str) and not _has_mark(path):
+        return source
+    lines = _lines(source, path)
     header = next((line for line in lines if line.strip()), "")
     n_cells = header.count(separator)
     kept = []
