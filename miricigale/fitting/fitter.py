@@ -7,12 +7,13 @@ from astropy.utils.decorators import deprecated
 from miricigale.filters.band_names import known_filter
 from miricigale.fitting.catalog_fits import CatalogFits
 from miricigale.fitting.data import fitted_bands
-from miricigale.fitting.data.likelihood import (
-    PhotometryReader,
-    filter_names,
-    per_band,
+from miricigale.fitting.data.likelihood import PhotometryReader, filter_names, per_band
+from miricigale.fitting.fitter_options import (
+    check_scale_error,
+    chosen_settings,
+    errors_of_expected_flux,
+    fitted_names,
 )
-from miricigale.fitting.fitter_options import check_scale_error, chosen_settings, fitted_names
 from miricigale.fitting.grid.grid_fit import GridFit
 from miricigale.fitting.results.pulls import warn_of_pulls
 from miricigale.fitting.results.sample_flags import chi2_limit, chi2_step, with_high_chi2
@@ -87,8 +88,8 @@ class BayesFitter(CatalogFits):
         ``"survey"``, ``"far-infrared"``, ``"yang2021"`` (of simulations) or ``"yang2021-quick"``. By default the
         model's own (`~miricigale.sed.SEDModel.named_axes`).
     model_error, error_floor : float or dict of str to float, optional
-        Part of the flux that is added to its error in quadrature, 0.1 where there is no calibration, and least
-        relative error of a flux, for all or by filter.
+        Part of the measured flux that is added to its error in quadrature, 0.1 where there is no calibration, and
+        least relative error of a flux, for all or by filter.
     template_error : `~miricigale.fitting.TemplateError`, optional
         Of a grid: error of the models by rest wavelength, added in quadrature too; what it does to the
         normalization of the likelihood counts. ``sigma`` of the results has that of the best model.
@@ -292,6 +293,9 @@ class BayesFitter(CatalogFits):
                 corrections[name] = calibration.of_bands(name, error_bands, 1.0)
             if model_error is None:
                 model_error = calibration.of_bands("error_part", error_bands, 0.0)
+                part = errors_of_expected_flux(self.bands, model_error)
+                self.backend = self.backend.with_relative_errors(part)
+                corrections["added_later"] = tuple(part)
         if model_error is None:
             model_error = 0.1
         self._reader = PhotometryReader(

@@ -1,7 +1,8 @@
 """Checks of the options of a fitter, before anything is made of them."""
 
-from miricigale.fitting.data.likelihood import filter_names
+from miricigale.fitting.data.likelihood import filter_names, is_filter
 from miricigale.fitting.data.settings import GridSettings, SamplerSettings
+from miricigale.fitting.survey.band_errors import long_instruments
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 
@@ -58,3 +59,30 @@ def check_scale_error(scale_error, compat):
         if compat:
             wanted = "False with compat='cigale'"
         raise argument_error("scale_error", wanted, repr(scale_error))
+
+
+def errors_of_expected_flux(bands, error_part):
+    """
+    Choose the bands in which errors of a calibration are a part of the expected flux, not of the measured one.
+
+    They are those of instruments whose starlight the other bands predict, as MIRI
+    (`miricigale.fitting.grid.relative_errors`).
+
+    Parameters
+    ----------
+    bands : tuple of str
+        All bands of the models.
+    error_part : dict of str to float
+        Errors as parts of the flux by band.
+
+    Returns
+    -------
+    part : dict of str to float
+        Those of these bands above 0.
+    """
+    part = {}
+    for group in long_instruments([band for band in bands if is_filter(band)]):
+        for band in group:
+            if error_part[band] > 0:
+                part[band] = error_part[band]
+    return part

@@ -255,6 +255,9 @@ class PhotometryReader:
         Objects with fewer usable bands are flagged.
     zero_point, error_factor : dict of str to float, optional
         What fluxes and errors of a filter are multiplied by, and errors besides; 1 by default.
+    added_later : tuple of str, optional
+        Filters whose part of the flux is added to the errors by
+        `~miricigale.fitting.grid.relative_errors.RelativeErrors`.
     """
 
     bands: tuple
@@ -264,6 +267,7 @@ class PhotometryReader:
     n_bands_min: int
     zero_point: dict = field(default_factory=dict)
     error_factor: dict = field(default_factory=dict)
+    added_later: tuple = ()
 
     def fitted(self, table):
         """List the bands of a catalog that are fitted: tuple of str."""
@@ -335,9 +339,10 @@ class PhotometryReader:
             flux_err[:, column] = band_err
             abs_flux = np.abs(np.where(usable, band_flux, 0.0))
             own_err = np.where(usable, band_err, 1.0)
-            total_err = np.hypot(
-                np.maximum(own_err, floor * abs_flux), self.model_error[name] * abs_flux
-            )
+            model_error = self.model_error[name]
+            if name in self.added_later:
+                model_error = 0.0
+            total_err = np.hypot(np.maximum(own_err, floor * abs_flux), model_error * abs_flux)
             limit[:, column] = usable & limits(table, name)
             total_err = np.maximum(
                 np.where(limit[:, column], own_err, total_err), _MIN_RELATIVE_ERROR * abs_flux

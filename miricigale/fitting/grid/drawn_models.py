@@ -37,7 +37,7 @@ def draw_samples(fit, data, log_prior, n_draws, seed, **parallel):
     """
     slices = list(chunks(len(data), _AT_ONCE)) or [slice(0, 0)]
     pieces = [(data[rows], log_prior[rows]) for rows in slices]
-    draw = partial(_draw_on_nodes, fit.engine, n_draws, seed)
+    draw = partial(_draw_on_nodes, fit, n_draws, seed)
     if fit.between is not None:
         draw = partial(_draw_between, fit, n_draws, seed)
     parts = parallel_map(draw, pieces, desc="draws", **parallel)
@@ -108,18 +108,20 @@ class Draws:
         return columns
 
 
-def _draw_on_nodes(engine, n_draws, seed, piece):
+def _draw_on_nodes(fit, n_draws, seed, piece):
     """Draw models of a piece of the catalog on the nodes: `Draws`."""
     data, log_prior = piece
+    data = fit.with_all_errors(data, log_prior)
     seeds = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
     seeds = np.array(seeds, dtype=np.int64)
-    index, scale = engine.draw(n_draws=n_draws, seeds=seeds, **data.of_engine(log_prior))
+    index, scale = fit.engine.draw(n_draws=n_draws, seeds=seeds, **data.of_engine(log_prior))
     return Draws(index, scale, np.zeros(len(data), np.int64), {}, None)
 
 
 def _draw_between(fit, n_draws, seed, piece):
     """Draw models of a piece of the catalog from those that the results of a fit rest on: `Draws`."""
     data, log_prior = piece
+    data = fit.with_all_errors(data, log_prior)
     names = dict.fromkeys(("redshift", "frac_agn", *fit.priors.axes))
     names |= dict.fromkeys(fit.engine.quantities.names)
     draws = Draws.empty(len(data), n_draws, names, len(fit.filters))

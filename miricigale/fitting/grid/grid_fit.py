@@ -16,6 +16,7 @@ from miricigale.fitting.grid.grid import GridEngine
 from miricigale.fitting.grid.interpolation import InterpolatedModels
 from miricigale.fitting.grid.mixture import BandMixture
 from miricigale.fitting.grid.nuclei import NuclearGrid, fit_with_nuclei
+from miricigale.fitting.grid.relative_errors import RelativeErrors
 from miricigale.fitting.posterior.populations import MassPrior, expected_sfr, sfr_log_prior
 from miricigale.fitting.posterior.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.posterior.priors import (
@@ -54,6 +55,7 @@ class GridFit:
     template_error: TemplateError | None = None
     between: Continuation | None = None
     nuclei: NuclearGrid | None = None
+    relative_errors: RelativeErrors | None = None
 
     #: Weight of the first or last redshift above which an object is flagged.
     edge_weight = 0.01
@@ -157,6 +159,26 @@ class GridFit:
         stars = float(self.given.nuclear_stars)
         return replace(self, nuclei=NuclearGrid(self.engine, index, stars, error))
 
+    def with_relative_errors(self, part):
+        """
+        Return the fit for data to whose errors parts of the expected flux are to be added.
+
+        Parameters
+        ----------
+        part : dict of str to float
+            Parts of the flux by band; nothing changes without bands.
+        """
+        if not part:
+            return self
+        parts = np.array([part.get(band, 0.0) for band in self.filters])
+        return replace(self, relative_errors=RelativeErrors(self.engine, parts))
+
+    def with_all_errors(self, data, log_prior):
+        """Add the errors that are parts of the expected flux to photometry, with ln of the prior of redshifts."""
+        if self.relative_errors is None:
+            return data
+        return self.relative_errors.add_to(data, log_prior)
+
     @property
     def chunk_size(self):
         """Objects in a piece of the catalog."""
@@ -211,6 +233,8 @@ class GridFit:
             "agn_error": agn_error,
             "constants": self.constants,
         }
+        if self.relative_errors is not None:
+            out["errors_of_expected_flux"] = self._relative_bands
         if self.nuclei is not None:
             out["nuclei"] = [self.filters[i] for i in self.nuclei.bands]
             out["nuclear_stars"] = self.nuclei.stars
@@ -233,6 +257,12 @@ class GridFit:
         if self.given.agn_bins is not None:
             out["agn_bins"] = repr(self.given.agn_bins)
         return out
+
+    @property
+    def _relative_bands(self):
+        """Bands whose errors have a part of the expected flux: list of str."""
+        part = self.relative_errors.part
+        return [band for band, value in zip(self.filters, part, strict=True) if value > 0]
 
     def provenance(self):
         """Return what results say of the grid, and what to cite for it."""
@@ -288,6 +318,7 @@ class GridFit:
     def fit_piece(self, pairs, piece):
         """Fit a piece, its photometry and priors of redshift: `FitResults`."""
         data, log_prior = piece
+        data = self.with_all_errors(data, log_prior)
         if data.nuclei is not None:
             return fit_with_nuclei(self, data, log_prior, pairs)
         if self.between is not None:

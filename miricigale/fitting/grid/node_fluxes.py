@@ -201,6 +201,7 @@ def flux_moments(fitter, table, *, redshift=None, redshift_prior=None, executor=
     """
     data, log_prior, _ = fitter._prepare(table, redshift, redshift_prior)
     backend = fitter.backend
+    data = backend.with_all_errors(data, log_prior)
     moments = FluxMoments.of_data(data, backend.filters)
     rows = np.flatnonzero(np.isfinite(log_prior).any(axis=1) & ~data.limit.any(axis=1))
     engine = _without_wrong_bands(backend.engine, data.used.any(axis=0))
