@@ -124,6 +124,20 @@ def test_image_is_the_model_evaluated():
     assert_allclose(image, expected, atol=1e-5 * image.max())
 
 
+@pytest.mark.parametrize("n", [11, 25, 51])
+def test_a_psf_on_finer_pixels_has_its_width(n):
+    """The ratio of pixel scales counts, not that of the numbers of pixels (as in photutils' resize_psf)."""
+    axis = np.arange(n) - n // 2
+    data = np.exp(-0.5 * np.add.outer(axis**2, axis**2) / 1.5**2)
+    psf = make_psf(data / data.sum(), pixel_scale=0.11 * u.arcsec, frame="sky")
+    image = psf_image(psf, pixel_scale=0.055 * u.arcsec, shape=2 * n - 1)
+    finer = np.arange(2 * n - 1) - (n - 1)
+    variance = image.sum(axis=0) @ finer**2 / image.sum()
+    # of the light on the array, which ends at 3.3 sigma of the smallest
+    truth = np.exp(-0.5 * (finer / 3.0) ** 2)
+    assert variance == pytest.approx(truth @ finer**2 / truth.sum(), rel=5e-3)
+
+
 def test_drizzle_adds_the_drop_and_the_pixel():
     """Variances of boxes add: (native^2 + mosaic^2) / 12 per axis, at any angle."""
     psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)
