@@ -1,7 +1,7 @@
 """
 Redshifts of CEERS sources with errors of the bands that are measured on the catalog, without known redshifts.
 
-    MIRICIGALE_DATA=../shared/data python benchmarks/band_errors.py [--interpolate 200] [--random 300]
+    MIRICIGALE_DATA=../shared/data python benchmarks/band_errors.py [--interpolate 600] [--random 300]
 
 The whole catalog (the part of that of Lisiecki et al. 2025 in $MIRICIGALE_DATA/ceers) is measured with
 `calibrate_bands`. Fitted are sources with S/N above 5 in seven bands: some at random, those with S/N above 5 in
@@ -46,7 +46,7 @@ def score(label, results, true, finer):
 def main():
     """Print the calibration and the scores."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--interpolate", type=int, default=200, help="as of GridSettings")
+    parser.add_argument("--interpolate", type=int, default=600, help="as of GridSettings")
     parser.add_argument("--random", type=int, default=300, help="sources at random")
     args = parser.parse_args()
     path = Path(os.environ["MIRICIGALE_DATA"]) / "ceers/ceers_photometry_part.fits"
