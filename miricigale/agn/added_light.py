@@ -1,7 +1,5 @@
 """Light of AGN of known luminosity, added to the photometry of galaxies."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from astropy.table import QTable
 
@@ -13,13 +11,14 @@ from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, LUMINOSITY, to_array
+from miricigale.utils.values import value_class
 
 #: Most bins of flux in which errors of a band are looked at, and least number of fluxes in each.
 _MOST_BINS = 20
 _LEAST_FLUXES = 20
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class NoiseCurve:
     """
     Error of a band as a function of flux, as a catalog has it.

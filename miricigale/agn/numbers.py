@@ -1,7 +1,5 @@
 """Tables of a survey of AGN: numbers by redshift and luminosity, totals, and the prior of the AGN fraction."""
 
-from dataclasses import dataclass
-
 import astropy.units as u
 import numpy as np
 
@@ -11,6 +9,7 @@ from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows
+from miricigale.utils.values import value_class
 
 #: AGN fraction from which AGN are counted by luminosity: smaller ones look like none.
 FLOOR = CLASS_LIMITS[0]
@@ -35,7 +34,7 @@ def _summary(draws, name):
     return {name: float(np.median(draws)), f"{name}_low": float(low), f"{name}_high": float(high)}
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class SampleNumbers:
     """
     What the numbers of a survey are made of.

@@ -1,7 +1,5 @@
 """Shares of AGN among galaxies, measured on a sample by a hierarchical sum over posteriors."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error
@@ -9,6 +7,7 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import check_count
+from miricigale.utils.values import value_class
 
 #: Pseudo-objects of the Dirichlet prior of the shares, in each bin of redshift and for the classes.
 CONCENTRATION = 1.0
@@ -18,7 +17,7 @@ _BURN_IN = 0.2
 _LARGEST_RATIO = 300.0
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class ShareDraws:
     """
     Draws from the posterior of shares and numbers of AGN in a sample; made by `draw_shares`.

@@ -1,6 +1,5 @@
 """AGN of a survey: fits of a catalog, and of the same with AGN of known luminosity."""
 
-import dataclasses
 import logging
 from io import BytesIO
 from pathlib import Path
@@ -25,6 +24,7 @@ from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, error_column
 from miricigale.utils.units import FNU, LUMINOSITY, check_count, is_number, positive
+from miricigale.utils.values import value_class
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ _SKY = (4.0 * np.pi * u.sr).to_value(u.deg**2)
 _WITH_AGN = ("galaxy", "quasar")
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class AGNResult(Interactive):
     """
     AGN of a survey; made by `AGNSurvey.run`.
@@ -433,7 +433,7 @@ def _noise_curves(results, bands, points):
     return {band: NoiseCurve.of_band(flux[:, j], error[:, j]) for j, band in enumerate(bands)}
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class _Sample:
     """
     What is taken from the fits of a catalog, by object.

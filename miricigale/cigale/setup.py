@@ -1,7 +1,7 @@
 """A run of CIGALE as a model, a grid and a fit here."""
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import astropy.units as u
@@ -24,6 +24,7 @@ from miricigale.utils.files import replacing
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns
+from miricigale.utils.values import value_class
 
 #: Most models that are written.
 _MOST = 2_000_000
@@ -43,7 +44,7 @@ def with_agn_parts(grid, model):
     return dataclasses.replace(grid, agn_properties=table)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class CigaleSetup:
     """
     A run of CIGALE in our terms; made by `read_pcigale_ini`.

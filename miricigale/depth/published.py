@@ -1,7 +1,5 @@
 """Published limits, how the exposure time calculator gets its own, and the residual they imply."""
 
-import dataclasses
-
 import astropy.units as u
 import numpy as np
 
@@ -10,6 +8,7 @@ from miricigale.instrument.published_tables import filter_row, imager_filter, ta
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.units import to_array
+from miricigale.utils.values import value_class
 
 
 def _short(filter):
@@ -17,7 +16,7 @@ def _short(filter):
     return imager_filter(filter).removeprefix("miri.")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class EtcSetup:
     """
     Exposures and extraction behind a published limit (see `etc_setup`).

@@ -1,7 +1,5 @@
 """What sky and sources fill the wells, and when."""
 
-import dataclasses
-
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -13,6 +11,7 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import require_columns
+from miricigale.utils.values import value_class
 
 #: Share of the full well above which the sky is reported.
 SKY_FRACTION = 0.6
@@ -24,7 +23,7 @@ NEVER = 2**31 - 1
 _SIDE = 3
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class SaturationForecast:
     """
     What an exposure fills, made by `~miricigale.detector.Detector.forecast`; it never changes.

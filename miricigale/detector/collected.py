@@ -1,16 +1,15 @@
 """What the pixels of an exposure collect in its whole time: what rates are drawn from."""
 
-import dataclasses
-
 import numpy as np
 
 from miricigale.detector.effects.base import Timed
 from miricigale.detector.effects.readout import Bias, Nonlinearity, ReadNoise
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
 from miricigale.instrument import DetectorProperties, Exposure, ExposureHistory
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Charge(Timed):
     """
     What the pixels of one exposure collect, and how it is read.

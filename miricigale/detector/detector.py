@@ -39,6 +39,7 @@ from miricigale.utils.options import check_kind, check_names, check_that
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import SURFACE_BRIGHTNESS
+from miricigale.utils.values import value_class
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +50,7 @@ _STANDARD = [kind for kind in ORDER if kind not in _OPTIONAL]
 _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Detector(Interactive):
     """
     A detector: effects in the order in which they act.

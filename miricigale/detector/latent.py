@@ -10,12 +10,13 @@ from miricigale.instrument import DQ, aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.units import TIME, Frozen, frozen_array, scalar, to_array
+from miricigale.utils.values import value_class
 
 # pixels of a ramp without information on the light
 _NO_LIGHT = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Latent(Frozen):
     """
     What an exposure leaves behind for those after it.

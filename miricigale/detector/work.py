@@ -1,6 +1,5 @@
 """The work of an exposure: effects that act on blocks of rows, side by side."""
 
-import dataclasses
 import functools
 
 import numpy as np
@@ -13,6 +12,7 @@ from miricigale.detector.effects.light import Photons
 from miricigale.detector.effects.order import ORDER
 from miricigale.instrument import DetectorProperties, Exposure
 from miricigale.utils.parallel import chunks, parallel_map, threads
+from miricigale.utils.values import value_class
 
 #: What makes the charge of a pixel, whenever it comes within the exposure; cosmic rays apart.
 _COLLECTING = tuple(kind for kind in ORDER[: ORDER.index(Saturation)] if kind is not CosmicRays)
@@ -24,7 +24,7 @@ _ROWS = 128
 _BLOCK_SAMPLES = 2**21
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class(repr=False)
 class Work:
     """
     One exposure: its effects act on blocks of rows, side by side.

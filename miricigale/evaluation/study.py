@@ -11,9 +11,10 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, ab_magnitude
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class TruthResults:
     """
     What was found of one truth.
@@ -147,7 +148,7 @@ class TruthResults:
         return out
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class(repr=False)
 class StudyResults:
     """
     What was found of several truths with the same sources.

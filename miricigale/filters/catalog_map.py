@@ -36,6 +36,7 @@ from miricigale.utils.named_values import convert_values, field_names, field_val
 from miricigale.utils.options import check_choice, check_data, check_names, check_that
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, flux_unit
+from miricigale.utils.values import value_class
 
 #: Unit that a column without any has.
 _DEFAULT_UNITS = {"ra": u.deg, "dec": u.deg, "position_angle": u.deg}
@@ -45,7 +46,7 @@ TRANSLATE_SUFFIXES = (".translate", ".csv")
 _PER_MAGNITUDE = 0.4 * np.log(10)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class CatalogMap:
     """
     Names, units and missing values of a catalog.

@@ -1,7 +1,7 @@
 """Files of filter curves."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import astropy.units as u
@@ -15,6 +15,7 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_data
 from miricigale.utils.table_files import TABLE_FORMATS, read_table, table_suffix
 from miricigale.utils.units import WAVE
+from miricigale.utils.values import value_class
 
 #: Units of wavelengths as headers name them.
 _UNITS = {
@@ -51,7 +52,7 @@ _NOISE = 0.05
 _EDGE = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Curve:
     """
     A filter curve of a file.

@@ -28,6 +28,7 @@ from miricigale.utils.units import (
     is_number,
     to_array,
 )
+from miricigale.utils.values import value_class
 
 #: Version of the band averages: raised when the same curve gives other numbers.
 VERSION = 1
@@ -55,7 +56,7 @@ def _padded(wave, throughput):
     return wave, throughput
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Filter(Frozen, Interactive):
     """
     A passband: the response to photons against wavelength.

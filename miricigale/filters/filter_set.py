@@ -17,7 +17,7 @@ from miricigale.utils.interactive import Interactive
 from miricigale.utils.units import FNU, WAVE
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
+@dataclasses.dataclass(frozen=True)
 class FilterSet(Interactive):
     """
     An ordered set of filters.

@@ -1,6 +1,5 @@
 """The field into which sources are injected: what its user measures, without and with them."""
 
-import dataclasses
 import functools
 
 import astropy.units as u
@@ -21,9 +20,10 @@ from miricigale.psf import make_psf, psf_image, rotate_psf
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import match_sky
 from miricigale.utils.units import ANGLE, FNU
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Measured:
     """What a user's photometry gives for the sources of a field, and for those that were injected."""
 

@@ -14,6 +14,7 @@ from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_choice
 from miricigale.utils.package_tables import declared
 from miricigale.utils.units import FNU
+from miricigale.utils.values import value_class
 
 #: What tables may be binned by.
 BINNED_BY = ("magnitude", "size", "place", "neighbors")
@@ -35,7 +36,7 @@ _BRIGHT = 5.0
 _ONE_SIGMA = 68.27
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class InjectionResult(Interactive):
     """
     Completeness, purity, bias and error calibration of the photometry of a field.

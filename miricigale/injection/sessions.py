@@ -10,9 +10,10 @@ from miricigale.reduction import Reducer
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.named_values import field_values
 from miricigale.utils.units import ANGLE
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Injection(Interactive, InjectionSettings):
     """
     Inject stars and galaxies into real images or ramps, and measure what becomes of them.

@@ -6,9 +6,10 @@ from miricigale.photometry import DETECTION_PRESETS, DetectionPreset
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_least, check_names, check_positive
 from miricigale.utils.random import check_seed
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class(repr=False)
 class InjectionSettings:
     """What is injected, and what counts as found; each as for `~miricigale.injection.Injection`."""
 

@@ -1,7 +1,5 @@
 """One measurement of a field with injected sources, and that without any."""
 
-import dataclasses
-
 import numpy as np
 from astropy.table import QTable
 
@@ -23,6 +21,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
 from miricigale.utils.units import ANGLE, FNU, ab_magnitude
+from miricigale.utils.values import value_class
 
 #: Flags with which a source still says what colors and shapes are like.
 _HARMLESS = ForcedFlags.BLENDED | ForcedFlags.UNEXPLAINED_NEIGHBOR
@@ -51,7 +50,7 @@ _FEWEST = 20
 _ROOM = 3.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Base:
     """
     The field without injected sources.

@@ -19,6 +19,7 @@ from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import check_count, scalar
+from miricigale.utils.values import value_class
 
 
 def readout_patterns():
@@ -109,7 +110,7 @@ def _counts_of(filter, time, group, n_integrations, max_fill=0.6, max_groups=100
     return min(counts, key=lambda pair: abs(math.prod(pair) - groups))
 
 
-@dataclasses.dataclass(frozen=True, eq=False, init=False, repr=False)
+@value_class(init=False)
 class Exposure(Interactive):
     """
     One exposure of the imager.

@@ -22,6 +22,7 @@ from miricigale.reduction import imager_response
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.named_values import attributes
+from miricigale.utils.values import value_class
 from miricigale.workflow.background import band_background
 from miricigale.workflow.options import of_option
 
@@ -29,7 +30,7 @@ from miricigale.workflow.options import of_option
 _ANYWHERE = {"pointing": SkyCoord(0 * u.deg, 0 * u.deg), "roll": 0 * u.deg}
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class BandPlan:
     """
     The exposures of one band, and the errors that they give.

@@ -1,6 +1,5 @@
 """From exposures to accuracy: mock photometry of a sample, fitted and compared with its truth."""
 
-import dataclasses
 import functools
 
 import astropy.units as u
@@ -18,6 +17,7 @@ from miricigale.utils.named_values import places, subset
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.tables import error_column, require_columns
+from miricigale.utils.values import value_class
 from miricigale.workflow.stages.fits import existing_errors, study_fitter
 from miricigale.workflow.stages.inputs import fit_plan
 from miricigale.workflow.stages.sample import detected_bands
@@ -35,7 +35,7 @@ _RTOL = 1e-4
 _LEAST = 3
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Plan:
     """
     What one set of exposures yields; made by `Planner`.

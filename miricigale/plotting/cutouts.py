@@ -1,7 +1,5 @@
 """Small pictures of sources: the prior, and mosaic, model and residual of each band, many in one file."""
 
-import dataclasses
-
 import numpy as np
 from astropy.nddata import block_reduce
 from astropy.stats import mad_std
@@ -10,6 +8,7 @@ from PIL import Image
 
 from miricigale.plotting.images import filled
 from miricigale.utils.parallel import chunks
+from miricigale.utils.values import value_class
 
 #: Side of the pictures, and the finest pixels of those of the bands, in arcsec.
 BOX = 5.3
@@ -25,7 +24,7 @@ LOWEST = -3.0
 HIGHEST = 10.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class(repr=False)
 class _Panels:
     """
     Images on one grid that are shown with one stretch.

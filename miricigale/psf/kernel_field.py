@@ -1,6 +1,5 @@
 """Matching kernels that change over the field."""
 
-import dataclasses
 import functools
 from operator import attrgetter
 from typing import ClassVar
@@ -16,9 +15,10 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.positions import plain_positions
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class KernelField:
     """
     Matching kernels of several places of a field.

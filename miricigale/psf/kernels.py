@@ -20,9 +20,10 @@ from miricigale.utils.interactive import Interactive
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.units import ANGLE, frozen_array, positive, scalar, to_array
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class MatchingKernel(Interactive):
     """
     A convolution kernel from a sharp PSF to a wide one.

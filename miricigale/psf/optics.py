@@ -1,6 +1,5 @@
 """Pupils, wavefronts and the light of a point source in the focal plane."""
 
-import dataclasses
 import math
 import tomllib
 
@@ -13,6 +12,7 @@ from miricigale.utils.options import check_least, check_that
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import frozen_array
+from miricigale.utils.values import value_class
 
 #: One arcsecond in rad.
 ARCSEC = math.pi / 180 / 3600
@@ -28,7 +28,7 @@ _HST_OBSCURATION = 0.40
 _ROWS = 8
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Pupil:
     """
     A pupil on a square grid, seen so that its axes are those of the image.

@@ -7,6 +7,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from miricigale.psf import _core
 from miricigale.utils.options import check_that
+from miricigale.utils.values import value_class
 
 #: Terms of a correction and the standard deviation of each by its prior: relative width of the core, its
 #: elongation along the axes and the diagonals, and the light beyond some full widths at half maximum.
@@ -33,7 +34,7 @@ _SCATTER = 0.02
 _STEPS = 5
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Star:
     """
     Pixels of a star, each array of shape (ny, nx): its light, the error (infinite for pixels that do not count),

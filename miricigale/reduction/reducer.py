@@ -53,7 +53,7 @@ from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 _SCALE = 0.11 * ANGLE
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Reducer(Interactive):
     """
     Settings of the reduction; every method leaves them as they are.

@@ -18,9 +18,10 @@ from miricigale.reduction.sky.background import Background
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import RATE
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class ReductionResult(Interactive):
     """
     What the reduction of one filter's dithers gave.

@@ -14,6 +14,7 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import middle_pixel
 from miricigale.utils.units import ANGLE, Frozen, frozen_array, frozen_quantity, positive
+from miricigale.utils.values import value_class
 
 # two points of Gauss and Legendre in a cell: the light's variance in it is exact
 _GAUSS = 0.5 / math.sqrt(3.0)
@@ -23,7 +24,7 @@ _GAUSS = 0.5 / math.sqrt(3.0)
 _CELL = 0.375
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Cutout(Frozen):
     """
     An image of a source, to be painted into a scene.

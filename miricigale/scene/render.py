@@ -1,6 +1,5 @@
 """Painting points, Sersic profiles and images through a PSF: one grid, one convolution."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -14,6 +13,7 @@ from miricigale.scene.deposit import deposit_profiles, smooth_from
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import thread_count
+from miricigale.utils.values import value_class
 
 #: Sersic sources with a half-light radius below this many nodes are points.
 _UNRESOLVED = 0.05
@@ -23,7 +23,7 @@ _UNRESOLVED = 0.05
 _DIRECT = 8
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Painter:
     """
     Paints sources on a pixel grid through a PSF.

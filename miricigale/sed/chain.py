@@ -1,7 +1,6 @@
 """The chain of components worked out on one grid of rest wavelengths: arrays only."""
 
 import itertools
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from miricigale.sed.component import ROLES
 from miricigale.utils.caching import cached
 from miricigale.utils.named_values import subset
 from miricigale.utils.package_tables import declared
+from miricigale.utils.values import value_class
 
 #: Version of the numbers that follow from the components: raised when the chain, the derived
 #: quantities or the grids change, so that grids kept on the disk are made anew.
@@ -38,7 +38,7 @@ _KEEPING = "names _hat _populations _glow factors dust agn_templates sky_transmi
 _OF_STARS = "dust_power stellar_mass sfr sfr_10myr sfr_100myr age_mass age_light"
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Stars:
     """
     Light of stars of n histories and of the gas they ionize, for one solar mass formed.

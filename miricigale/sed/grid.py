@@ -2,7 +2,7 @@
 
 import functools
 import re
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, field
 
 import astropy.units as u
 import numpy as np
@@ -14,6 +14,7 @@ from miricigale.utils.named_values import attributes, subset
 from miricigale.utils.options import check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import Frozen, frozen_array
+from miricigale.utils.values import value_class
 
 _SPAN = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)um")
 
@@ -65,7 +66,7 @@ def fraction_span(definition):
     return (low, high)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class ModelGrid(Frozen):
     """
     Band fluxes of a grid of galaxy and AGN models, kept as two factors.

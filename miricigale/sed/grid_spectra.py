@@ -1,7 +1,5 @@
 """Fluxes and spectra of models of a grid, also in bands and wavelengths that it does not have."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from astropy.table import QTable
 
@@ -12,9 +10,10 @@ from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import places
 from miricigale.utils.options import check_that
+from miricigale.utils.values import value_class
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class ListedModels:
     """
     Models that are none of a grid, for functions of this module that take one: model i is (i, i, i, i).

@@ -6,8 +6,6 @@ the dust took times a template D of one watt. Both S and L follow a straight lin
 Each part depends on a few parameters only, so that each can be tabulated much more finely than the whole.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
@@ -17,6 +15,7 @@ from miricigale.sed.gridding import Galaxies, agn_table
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.named_values import without
+from miricigale.utils.values import value_class
 
 #: Time spans in Gyr over which star-formation rates are averaged, by quantity.
 RATE_SPANS = {"sfr_10myr": 0.01, "sfr_100myr": 0.1}
@@ -39,7 +38,7 @@ _STELLAR_COLUMNS = (
 FORMED_COLUMNS = {_STELLAR_COLUMNS.index(name): span for name, span in RATE_SPANS.items()}
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class PartTable:
     """
     One part of the light for n sets of parameters.

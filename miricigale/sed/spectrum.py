@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import astropy.units as u
 import numpy as np
@@ -27,6 +27,7 @@ from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table, table_suffix, write_table
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number, to_array
+from miricigale.utils.values import value_class
 
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
 
@@ -114,7 +115,7 @@ class _Flux(u.Quantity):
         raise TypeError(msg)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class SED(Frozen, Interactive):
     """
     Spectral energy distribution: flux density against observed wavelength.

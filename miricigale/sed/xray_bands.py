@@ -1,7 +1,6 @@
 """X-ray bands of a grid: corona of the AGN by alpha_ox, binaries and hot gas of the galaxy."""
 
 import dataclasses
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import astropy.constants as const
@@ -15,6 +14,7 @@ from miricigale.sed.xray import check_band
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import positive, to_array
+from miricigale.utils.values import value_class
 
 #: Slopes between 2500 A and 2 keV, the values of X-CIGALE.
 ALPHA_OX = tuple(np.round(np.arange(-1.9, -1.05, 0.1), 1))
@@ -65,7 +65,7 @@ class Source(NamedTuple):
         return share / (4.0 * np.pi * far**2 * (high - low) * _PER_KEV * _MICROJANSKY)
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class XRays:
     """Options of `with_xray_bands`, and the sources that they make."""
 

@@ -22,6 +22,7 @@ from miricigale.utils.named_values import without_none
 from miricigale.utils.random import stream
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import ANGLE
+from miricigale.utils.values import value_class
 
 log = logging.getLogger(__name__)
 
@@ -150,7 +151,7 @@ def _clumps(row, seed):
     return light / light.sum(), east, north
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class RealGalaxies:
     """
     Galaxies that are found on an image, with the light that is theirs.

@@ -9,6 +9,7 @@ from miricigale.instrument import DetectorProperties, Exposure, reference_pixel_
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
+from miricigale.utils.values import value_class
 
 
 class Timed:
@@ -26,7 +27,7 @@ class Timed:
         return exposure.n_integrations * exposure.n_groups * exposure.group_time.to_value("s")
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class(repr=False)
 class Block(Timed):
     """
     Where and when an effect acts: some full rows of one exposure.

@@ -1,6 +1,6 @@
 """How far a fit can be trusted: mock catalogs fitted again, and bands left out and predicted."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import astropy.units as u
 import numpy as np
@@ -26,6 +26,7 @@ from miricigale.utils.tables import (
     require_columns,
 )
 from miricigale.utils.units import FNU, frozen_array
+from miricigale.utils.values import value_class
 
 _LEVELS = (0.16, 0.84)
 _COLUMNS = declared("miricigale.fitting", "columns.toml")
@@ -114,7 +115,7 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     return MockResult(results, fitter.fit(mock, **options), mock, seed, meta)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class MockResult:
     """
     A mock catalog, fitted.
@@ -361,7 +362,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     )
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class LeaveOutResult:
     """
     Bands that were not fitted, measured and predicted.

@@ -1,6 +1,6 @@
 """From a catalog of photometry to fluxes, errors and flags that a fit can use, and the flags of fits."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import astropy.units as u
 import numpy as np
@@ -14,6 +14,7 @@ from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, flux_unit, to_array
+from miricigale.utils.values import value_class
 
 #: S/N of the best model in all bands together below which an object is flagged.
 LOW_SIGNAL = 3.0
@@ -163,7 +164,7 @@ class FitFlags(Flags):
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192, "Bits with which a row has no result."
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class FitData(ObjectRows):
     """
     Photometry in arrays, which slices like `~miricigale.fitting.FitResults`.
@@ -237,7 +238,7 @@ class FitData(ObjectRows):
         return keywords
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class PhotometryReader:
     """
     How a fit takes fluxes and errors from catalogs.

@@ -1,7 +1,5 @@
 """Errors of models by rest wavelength, as a part of the flux."""
 
-from dataclasses import dataclass
-
 import astropy.units as u
 import numpy as np
 from astropy.utils.decorators import deprecated
@@ -13,9 +11,10 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_kind
 from miricigale.utils.table_files import read_table
 from miricigale.utils.units import WAVE, frozen_array, to_array
+from miricigale.utils.values import value_class
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class TemplateError:
     """
     How well models represent real galaxies, by rest wavelength (Brammer et al. 2008, ApJ 686, 1503).

@@ -9,7 +9,7 @@ Bernoulli 25, 2714), which takes from what has little weight. Points are quasi-r
 objects: nothing depends on the id or place of an object in its catalog.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from miricigale.fitting.grid.moves import move_places, systematic
 from miricigale.fitting.grid.placed_models import PlacedModels, places_to_values, thinned
 from miricigale.fitting.grid.points import quasi_random
 from miricigale.fitting.grid.proposals import MIN_WEIGHT, Places, fit_mixture
+from miricigale.utils.values import value_class
 
 #: Number of places in a round.
 ROUND_SIZE = 512
@@ -81,7 +82,7 @@ _HOPELESS = 0.5
 _HOPELESS_TRIAL = 4096
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class WeightedPlaces:
     """
     Some of the places of a sampler with their weights, and what is wanted of them.

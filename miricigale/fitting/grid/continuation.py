@@ -1,6 +1,6 @@
 """Grids with what lies between their nodes, and the posteriors of objects there."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ from miricigale.fitting.grid.peaks import redshift_peaks
 from miricigale.fitting.grid.placed_models import places_to_values
 from miricigale.fitting.posterior.priors import GridAxis
 from miricigale.utils.units import Frozen
+from miricigale.utils.values import value_class
 
 #: Draws of the posterior on nodes that sampling begins with.
 N_START = 256
@@ -23,7 +24,7 @@ N_START = 256
 _SAME_FLUX = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Continuation(Frozen):
     """
     A grid with what lies between its nodes; picklable.
@@ -401,7 +402,7 @@ class Continuation(Frozen):
         return out
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class BetweenPosterior:
     """
     Posterior of an object between nodes.

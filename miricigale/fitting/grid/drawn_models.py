@@ -1,6 +1,5 @@
 """Models drawn from posteriors on a grid: on its nodes, or from the models between them that results rest on."""
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -9,6 +8,7 @@ from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.results.samples import Samples
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
+from miricigale.utils.values import value_class
 
 #: Objects in a piece of the catalog that models are drawn for.
 _AT_ONCE = 16
@@ -49,7 +49,7 @@ def draw_samples(fit, data, log_prior, n_draws, seed, **parallel):
     return Samples(fit.grid, data.ids, flags, axes=fit.priors.axes, seed=seed, **columns)
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Draws:
     """
     Draws of a piece of a catalog.

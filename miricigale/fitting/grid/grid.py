@@ -1,7 +1,6 @@
 """The grid engine: every model of a `~miricigale.sed.ModelGrid`, by factors."""
 
 from collections import namedtuple
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +14,7 @@ from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, Quantities
 from miricigale.sed import ModelGrid
 from miricigale.utils.package_tables import declared
 from miricigale.utils.units import Frozen
+from miricigale.utils.values import value_class
 
 #: Runs of up to 64 pairs listed at once by one worker (260 bytes each).
 _CAPACITY = 1 << 16
@@ -52,7 +52,7 @@ ObjectOnNodes = namedtuple(
 )
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@value_class(repr=False)
 class GridEngine(Frozen):
     """
     Posterior of many objects over a factorized model grid.

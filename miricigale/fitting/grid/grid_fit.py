@@ -1,6 +1,6 @@
 """Fits on a model grid: priors of redshift, joint posteriors, and what the engine finds as results."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -32,6 +32,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import MASS
+from miricigale.utils.values import value_class
 
 #: Best chi2 above which exp(-chi2 / 2) is below the smallest normal number for every model.
 VANISHING_CHI2 = 1417.0
@@ -41,7 +42,7 @@ _JOINT_SIZE = 1 << 22
 _ONE_NODE_WEIGHT = 0.95
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class GridFit:
     """
     How `~miricigale.fitting.BayesFitter` fits with every model of a grid; picklable.

@@ -6,8 +6,6 @@ along its axes and in redshift until the interpolation is good; the burst enters
 that dust takes. Of a grid whose model is unknown the whole galaxies are interpolated between its own nodes.
 """
 
-from dataclasses import dataclass
-
 import astropy.units as u
 import numpy as np
 
@@ -26,9 +24,10 @@ from miricigale.fitting.grid.part_tables import (
 )
 from miricigale.fitting.posterior.priors import grid_priors
 from miricigale.fitting.posterior.quantities import Quantities, column_values
+from miricigale.utils.values import value_class
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class _GalaxiesOfGrid:
     """Derived quantities of galaxies interpolated between those of a grid."""
 
@@ -45,7 +44,7 @@ class _GalaxiesOfGrid:
         return quantities | dict(zip(self.shape_names, shape, strict=True))
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class _Names:
     """Names of the quantities of a grid, and what turns luminosities into W."""
 
@@ -74,7 +73,7 @@ class _Names:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class InterpolatedModels:
     """
     Models between the nodes of a grid; picklable.

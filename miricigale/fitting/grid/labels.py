@@ -1,16 +1,15 @@
 """Labels of posteriors between the nodes of a grid: which components are present, and values of libraries."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.special import ndtri
 from scipy.stats import qmc
 
 from miricigale.fitting import _core
 from miricigale.utils.caching import cached
+from miricigale.utils.values import value_class
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class LabelTable:
     """
     What posteriors between nodes tell apart: components that are absent or present, and values that are labels.

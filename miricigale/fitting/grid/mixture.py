@@ -9,8 +9,6 @@ w = (1 - q) / sigma^2 + q / Sigma^2 and q the share of the broad part where the 
 2000, Stat. Comput. 10, 25). At every redshift it touches at a model that fits best with some bands wrong.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.special import expit, log_ndtr
 
@@ -18,6 +16,7 @@ from miricigale.filters import FilterSet
 from miricigale.fitting import _core
 from miricigale.fitting.data.likelihood import per_band
 from miricigale.utils.options import check_that
+from miricigale.utils.values import value_class
 
 #: Smallest width of the broad part, in units of the stated error.
 _MIN_BROAD_SIGMA = 10.0
@@ -28,7 +27,7 @@ _N_MORE_GALAXIES = 512
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class BandMixture:
     """
     Prior fraction and place of each band.
@@ -135,7 +134,7 @@ class BandMixture:
         return np.sum(weight[:, None] * wrong, axis=0)
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Tangents:
     """
     Finds, for each object, the models at which the tangents touch.

@@ -2,7 +2,6 @@
 
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
@@ -28,6 +27,7 @@ from miricigale.sed.light_parts import (
 )
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.options import check_that
+from miricigale.utils.values import value_class
 
 #: Part of a parameter's first step at which dust that may be absent is evaluated in place of 0.
 _TRACE_OF_DUST = 1e-3
@@ -47,7 +47,7 @@ _stored_tables = OrderedDict()
 _lock = threading.Lock()
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class ModelGalaxies:
     """Derived quantities of galaxies from columns of their parts; see `LightParts`."""
 

@@ -1,19 +1,19 @@
 """Fluxes that the posterior on the nodes of a grid predicts, from models that a scan of the nodes draws."""
 
 import dataclasses
-from dataclasses import dataclass
 
 import numpy as np
 
 from miricigale.fitting.grid.node_scan import NodeScan
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.units import Frozen
+from miricigale.utils.values import value_class
 
 #: Models drawn for each object: means are good to a thirtieth of the standard deviation.
 _N_DRAWS = 1024
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class FluxMoments:
     """
     Means and standard deviations of the model fluxes of n objects, with the data that were fitted.
@@ -136,7 +136,7 @@ def model_fluxes(engine, index):
     return model
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class _ScanTask(Frozen):
     """Scans pieces of a catalog, in other processes too."""
 

@@ -1,6 +1,5 @@
 """Where the posterior of objects is on the nodes of a grid: what sampling between the nodes begins with."""
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -9,6 +8,7 @@ from scipy.special import logsumexp
 from miricigale.fitting import _core
 from miricigale.fitting.grid.grid import GridEngine, ObjectOnNodes, Start
 from miricigale.utils.units import Frozen
+from miricigale.utils.values import value_class
 
 #: Objects that are compared with the galaxies of a redshift at once.
 _TOGETHER = 4
@@ -23,7 +23,7 @@ _LEAST_LOG = -1e4
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class NodeScan(Frozen):
     """
     A look at all nodes of a grid in single precision, at the best AGN fraction of each pair of models.
@@ -195,7 +195,7 @@ class NodeScan(Frozen):
         return np.sum(scan.stated.weight[z] * np.square(scan.stated.flux - scale * model))
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class _Scanned:
     """
     Data of an object as a scan takes them.

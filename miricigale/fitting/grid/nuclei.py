@@ -14,7 +14,7 @@ same linear combinations of their fluxes: galaxies have none of the points, so t
 differ from object to object.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -30,6 +30,7 @@ from miricigale.fitting.grid.mixture import BandMixture
 from miricigale.fitting.posterior.posterior import joint_names
 from miricigale.fitting.results.results import FitResults
 from miricigale.utils.units import Frozen
+from miricigale.utils.values import value_class
 
 #: Least rest of a total as a part of it: errors of templates are parts of what is there.
 _LEAST_REST = 1e-9
@@ -37,7 +38,7 @@ _LEAST_REST = 1e-9
 _WIDE = 10.0
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class NuclearMixture(BandMixture):
     """
     `BandMixture` of bands, of the rests of their totals, and of nuclei.
@@ -77,7 +78,7 @@ class NuclearMixture(BandMixture):
         return out
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class ObjectNuclei:
     """
     Nuclei of one object, and the data and models without covariance that they make.
@@ -229,7 +230,7 @@ class ObjectNuclei:
         return out
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class NuclearGrid(Frozen):
     """
     A grid for data with nuclei; picklable.

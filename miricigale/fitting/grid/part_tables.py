@@ -1,11 +1,11 @@
 """Tables of parts of models' light, between whose nodes these are interpolated, and how their axes are refined."""
 
 import itertools
-from dataclasses import dataclass
 
 import numpy as np
 
 from miricigale.fitting import _core
+from miricigale.utils.values import value_class
 
 #: Powers of a parameter, 1 or parts by 2, that may be its scale; those below 0 with the sign changed.
 _POWERS = (1.0, 0.5, 0.125, -0.5, -1.0)
@@ -146,7 +146,7 @@ def _n_combinations(axes):
     return int(np.prod([len(values) for values in axes.values()]))
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class PartAxes:
     """
     One part of a model's light on a product of axes.

@@ -1,11 +1,11 @@
 """Models between the nodes of a grid with the weights of a posterior."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from miricigale.utils.values import value_class
 
-@dataclass(frozen=True, eq=False)
+
+@value_class
 class PlacedModels:
     """
     Models between nodes with the weights of a posterior.

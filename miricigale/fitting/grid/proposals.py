@@ -1,11 +1,11 @@
 """Mixtures of t distributions that places between the nodes of a grid are drawn from, fitted to places before."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from miricigale.fitting import _core
+from miricigale.utils.values import value_class
 
 #: Weight, over that of its peak, below which no part is fitted.
 MIN_WEIGHT = 1e-3
@@ -29,7 +29,7 @@ _MIN_LOCAL_WEIGHT = 0.03
 _N_NEAR = 120
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Places:
     """
     Places of a posterior that a mixture is fitted to.
@@ -54,7 +54,7 @@ class Places:
     log_target: np.ndarray | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class FittedParts:
     """
     Parts of a mixture, whose shares are those within their label and peak.

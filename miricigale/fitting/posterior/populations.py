@@ -13,6 +13,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.units import MASS, is_number, to_array
+from miricigale.utils.values import value_class
 
 #: Part of the galaxies whose specific accretion rate lambda is above 0.01.
 _ACTIVE_PART = 0.1
@@ -146,7 +147,7 @@ class MassFunction:
         return x ** (self.alpha + 1.0) * np.exp(-x) * (1.0 + np.asarray(redshift)) ** self.evolution
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class MassPrior:
     """Prior of mass and redshift as the kernels take it: see `~miricigale.fitting._core.weigh_masses`."""
 

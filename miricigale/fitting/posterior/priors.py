@@ -1,6 +1,6 @@
 """Priors of the parameters of a grid, in weights of the nodes, and what is known of redshifts."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import astropy.units as u
 import numpy as np
@@ -16,6 +16,7 @@ from miricigale.utils.missing_values import floats, own_mask, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
 from miricigale.utils.random import stream
 from miricigale.utils.units import to_array
+from miricigale.utils.values import value_class
 
 #: Power of the redshift in `magnitude_prior`.
 _POWER = 0.90
@@ -27,7 +28,7 @@ _SLOPE = 0.066
 _CELL_POINTS = 16
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class GridAxis:
     """
     One parameter of a grid.
@@ -153,7 +154,7 @@ def _declared(components, name, attribute):
     return any(getattr(parameter, attribute, False) for parameter in declared)
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class GridPriors:
     """Axes with priors, and the prior weights of galaxies, AGN models, fractions and redshifts."""
 

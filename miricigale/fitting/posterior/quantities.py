@@ -1,6 +1,5 @@
 """Parameters and derived quantities of the models of a grid."""
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import astropy.units as u
@@ -9,6 +8,7 @@ import numpy as np
 from miricigale.fitting.posterior.posterior import cell_percentiles
 from miricigale.utils.options import check_that
 from miricigale.utils.units import LUMINOSITY, MASS, frozen_array
+from miricigale.utils.values import value_class
 
 #: Levels at which the distributions of derived quantities are kept.
 DERIVED_LEVELS = frozen_array(
@@ -125,7 +125,7 @@ def kept_percentiles(name, levels, quantiles):
     return quantiles[:, i] * (1.0 - part) + quantiles[:, i + 1] * part
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class ShapeQuantities:
     """
     What is derived from a galaxy model and does not scale with its mass: attenuation, ages, colors.
@@ -183,7 +183,7 @@ class ShapeQuantities:
         return out, quantiles
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class OtherFraction:
     """
     AGN fraction of every model in a second definition: y / (1 + y), y = c galaxy[g] agn[k].
@@ -222,7 +222,7 @@ class OtherFraction:
         return cls(name, ratio, agn)
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Quantities:
     """
     What is derived from the models of a grid, and how.

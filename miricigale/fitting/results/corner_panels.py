@@ -1,11 +1,10 @@
 """Panels of corner plots: cells for the draws of one object, the share of draws in each, values to mark."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.values import value_class
 
 #: Cells of a derived quantity.
 N_BINS = 20
@@ -13,7 +12,7 @@ N_BINS = 20
 CUT = 0.01
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class DrawPanel:
     """
     Values of a parameter in the draws of one object, and the cells in which they are counted.

@@ -2,7 +2,7 @@
 
 import html
 import re
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import astropy.units as u
 import numpy as np
@@ -27,6 +27,7 @@ from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.units import FNU
+from miricigale.utils.values import value_class
 
 #: Part of the mean below which CIGALE gives no standard deviation.
 CIGALE_LEAST_STD = 0.05
@@ -34,7 +35,7 @@ CIGALE_LEAST_STD = 0.05
 _SHOWN = 20
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class FitResults(FitRows):
     """
     Posteriors of the objects of a catalog, in its order.

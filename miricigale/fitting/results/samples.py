@@ -1,6 +1,6 @@
 """Models drawn from posteriors: joint distributions, fluxes in any band, spectra."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 
 import astropy.units as u
@@ -22,9 +22,10 @@ from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.units import FNU, WAVE
+from miricigale.utils.values import value_class
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Samples(FitRows):
     """
     Models drawn from the posteriors of the objects of a catalog.

@@ -2,7 +2,6 @@
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_names
 from miricigale.utils.parallel import chunks
+from miricigale.utils.values import value_class
 
 #: What to cite for them.
 CITATIONS = {
@@ -22,7 +22,7 @@ _BATCH = 128
 _QUEUE = 64
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Draws:
     """
     Weighted draws from a posterior.

@@ -1,6 +1,5 @@
 """Fits with continuous parameters by a nested sampler, and what it finds as results."""
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -23,6 +22,7 @@ from miricigale.utils.options import check_that
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
+from miricigale.utils.values import value_class
 
 #: Draws from the prior of which every component has to be able to evaluate one.
 _N_LIBRARY_TRIALS = 64
@@ -30,7 +30,7 @@ _N_LIBRARY_TRIALS = 64
 _N_TRIALS = 2048
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class SamplerFit:
     """
     How `~miricigale.fitting.BayesFitter` fits with a nested sampler; picklable.

@@ -12,6 +12,7 @@ from miricigale.fitting.posterior.priors import integrals_to, known_redshifts, r
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.values import value_class
 
 #: Part of a prior without limits that may lie outside the cells of its axis.
 _TAIL = 1e-3
@@ -69,7 +70,7 @@ class Log(Flat):
         return f"flat in log from {self.low:g} to {self.high:g}"
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Choice:
     """These values only, ascending, with weights that sum to 1."""
 
@@ -94,7 +95,7 @@ class Choice:
         return f"one of {', '.join(f'{v:g}' for v in self.values)}"
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Continuous(Flat):
     """A distribution of `scipy.stats`, cut to ``low`` and ``high``."""
 
@@ -126,7 +127,7 @@ class Continuous(Flat):
         return f"{law} of mean {self.law.mean():g}, std {self.law.std():g}"
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Table:
     """A density given at nodes and linear between them, such as p(z)."""
 
@@ -253,7 +254,7 @@ def _choice(argument, values, weights, parameter):
     return Choice(values, weights / weights.sum())
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Space:
     """The parameters of a fit by name: some free, with priors of this module, the others fixed."""
 

@@ -10,6 +10,7 @@ from scipy.special import expit, logit
 from miricigale.fitting.data.template_error import pivots
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.units import WAVE
+from miricigale.utils.values import value_class
 
 #: How many times their errors wrong fluxes scatter by.
 WRONG_WIDTH = 5.0
@@ -220,7 +221,7 @@ def _largest_chi2(results):
     return MAX_REDUCED_CHI2 * max(1.0, median)
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class PredictedFluxes:
     """
     Measured fluxes of a band, or of bands that have their errors in common, and what the others predict.

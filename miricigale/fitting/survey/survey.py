@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from dataclasses import dataclass
 
 import numpy as np
 from astropy.table import QTable
@@ -29,6 +28,7 @@ from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
+from miricigale.utils.values import value_class
 
 #: Turns of the calibration, each a step of expectation maximization.
 _N_TURNS = 6
@@ -43,7 +43,7 @@ _COLUMNS = declared("miricigale.fitting", "columns.toml")["bands"]
 _SCORES = declared("miricigale.fitting", "columns.toml")["scores"]
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class SurveyCalibration:
     """
     What sources of known redshift say of a survey and of models: for ``calibration`` of `BayesFitter`.

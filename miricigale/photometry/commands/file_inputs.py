@@ -22,6 +22,7 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import file_place
 from miricigale.utils.positions import middle_pixel
 from miricigale.utils.units import SURFACE_BRIGHTNESS
+from miricigale.utils.values import value_class
 
 #: Bytes of a process without images, for each pixel of the prior (or of an image of the detection) and of an
 #: image that is measured, and of some thousand sources where they are dense: largest memory, as it was measured.
@@ -231,7 +232,7 @@ def short_band(band):
     return str(band).rpartition(".")[2]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Measurement:
     """What was measured, and of what."""
 

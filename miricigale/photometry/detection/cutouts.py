@@ -1,12 +1,11 @@
 """Cutouts: the light of a source on the fine grid, before convolution."""
 
-import dataclasses
-
 import numpy as np
 import scipy.ndimage
 
 from miricigale.photometry._core.sampling import convolve_batch
 from miricigale.photometry.images.flags import ForcedFlags
+from miricigale.utils.values import value_class
 
 #: Rim of zeros around fine stamps, for the splines and the pixel response to fade in.
 RIM = 8
@@ -15,7 +14,7 @@ RIM = 8
 _FLAT = 5
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Cutout:
     """The light of one source on the fine grid, before convolution, of unit total."""
 

@@ -9,6 +9,7 @@ import scipy.spatial
 from astropy.stats import mad_std
 
 from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.values import value_class
 
 #: Least signal-to-noise of light that no template explains, its least share of the model below it and
 #: of a neighbor's flux, and its distance to sources in full widths at half maximum: the least to any,
@@ -22,7 +23,7 @@ _LEFT_REACH = 2.0
 _WINGS = 0.02, 10.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class ResidualPeaks:
     """Peaks of a residual image, the brightest first."""
 

@@ -14,6 +14,7 @@ from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_rows, require_columns
 from miricigale.utils.units import FNU
+from miricigale.utils.values import value_class
 
 #: Least number of sources in a bin, and edges of the bins in flux over the error by noise.
 _LEAST = 30
@@ -23,7 +24,7 @@ _EDGES = (1.0, 3.0, 5.0, 10.0, 20.0, 50.0)
 _ONE_SIGMA = 68.27
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class ErrorCalibration:
     """
     Scatter of sources of known flux in units of their errors; `calibrate_errors` makes it.

@@ -1,6 +1,5 @@
 """Curves of one band: the error as a function of flux, from bins or from a formula."""
 
-import dataclasses
 import itertools
 
 import astropy.units as u
@@ -14,12 +13,13 @@ from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_columns, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, to_array
+from miricigale.utils.values import value_class
 
 #: What turns the median of absolute values into a standard deviation.
 STATISTICS = {"mad": 1.482602218505602, "median_abs": 1.0}
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Binned:
     """Errors at nodes in flux, joined by straight lines in asinh(flux)."""
 
@@ -43,7 +43,7 @@ class Binned:
         return [self.flux, self.error, low, high, nan, nan]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Analytic:
     """sigma^2 = sky^2 + fraction^2 flux^2 + photon max(flux, 0)."""
 

@@ -31,6 +31,7 @@ from miricigale.utils.options import check_choice, check_least, check_positive, 
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, ab_quantity, to_array
+from miricigale.utils.values import value_class
 
 #: 5-sigma AB depths of 15 bands of CANDELS/EGS like the paper's (after Stefanon 2017 and FIDEL): the
 #: paper states none.
@@ -90,7 +91,7 @@ def add_noise(photometry, name, sigma, seed):
     photometry[error_column(name)] = sigma
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class ErrorModel(Interactive):
     """
     The 1-sigma error of a flux, band by band; make it with one of the class methods.

@@ -1,7 +1,5 @@
 """The errors of an image: the noise of its pixels, how it is correlated, and limits of apertures and points."""
 
-import dataclasses
-
 import astropy.units as u
 import numpy as np
 import scipy.ndimage
@@ -24,13 +22,14 @@ from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_columns
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.values import value_class
 
 #: Largest number of empty positions, and arcsec to the edge of a PSF that is fitted.
 _EMPTY = 2000
 _REACH = 2.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class ImageErrors:
     """
     The errors of an image; made by `image_errors`.

@@ -1,7 +1,5 @@
 """Diagnostics of a fit from its residual: noise, goodness of fit and flags."""
 
-import dataclasses
-
 import numpy as np
 
 from miricigale.photometry._core.stamps import residual_statistics
@@ -9,6 +7,7 @@ from miricigale.photometry.detection.residual_sources import ResidualPeaks, resi
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.templates.normal_equations import noise_correlation, stated_correlation
 from miricigale.utils.parallel import chunks
+from miricigale.utils.values import value_class
 
 #: Part of a template's light on pixels at the rim of the data from which its flux may be off by some per cent.
 _RIM_LIGHT = 0.1
@@ -17,7 +16,7 @@ _ABOVE_LIGHT = 3.0
 _NEGATIVE = 5.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Diagnostics:
     """A fit compared with its image."""
 

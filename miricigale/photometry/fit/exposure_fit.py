@@ -23,6 +23,7 @@ from miricigale.photometry.templates.normal_equations import (
     stated_correlation,
 )
 from miricigale.utils.units import ANGLE
+from miricigale.utils.values import value_class
 
 #: Largest share of a template's power that is its own noise and is taken off (as for one image).
 _MAX_EXCESS = 0.5
@@ -103,7 +104,7 @@ def gaussian_width(kernel):
     return width * kernel.pixel_scale.to_value(ANGLE)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class JointChanges(FreeTemplates):
     """Changes of templates that are the same in all exposures; ``bank`` has those of each exposure."""
 

@@ -1,6 +1,5 @@
 """Kernels of exposures that are fitted together: one, or a field of them, for each exposure."""
 
-import dataclasses
 import functools
 
 import astropy.units as u
@@ -23,6 +22,7 @@ from miricigale.psf.miri import MIRI_FILTERS
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE
+from miricigale.utils.values import value_class
 
 #: Difference of rolls (deg) below which exposures share their kernels.
 _SAME_ROLL = 0.05
@@ -33,7 +33,7 @@ def are_exposures(image):
     return isinstance(image, (list, tuple)) and not isinstance(image, fits.HDUList)
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class ExposureKernels:
     """
     Kernels from one high-resolution image to several exposures, in their order.

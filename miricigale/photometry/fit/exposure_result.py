@@ -1,6 +1,5 @@
 """From a fit of several exposures to its result: diagnostics, flags, errors, tables and images."""
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -22,6 +21,7 @@ from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFla
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
+from miricigale.utils.values import value_class
 
 #: Largest light of the model, over the noise, of pixels that count as free of sources.
 _FREE = 0.3
@@ -39,7 +39,7 @@ _BRIGHT = 10.0
 _MICRO = 1e12
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class ExposureResults:
     """
     What a joint fit leaves of each exposure.
@@ -91,7 +91,7 @@ class ExposureResults:
         return f"<ExposureResults of {len(self)} exposures>"
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class _PlaneFit:
     """What `residual_peaks` needs of a fit: the mean residual in the plane."""
 

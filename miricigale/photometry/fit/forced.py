@@ -29,6 +29,7 @@ from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, is_number, positive, to_array
+from miricigale.utils.values import value_class
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +95,7 @@ class MemorySettings:
     max_bytes: float = 1.5e9
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class ForcedPhotometer(Interactive):
     """
     Measure the sources of a catalog on an image of lower resolution.

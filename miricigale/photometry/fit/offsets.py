@@ -1,7 +1,5 @@
 """Offsets of an image against a catalog: source by source, and as a smooth map."""
 
-import dataclasses
-
 import numpy as np
 import scipy.optimize
 from astropy.stats import gaussian_sigma_to_fwhm
@@ -15,6 +13,7 @@ from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
+from miricigale.utils.values import value_class
 
 #: Least signal-to-noise of sources whose offsets are measured.
 _BRIGHT = 20.0
@@ -41,7 +40,7 @@ _OWN = 0.3
 _NOTICED = 0.05
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class OffsetMap:
     """
     Where an image shows sources, less where the catalog has them.

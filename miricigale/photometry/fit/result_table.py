@@ -1,6 +1,5 @@
 """From a fit in the order of its templates to the result in the order of the catalog."""
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -23,6 +22,7 @@ from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
+from miricigale.utils.values import value_class
 
 #: Names of the errors of a flux after ``flux_err``: their sum, and its terms.
 _TERMS = ("", "_noise", "_template", "_psf")
@@ -38,7 +38,7 @@ _BRIGHT_SNR = 10.0
 _TEMPLATE_ERROR = 0.1
 
 
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+@value_class(kw_only=True)
 class CatalogRows:
     """The sources of a catalog, as far as they are known before the fit."""
 
@@ -91,7 +91,7 @@ class CatalogRows:
         )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class NewSources:
     """Sources that a catalog lacks, as a `~miricigale.photometry.ForcedPhotometryResult` has them."""
 

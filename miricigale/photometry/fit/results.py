@@ -32,6 +32,7 @@ from miricigale.utils.random import check_seed
 from miricigale.utils.region_files import write_circles
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, FNU, check_count, is_number, positive
+from miricigale.utils.values import value_class
 
 #: Columns of which a band's name takes the place of flux.
 _FLUXES = ("flux", "flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf")
@@ -92,7 +93,7 @@ def crowded(sky, flux, *, radius=2 * u.arcsec):
     return is_crowded
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+@value_class(kw_only=True)
 class ForcedPhotometryResult(Tabular):
     """
     Fluxes of all sources of a catalog on one image.

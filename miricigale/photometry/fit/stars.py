@@ -21,6 +21,7 @@ from miricigale.psf import KernelField, _core
 from miricigale.psf.star_fit import TERMS, WHOLE, Star, StarPSF, fitted_stars
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.units import ANGLE
+from miricigale.utils.values import value_class
 
 #: Least signal-to-noise of a star, and largest number that are looked at and used, the brightest first.
 _SNR = 50.0
@@ -59,7 +60,7 @@ _TAIL = 1.6
 _APART = 1.2
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class KernelStars:
     """
     The stars of an image and of its prior, and what became of the kernel with them.

@@ -1,7 +1,5 @@
 """From images with units and coordinates to the plain arrays that photometry works on."""
 
-import dataclasses
-
 import astropy.units as u
 import numpy as np
 from astropy.nddata import CCDData, StdDevUncertainty, UnknownUncertainty
@@ -15,12 +13,13 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import middle_pixel, plain_positions
 from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, scalar
+from miricigale.utils.values import value_class
 
 #: uJy per MJy.
 _MICRO = 1e12
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class ImageArrays:
     """An image as arrays of flux per pixel."""
 
@@ -32,7 +31,7 @@ class ImageArrays:
     wcs: object  # The image's coordinates.
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class FitArrays:
     """An image as templates are fitted to it, in single precision: images can be large."""
 

@@ -1,17 +1,17 @@
 """Exposures brought to one plane, for pictures and the search of sources that a catalog lacks."""
 
-import dataclasses
-
 import numpy as np
 import scipy.ndimage
 from astropy.wcs.utils import pixel_to_pixel
+
+from miricigale.utils.values import value_class
 
 #: Pixels between the nodes at which coordinates are calculated; bilinear between them, the distortion of the
 #: imager leaves 1e-3 pixels.
 _STEP = 16
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Plane:
     """
     A grid of pixels on the sky that all exposures have in common, and where its pixels are on each of them.

@@ -1,9 +1,9 @@
 """Smooth functions of the position on an image."""
 
-import dataclasses
-
 import numpy as np
 from numpy.polynomial import legendre
+
+from miricigale.utils.values import value_class
 
 
 def n_terms(order):
@@ -34,7 +34,7 @@ def _legendre(positions, n, order):
     return legendre.legvander(u.ravel(), order).reshape(*u.shape, -1)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class SmoothField:
     """
     A polynomial of the position on an image.

@@ -1,19 +1,19 @@
 """Contents of the headers of images that observers bring."""
 
 import contextlib
-import dataclasses
 import json
 
 import numpy as np
 
 from miricigale.instrument.image_planes import PLANES
 from miricigale.photometry.images.fits_images import filter_name, find_image, open_image
+from miricigale.utils.values import value_class
 
 #: Position angles that differ by less are one (deg).
 SAME_ANGLE = 1.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class MosaicHeader:
     """Contents of the header of an image."""
 

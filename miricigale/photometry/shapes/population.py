@@ -5,6 +5,8 @@ import functools
 
 import numpy as np
 
+from miricigale.utils.values import value_class
+
 #: What is known before a field is looked at, worth so many sources: mean and width of ln of the
 #: circularised half-light radius (arcsec) and of ln of the Sersic index, width of the two
 #: ellipticities, and the part of points; the width of the slopes with ln flux.
@@ -20,7 +22,7 @@ _STEPS = 30
 _FAR = 4.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Population:
     """
     Distribution of the shapes of the sources of a field.

@@ -15,6 +15,7 @@ from miricigale.photometry.shapes.population import Population
 from miricigale.photometry.shapes.shape_models import ShapeModels
 from miricigale.profiles import sersic_stamp
 from miricigale.utils.caching import cached
+from miricigale.utils.values import value_class
 
 #: Width (pixels) of the offset of the center from the position.
 _OFFSET = 0.7
@@ -61,7 +62,7 @@ _MOST = 48
 _REACH = 4.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Shape:
     """A profile that was fitted."""
 
@@ -162,7 +163,7 @@ def normal_nodes():
     return z @ np.linalg.inv(np.linalg.cholesky(z.T @ z / len(z))).T
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Neighbors:
     """Sources whose light was fitted together with that of another one."""
 
@@ -324,7 +325,7 @@ class ShapeFitter(ShapeModels):
         return _Stamp(self, self.plan(size), *white_inverse, corners)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class _Stamp:
     models: ShapeModels
     plan: Plan

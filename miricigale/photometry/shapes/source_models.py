@@ -1,7 +1,5 @@
 """Segments of the high-resolution image, and models of the sources on them."""
 
-import dataclasses
-
 import numpy as np
 import scipy.ndimage
 
@@ -9,9 +7,10 @@ from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.shapes.rectangles import hull, rectangle_corner
 from miricigale.photometry.shapes.shapes import Neighbors, Shape, not_fitted
 from miricigale.utils.parallel import chunks
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Segments:
     """Segments of an image: where each is, and its light and signal-to-noise."""
 
@@ -74,7 +73,7 @@ def segment_cutout(data, variance, segments, label):
     return Cutout(light, (place[0].start, place[1].start), noise=noise)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class SourceModel:
     """A fitted source: its profile, and its template of unit light."""
 
@@ -94,7 +93,7 @@ class SourceModel:
         return shape.parameters, shape.covariance, shape.point, self.light
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class DividedGalaxy:
     """A galaxy whose light is divided among sources."""
 

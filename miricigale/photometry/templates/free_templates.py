@@ -1,7 +1,5 @@
 """Templates that may change as far as they are not known, fitted together with the fluxes."""
 
-import dataclasses
-
 import numpy as np
 import scipy.sparse
 
@@ -14,13 +12,14 @@ from miricigale.photometry.templates.pieces import divided_galaxies
 from miricigale.photometry.templates.template_changes import TemplateChanges
 from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import parallel_map
+from miricigale.utils.values import value_class
 
 #: Changes whose root of the sum of squares over the noise is below this are left out: they can move
 #: no flux by more of its errors.
 LEAST = 0.3
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class FreeTemplates:
     """
     Changes of templates as further columns of a fit, each with a Gaussian prior.

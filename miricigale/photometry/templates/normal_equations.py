@@ -22,6 +22,7 @@ from miricigale.photometry.templates.templates import Block, batches
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
+from miricigale.utils.values import value_class
 
 #: What correlations are multiplied by until the matrix is positive.
 _SHRINK = (1.0, 1 - 1e-9, 1 - 1e-6, 1 - 1e-4, 0.999, 0.99, 0.95, 0.9, 0.8, 0.5, 0.0)
@@ -416,7 +417,7 @@ class _Crossing:
         return scipy.sparse.coo_array((values, places), shape=shape).tocsr()
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class LinearFit:
     """
     Least squares for sparse sources plus a few parameters of the whole image.

@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 
 from miricigale.photometry.detection.cutouts import Cutout
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Galaxy:
     """A galaxy whose pieces are sources of their own."""
 

@@ -1,7 +1,5 @@
 """The sources of a catalog on one image: where they are, and their templates there."""
 
-import dataclasses
-
 import numpy as np
 
 from miricigale.photometry.images.arrays import (
@@ -15,9 +13,10 @@ from miricigale.photometry.images.arrays import (
 from miricigale.photometry.templates.templates import BankSources, FineTemplates, TemplateBank
 from miricigale.psf import KernelField
 from miricigale.utils.units import ANGLE
+from miricigale.utils.values import value_class
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Placement:
     """Where sources are on an image."""
 

@@ -39,13 +39,14 @@ from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import single_threaded, threads
 from miricigale.utils.tables import unique_ids
 from miricigale.utils.units import ANGLE
+from miricigale.utils.values import value_class
 
 #: Arrays with a row for each source, and least signal-to-noise of a segment whose shape is looked at.
 _ROWS = ("id", "sersic", "flags", "snr", "fitted")
 _MIN_SNR = 5.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+@value_class(kw_only=True)
 class SourceTemplates:
     """
     The sources of a catalog and the light of each, before it is brought to an image.

@@ -11,6 +11,7 @@ from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
 from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.shapes.shape_models import ShapeModels
 from miricigale.photometry.shapes.shapes import POINT_SIZE, major_radius, normal_nodes
+from miricigale.utils.values import value_class
 
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
 #: widths of the PSF.
@@ -23,7 +24,7 @@ _WIDTHS = 4.0
 _SEEN = 0.01
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Change:
     """How a template changes along one direction."""
 
@@ -35,7 +36,7 @@ class Change:
     fixed: bool = False
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class DrawnCutout:
     """
     A `~miricigale.photometry.detection.cutouts.Cutout` that keeps its transform alone.

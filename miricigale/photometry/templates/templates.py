@@ -19,6 +19,7 @@ from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.detection.cutouts import RIM, convolve_padded
 from miricigale.utils.caching import cached
 from miricigale.utils.parallel import parallel_map
+from miricigale.utils.values import value_class
 
 #: Pixels of the stamps that a thread works on at a time, and how many times as many are in a block.
 _PART = 250_000
@@ -29,7 +30,7 @@ _PARTS_OF_BLOCK = 16
 _DROPPED = object()
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class FineTemplates:
     """Convolve cutouts on the fine grid, as spline coefficients."""
 
@@ -132,7 +133,7 @@ class FineTemplates:
         return convolve_batch(stamps, transfer, shape)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Block:
     """Some templates as flat stamps: rows ``first ... first + len(box)`` of the bank."""
 
@@ -194,7 +195,7 @@ def batches(shapes):
             yield shape, rows[first : first + size]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class BankSources:
     """The sources of a bank."""
 

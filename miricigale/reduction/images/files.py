@@ -1,6 +1,5 @@
 """Images of the pipeline's later stages as files: rates, calibrated images, mosaics."""
 
-import dataclasses
 import glob
 import json
 import os
@@ -37,6 +36,7 @@ from miricigale.utils.files import open_fits
 from miricigale.utils.named_values import without, without_none
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, with_adu
+from miricigale.utils.values import value_class
 
 _WANTED = "an image of JWST (FITS with SCI)"
 
@@ -50,7 +50,7 @@ _META = {
 }  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class ImageFile:
     """
     An image from a file, with all of its planes.

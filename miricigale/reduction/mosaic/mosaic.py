@@ -26,6 +26,7 @@ from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.values import value_class
 
 # pixels of the boxes by which the variance that gives weights is smoothed
 _WEIGHT_BOX = 32
@@ -36,7 +37,7 @@ _FEW_PIXELS = 25
 _NODES = 49
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Mosaic:
     """
     A drizzled image.

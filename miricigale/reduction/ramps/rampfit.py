@@ -12,8 +12,6 @@ a contrast of differences that is uncorrelated with this slope (Gauss-Markov the
 that there is no bias to first order.
 """
 
-import dataclasses
-
 import numpy as np
 
 from miricigale.depth._core import shared_photons
@@ -27,6 +25,7 @@ from miricigale.utils.missing_values import floats, without_mask
 from miricigale.utils.options import check_positive, check_that
 from miricigale.utils.parallel import chunks, parallel_map, threads
 from miricigale.utils.units import check_count
+from miricigale.utils.values import value_class
 
 # rows that one call of the kernel fits; the events come out in this order
 _ROWS = 32
@@ -35,7 +34,7 @@ _ROWS = 32
 _PIXELS = 4096
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class RampFit:
     """
     Slopes of the ramps of one exposure.

@@ -13,6 +13,7 @@ from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import ReductionWarning, warn
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 from miricigale.utils.tables import Flags
+from miricigale.utils.values import value_class
 
 # rounds of detecting and masking sources at most; it ends when the mask stays
 _ROUNDS = 5
@@ -56,7 +57,7 @@ class BackgroundFlags(Flags):
     )
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@value_class
 class Background:
     """
     Smooth background of an image.

@@ -1,12 +1,13 @@
 """Brightness of the sky in boxes of an image, and the smooth surface through them."""
 
 import copy
-import dataclasses
 import math
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import distance_transform_edt
+
+from miricigale.utils.values import value_class
 
 #: Clipping of a box, in standard deviations, and what it leaves of that of a Gaussian.
 _CLIP = 3.0
@@ -17,7 +18,7 @@ _MEDIAN_ERROR = 1.2533
 _MIN_PIXELS = 20
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class SkyBoxes:
     """
     The sky in boxes of nearly one size.

@@ -11,7 +11,7 @@ import itertools
 import re
 import struct
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import unpacked_size
 from miricigale.utils.package_tables import declared
+from miricigale.utils.values import value_class
 
 #: Quantities after the spectra, in their order.
 QUANTITIES = declared("miricigale.refdata.libraries", "formats.toml")["ised"]["quantities"]
@@ -30,7 +31,7 @@ _MOST_NUMBERS = 10**7
 _TEXT = 80
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class Ised:
     """
     Content of a file of GALAXEV, as it stands there.

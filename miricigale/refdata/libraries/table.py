@@ -1,7 +1,7 @@
 """The one format in which libraries are kept: FITS, an image for each kind of spectrum."""
 
 import threading
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import astropy.units as u
@@ -15,6 +15,7 @@ from miricigale.utils.named_values import convert_values, subset
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
+from miricigale.utils.values import value_class
 
 #: Layout of files.
 _LAYOUT = "miricigale-library-2"
@@ -23,7 +24,7 @@ _LAYOUT = "miricigale-library-2"
 _SAME = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class LibraryTable:
     """
     A library of spectra: what a reader of distributed files gives.

@@ -1,7 +1,5 @@
 """Active nuclei: accretion disk, dusty torus and polar dust."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from miricigale.refdata.libraries.skirtor import SKIRTOR_AXES
@@ -13,6 +11,7 @@ from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
+from miricigale.utils.values import value_class
 
 #: Law ``smc`` with the extinction of grains in its place below 0.1 um.
 _GRAINS = "smc_wd01"
@@ -23,7 +22,7 @@ _SPARSE = 25.0
 _FINE_STEP = 0.025  # in ln(lambda)
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class TorusSpectra:
     """
     What a torus library says for one set of parameters, in W/um on a common scale.
@@ -52,7 +51,7 @@ class TorusSpectra:
     dust: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class AGNTemplates:
     """
     Spectra for one watt of AGN dust emission (torus + polar), in W/um.

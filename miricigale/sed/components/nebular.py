@@ -1,7 +1,6 @@
 """Lines and continuum of the gas that young stars ionize."""
 
 import functools
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,13 +12,14 @@ from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import file_errors
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
+from miricigale.utils.values import value_class
 
 _KM_S = 1e-9 * _core.LIGHT  # speed of light
 _WIDTH = Parameter(300.0, (1.0, 3000.0), "Full width of the lines at half maximum.", unit="km / s")
 _WIDTH.name = "line_width"
 
 
-@dataclass(frozen=True, eq=False)
+@value_class
 class NebularTable:
     """
     Emission of HII regions for each ionizing photon per second.

@@ -1,7 +1,6 @@
 """Tasks that need each other, side by side within the threads and the memory of each machine."""
 
 import collections
-import dataclasses
 import heapq
 import logging
 import queue
@@ -11,6 +10,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 from typing import NamedTuple
 
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.values import value_class
 
 log = logging.getLogger(__name__)
 
@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 _DEATHS = 4
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@value_class
 class Task:
     """
     A piece of work.
