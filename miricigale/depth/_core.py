@@ -26,7 +26,7 @@ _X_MAX = 1e12
 _SMALL = 0.3
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(error_model="numpy", inline="always")
 def _decay(v, s):
     """Poisson and read variance within the range of the closed forms, 1 / l - 1, and theta."""
     v = max(v, _X_MIN * s)
@@ -36,7 +36,7 @@ def _decay(v, s):
     return v, s, q, math.log1p(q)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def weight_sums(n, v, s):
     """Sums of the weights, and of their squares, of ``n`` differences."""
     v, s, q, theta = _decay(v, s)
@@ -58,7 +58,7 @@ def weight_sums(n, v, s):
     return total / v, squares / (v * v)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def difference_weight(i, n, v, s):
     """Weight w_i of difference i (from 1) of ``n``, and (C^-1)_ii."""
     v, s, q, theta = _decay(v, s)

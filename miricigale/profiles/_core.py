@@ -46,7 +46,7 @@ _NODES3, _WEIGHTS3 = np.polynomial.legendre.leggauss(3)
 _NODES6, _WEIGHTS6 = np.polynomial.legendre.leggauss(6)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _lookup(log_r, table):
     """Enclosed fraction and first radial moment at ln(R / R_e), by quintic and cubic pieces."""
     t = (log_r - TABLE_START) / TABLE_STEP
@@ -73,7 +73,7 @@ def _lookup(log_r, table):
     return f, m
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _edge(x1, y1, x2, y2, table, out):
     """Add the light (times 2 pi / total) and its first moments of the triangle (0, P1, P2)."""
     ex = x2 - x1
@@ -113,7 +113,7 @@ def _edge(x1, y1, x2, y2, table, out):
     out[2] += sign * (moment_n * ny + moment_e * ey)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _exact_cell(dx, dy, size, par, table, out):
     """Light and centroid of a square cell by its edges."""
     h = 0.5 * size
@@ -147,7 +147,7 @@ def _exact_cell(dx, dy, size, par, table, out):
     out[0] = max(scale * light, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def cell(dx, dy, size, par, table, out):
     """
     Light of one square cell.
@@ -218,7 +218,7 @@ def cell(dx, dy, size, par, table, out):
         out[2] = my / light
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def sersic_cells(image, par, table):
     """Add the light of one source to an image whose pixel centers are integers."""
     out = np.empty(3)

@@ -8,7 +8,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from miricigale.utils.compilation import njit
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def polygon_coverage(vertices, n, step, rows):
     """
     Fraction, (n, n) by y and x, of each cell of a centered square grid that lies inside a polygon.
@@ -195,7 +195,7 @@ def line_scatter(image, kernel, axis):
     return np.ascontiguousarray(np.moveaxis(result, -1, axis))
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _overlap(dx, dy, radius, parts):
     """Part of the unit square around (dx, dy) inside a circle around 0."""
     if radius >= 12.0:
@@ -211,7 +211,7 @@ def _overlap(dx, dy, radius, parts):
     return area / parts
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _sorted_sums(image, x_center, y_center, radii):
     """`radial_sums` for radii in ascending order."""
     m = radii.size
@@ -291,7 +291,7 @@ def core_moments(data):
     return math.nan, math.nan, math.nan
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def spline_weights(t, w):
     """Weights (4) of the cubic B-splines at the nodes -1 to 2 for a position t from 0 to 1."""
     s = 1.0 - t
@@ -301,7 +301,7 @@ def spline_weights(t, w):
     w[3] = t * t * t / 6.0
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def cubic_splines(coefficients, y, x):
     """Cubic splines of shape (ny, nx, k) at positions in cells, shape (k, n), zero outside of the grid."""
     ny, nx, k = coefficients.shape

@@ -58,13 +58,13 @@ class Landing(NamedTuple):
     t_x: np.ndarray
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _box(sums, y0, y1, x0, x1):
     """Sum of a table over a range, from its cumulative sums."""
     return sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0]
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def share_row(land, i, j0, share):
     """Fill in what part of the light deposited on a row's nodes from ``j0`` on lands."""
     os_ = land.oversampling
@@ -98,7 +98,7 @@ def share_row(land, i, j0, share):
             share[n] += w_y * part
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _alike(land, i, k):
     """Whether the light of two rows of nodes lands alike."""
     return (
@@ -109,7 +109,7 @@ def _alike(land, i, k):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def point_nodes(x, y, flux, land):
     """
     The nodes on which the light of points is deposited; ``x``, ``y`` in nodes.
@@ -150,14 +150,14 @@ def point_nodes(x, y, flux, land):
     return rows[:n], columns[:n], light[:n], landed
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def deposit_nodes(grid, i, j, light):
     """Add the light of single nodes to the grid, one after the other."""
     for k in range(i.size):
         grid[i[k], j[k]] += light[k]
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _deposit(part, y, x, light, wy, wx):
     """Put one point's light on the nodes of a part of the grid; light outside it is dropped."""
     ny, nx = part.shape
@@ -172,7 +172,7 @@ def _deposit(part, y, x, light, wy, wx):
             part[iy - 1 + a, ix - 1 + b] += light * wy[a] * wx[b]
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def deposit_pieces(part, x, y, light):
     """Put pieces at ``x``, ``y`` (nodes) on a separate grid; parts outside it are dropped."""
     wy = np.empty(4)
@@ -181,7 +181,7 @@ def deposit_pieces(part, x, y, light):
         _deposit(part, y[k], x[k], light[k], wy, wx)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def add_part(grid, part, i0, j0, land):
     """Add a part to the grid at row ``i0`` and column ``j0``; return what lands on the image."""
     total = 0.0
@@ -194,7 +194,7 @@ def add_part(grid, part, i0, j0, land):
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _row_span(par, dy, limit, n):
     """First and last column whose node lies within the ellipse w <= limit in a row."""
     a = par[8]
@@ -209,7 +209,7 @@ def _row_span(par, dy, limit, n):
     return max(first, 0), min(last, n - 1)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def fill_cusp(part, i0, j0, n_x, par, table, w_zone):
     """
     Put the inner part of a Sersic profile on a grid of its own, in small cells.
@@ -235,7 +235,7 @@ def fill_cusp(part, i0, j0, n_x, par, table, w_zone):
                         _deposit(part, y + out[2] - i0, x + out[1] - j0, out[0], wy, wx)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _fill_row(par, table, dy, first, last, hole_first, hole_last, light, shift_x, shift_y):
     """Light and first moments of the cells of a row, shifted by 2 columns from ``first``."""
     out = np.empty(3)
@@ -254,7 +254,7 @@ def _fill_row(par, table, dy, first, last, hole_first, hole_last, light, shift_x
         j += 1
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _add_row(row, share, first, last, low, high, light, shift_x, shift_y, w_light, w_shift):
     """
     Add a row of cells to the nodes ``low`` to ``high`` of a row of the grid with two weights.
@@ -273,7 +273,7 @@ def _add_row(row, share, first, last, low, high, light, shift_x, shift_y, w_ligh
     return landed
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _smooth_deposit(par, dx, dy):
     """Deposit on a node where the profile is smooth: brightness and a sixth of the Laplacian."""
     a = par[8]
@@ -290,7 +290,7 @@ def _smooth_deposit(par, dx, dy):
     return par[3] * math.exp(-z) * (1.0 + second / 6.0)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _add_smooth(row, share, par, dy, first, last):
     """Add the smooth deposits of the nodes ``first`` to ``last``; return what lands."""
     landed = 0.0
@@ -319,7 +319,7 @@ def _add_smooth(row, share, par, dy, first, last):
     return landed
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def fill_outskirts(grid, start, stop, rows, tables, w_zone, w_smooth, w_cut, land, landed):
     """
     Add the outer parts of Sersic profiles to the rows ``start`` to ``stop`` of a grid, in place.

@@ -22,8 +22,6 @@ log = logging.getLogger(__name__)
 
 #: Options of kernels called from Python that allocate nothing, whose sums may be taken in any order.
 KERNEL = {
-    "cache": True,
-    "nogil": True,
     "error_model": "numpy",
     "fastmath": True,
     "no_cfunc_wrapper": True,
@@ -71,7 +69,9 @@ event.register("numba:compile", _Listener())
 
 def njit(**options):
     """
-    Compile a function as `numba.njit` does, without a cache where there is no place for it or it is out of date.
+    Compile a function as `numba.njit` does, with a cache and without the lock of Python's interpreter.
+
+    There is no cache where there is no place for it, and it is made again where it is out of date.
 
     Parameters
     ----------
@@ -82,6 +82,8 @@ def njit(**options):
     -------
     decorator : callable
     """
+
+    options = {"cache": True, "nogil": True} | options
 
     def decorate(function):
         try:

@@ -41,7 +41,7 @@ _REST = 0.25
 _PIXELS = 16
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _node(mean):
     """Split a mean into that of a coarse table, the number of this table, and the rest."""
     _, octave = math.frexp(mean)
@@ -50,7 +50,7 @@ def _node(mean):
     return number * step, number & (_COARSE - 1), mean - number * step
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _add_tabulated(s0, s1, s2, s3, mean, slot, tables, out):
     """Add a draw of a mean to each of ``out``; the table in ``slot`` is made if it has another mean."""
     means, first, steps, guide = tables
@@ -66,7 +66,7 @@ def _add_tabulated(s0, s1, s2, s3, mean, slot, tables, out):
     return s0, s1, s2, s3
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def _add_single(state, mean, out):
     """Add a draw of a mean to each of ``out``, without a table."""
     if mean < PTRS_FROM:
@@ -79,7 +79,7 @@ def _add_single(state, mean, out):
         out[g] += ptrs(state, mean, constants)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _draw_groups(state, mean, tables, out):
     """
     Fill ``out`` (n_group,) with Poisson numbers of a mean.
@@ -112,7 +112,7 @@ def _draw_groups(state, mean, tables, out):
         out[min(int(uniform(state) * n_group), n_group - 1)] += 1.0
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def add_poisson(ramp, mean, key, first_row):
     """Add charge that arrives at random: ``mean`` electrons per group, (n_row, n_col)."""
     n_int, n_group, n_row, n_col = ramp.shape
@@ -165,7 +165,7 @@ def add_poisson(ramp, mean, key, first_row):
                             row[x + j] += np.float32(total[j])
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def add_latent(ramp, rates, released, key, first_row):
     """
     Add charge that earlier exposures left.
@@ -189,7 +189,7 @@ def add_latent(ramp, rates, released, key, first_row):
                 ramp[i, g, r, x] += np.float32(total)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _push(deposits, n, slot, head, row, col, charge):
     """Append one deposit to the list of its group; returns the (grown) list and its length."""
     if n == deposits.shape[0]:
@@ -203,7 +203,7 @@ def _push(deposits, n, slot, head, row, col, charge):
     return deposits, n + 1
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _deposits(key, first_row, n_detector_rows, n_row, n_col, n_slot, settings):
     """
     Draw cosmic-ray hits of some rows, in all ``n_slot`` groups.
@@ -288,7 +288,7 @@ def _deposits(key, first_row, n_detector_rows, n_row, n_col, n_slot, settings):
     return deposits, n, head
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def add_cosmic_rays(ramp, key, first_row, n_detector_rows, settings):
     """Add the charge of cosmic-ray hits; ``settings`` are those of `_deposits`."""
     n_int, n_group, n_row, n_col = ramp.shape
@@ -308,7 +308,7 @@ def add_cosmic_rays(ramp, key, first_row, n_detector_rows, settings):
                     ramp[i, g, r, x] += plane[r, x]
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def cosmic_ray_deposits(key, first_row, n_detector_rows, shape, settings):
     """
     List what `add_cosmic_rays` would add to a ramp of a ``shape``.
@@ -335,7 +335,7 @@ def cosmic_ray_deposits(key, first_row, n_detector_rows, shape, settings):
     return places, charge
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def couple_neighbors(ramp, kernel):
     """
     Replace each pixel by the sum of its 3 x 3 neighbors, weighted by a float32 kernel (3, 3).

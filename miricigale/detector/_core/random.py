@@ -60,17 +60,17 @@ def _stirling(k):
 _LOG_FACTORIAL = np.array(
     [math.lgamma(k + 1.0) if k < 128 else _stirling(float(k)) for k in range(8192)]
 )
-_stirling = njit(cache=True, nogil=True)(_stirling)
+_stirling = njit()(_stirling)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def mix(z):
     z = (z ^ (z >> _U30)) * _MIX_1
     z = (z ^ (z >> _U27)) * _MIX_2
     return z ^ (z >> _U31)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def seed_stream(state, key, a, b):
     """Set the four words of a stream from the key (4 words) and two integers."""
     z = uint64(a) * _GAMMA + uint64(b)
@@ -82,7 +82,7 @@ def seed_stream(state, key, a, b):
         state[0] = _GAMMA
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def advance(s0, s1, s2, s3):
     """
     Advance the four words of a stream and return them with 64 random bits.
@@ -102,20 +102,20 @@ def advance(s0, s1, s2, s3):
     return s0, s1, s2, s3, bits
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def unit(bits):
     """Uniform in the open interval (0, 1)."""
     return (float(bits >> _U11) + 0.5) * _TO_UNIT
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def uniform(s):
     """Uniform in the open interval (0, 1), for draws outside the inner loops."""
     s[0], s[1], s[2], s[3], bits = advance(s[0], s[1], s[2], s[3])
     return unit(bits)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _normal_edge(s, layer, x):
     """What remains of the ziggurat: the wedges and the tail; NaN if x is rejected."""
     if layer == 0:
@@ -130,7 +130,7 @@ def _normal_edge(s, layer, x):
     return math.nan
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def fill_normals(s, out):
     """Fill a vector with standard normal numbers."""
     s0 = s[0]
@@ -163,12 +163,12 @@ def fill_normals(s, out):
     s[3] = s3
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def log_factorial(k):
     return _LOG_FACTORIAL[int(k)] if k < 8192.0 else _stirling(k)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def poisson_inversion(u, mean, p0):
     """Inversion by sequential search; p0 = exp(-mean), mean below about 10."""
     k = 0.0
@@ -181,7 +181,7 @@ def poisson_inversion(u, mean, p0):
     return k
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def fill_table(mean, steps, guide):
     """
     Tabulate the inversion of a Poisson distribution, for many draws of one mean.
@@ -222,7 +222,7 @@ def fill_table(mean, steps, guide):
     return smallest, n
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def table_lookup(bits, steps, guide):
     """Place in a table of `fill_table` of the number that a draw gives."""
     draw = np.int64(bits >> _U11)
@@ -232,7 +232,7 @@ def table_lookup(bits, steps, guide):
     return k
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def ptrs_constants(mean):
     """The constants a, b, v_r, 1 / alpha of PTRS, and the logarithm of the mean."""
     b = 0.931 + 2.53 * math.sqrt(mean)
@@ -240,7 +240,7 @@ def ptrs_constants(mean):
     return a, b, 0.9277 - 3.6224 / (b - 2.0), 1.1239 + 1.1328 / (b - 3.4), math.log(mean)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(inline="always")
 def ptrs_rest(mean, a, b, inverse_alpha, log_mean, v, k, us):
     """The slow part of PTRS; negative if the pair is rejected."""
     if k < 0.0 or (us < 0.013 and v > us):
@@ -249,7 +249,7 @@ def ptrs_rest(mean, a, b, inverse_alpha, log_mean, v, k, us):
     return k if log_ratio <= k * log_mean - mean - log_factorial(k) else -1.0
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def poisson(s, mean):
     """One Poisson number of any mean, for draws outside the inner loops."""
     if mean <= 0.0:
@@ -259,7 +259,7 @@ def poisson(s, mean):
     return ptrs(s, mean, ptrs_constants(mean))
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def ptrs(s, mean, constants):
     """One Poisson number of a mean of at least ``PTRS_FROM``."""
     a, b, v_r, inverse_alpha, log_mean = constants
@@ -274,7 +274,7 @@ def ptrs(s, mean, constants):
     return k
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def standard_normals(key, first_row, out):
     """Fill the rows of ``out`` (n_row, n_col) with standard normal numbers."""
     state = np.empty(4, np.uint64)

@@ -9,7 +9,7 @@ from miricigale.detector._core.random import fill_normals, mix, seed_stream
 from miricigale.utils.compilation import njit
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def clip_well(ramp, well, group_dq, flag):
     """Stop charge at ``well`` electrons, setting ``flag`` in ``group_dq`` where it was reached."""
     n_int, n_group, n_row, n_col = ramp.shape
@@ -27,7 +27,7 @@ def clip_well(ramp, well, group_dq, flag):
                 group_dq[i, g, r, x] |= flag
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def interpolate_response(ramp, gain, response, step):
     """
     Turn electrons into DN through a table of the response, linear between its nodes.
@@ -46,7 +46,7 @@ def interpolate_response(ramp, gain, response, step):
             ramp[i, g, r, x] = low + (place - np.float32(k)) * (response[k + 1] - low)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def add_noise(ramp, sigma, key, first_row):
     """Add independent Gaussian noise of standard deviation ``sigma`` to every read."""
     n_int, n_group, n_row, n_col = ramp.shape
@@ -60,7 +60,7 @@ def add_noise(ramp, sigma, key, first_row):
                 ramp[i, g, r, x] += np.float32(sigma * normals[x])
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def add_pink_noise(ramp, sigma, n_octave, n_output, key, first_row, n_detector_rows):
     """
     Add 1/f noise of standard deviation ``sigma``: a drift of the pixels of one row and output.
@@ -90,7 +90,7 @@ def add_pink_noise(ramp, sigma, n_octave, n_output, key, first_row, n_detector_r
             ramp[i, g, r, x] += drift[x % n_output]
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def digitize(ramp, counts, group_dq, flag_floor, flag_ceiling):
     """Round DN to ``counts`` (uint16), setting flags in ``group_dq`` out of their range."""
     n_int, n_group, n_row, n_col = ramp.shape

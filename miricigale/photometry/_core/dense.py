@@ -5,7 +5,7 @@ import numpy as np
 from miricigale.utils.compilation import njit
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def cholesky(matrix):
     """
     Factorize a symmetric matrix after Cholesky.
@@ -35,7 +35,7 @@ def cholesky(matrix):
     return factor
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def solve_factor(factor, right):
     """
     Solve a linear system whose matrix has a given Cholesky factor.
@@ -68,7 +68,7 @@ def solve_factor(factor, right):
     return solution
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def log_determinant(factor):
     """
     Return the logarithm of the determinant of a matrix with a given Cholesky factor.
@@ -89,7 +89,7 @@ def log_determinant(factor):
     return 2.0 * total
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def inverse_of(factor):
     """
     Invert a matrix with a given Cholesky factor.

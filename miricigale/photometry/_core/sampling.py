@@ -48,17 +48,17 @@ def convolve_batch(stamps, transfer, shape):
 
 
 # the quintic B-spline is a polynomial for distances up to 1, from 1 to 2, and from 2 to 3, of a node
-@njit(cache=True, nogil=True)
+@njit()
 def _inner(x):
     return 0.55 - 0.5 * x**2 + 0.25 * x**4 - x**5 / 12.0
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _outer(x):
     return 0.425 + 0.625 * x - 1.75 * x**2 + 1.25 * x**3 - 0.375 * x**4 + x**5 / 24.0
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _quintic(position, node, weight):
     # a row at once without branches, which the compiler turns into vector instructions
     for i in range(position.size):
@@ -74,7 +74,7 @@ def _quintic(position, node, weight):
         weight[5, i] = t**5 / 120.0
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def sample_stamps(coefficients, fine_stamp, amplitude, center, poly, box, start, out):
     """
     Add splines evaluated at the centers of target pixels, as fractions per target pixel.

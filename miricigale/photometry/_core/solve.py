@@ -135,7 +135,7 @@ def _arrays(matrix):
     return matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), matrix.data
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _dense(start, column, data, members, place):
     """Fill some rows and columns of a sparse matrix; ``place``, (n,), is that of each among them, or -1."""
     block = np.zeros((len(members), len(members)))
@@ -147,7 +147,7 @@ def _dense(start, column, data, members, place):
     return block
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _elements(start, column, members, inner, place):
     """Find the places, among some rows and columns, of the non-zeros in the inner ones of the rows."""
     capacity = 0

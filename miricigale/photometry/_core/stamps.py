@@ -6,7 +6,7 @@ from miricigale.photometry._core.sampling import convolve_batch
 from miricigale.utils.compilation import njit
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _sweep(box, grow, pairs):
     # boxes sorted by y0: candidates of i end where y0[j] passes i's last row
     n = box.shape[0]
@@ -45,7 +45,7 @@ def find_pairs(box, grow):
     return _listed(lambda pairs: _sweep(box, grow, pairs))
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _cross(box, other_box, tallest, pairs):
     # both sorted by y0: what ends above one of the others ends above all that follow
     count = 0
@@ -86,7 +86,7 @@ def cross_pairs(box, other_box):
 
 
 # products of float32 add up in float64 without rounding, in whatever order
-@njit(cache=True, nogil=True, fastmath={"reassoc"})
+@njit(fastmath={"reassoc"})
 def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
     """
     Sum products of two sets of flat stamps, with boxes and starts, over the pixels they share.
@@ -115,7 +115,7 @@ def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
         out[k] = total
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc"})
+@njit(fastmath={"reassoc"})
 def projections(values, box, start, image, out):
     """Sum each stamp times the image below it: ``out[k] = sum(stamp_k * image)``."""
     for k in range(box.shape[0]):
@@ -133,7 +133,7 @@ def projections(values, box, start, image, out):
         out[k] = total
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc"})
+@njit(fastmath={"reassoc"})
 def whiten_stamps(values, box, start, inverse_sigma, out, sums):
     """
     Multiply each flat stamp by the inverse noise below it, (ny, nx), and sum it up.
@@ -168,7 +168,7 @@ def whiten_stamps(values, box, start, inverse_sigma, out, sums):
         sums[k, 3] = white_power
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def add_model(image, values, box, start, flux):
     """Add stamps times their fluxes to an image, in the order of the stamps."""
     for k in range(box.shape[0]):
@@ -182,7 +182,7 @@ def add_model(image, values, box, start, flux):
                 n += 1
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def residual_statistics(values, box, start, residual, light, inverse_sigma, out):
     """
     Sum the template-weighted mean of (residual / sigma)^2, and residual and light below the core.
@@ -225,7 +225,7 @@ def residual_statistics(values, box, start, residual, light, inverse_sigma, out)
         out[k, 3] = core
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def offset_sums(values, box, start, flux, at, half, model, residual, inverse_sigma, out):
     """
     Sum up what the steps of sources against their stamps follow from.

@@ -34,7 +34,7 @@ _N_VALUES = 21
 _Y, _X, _JUMPS, _FLAGS = range(4)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def fitting_lanes(n_int, n_diff):
     """Arrays of the lanes: differences, which are kept, scratch (3), values, pixels (-1: none)."""
     size = n_int * (n_diff + 1), LANES
@@ -47,7 +47,7 @@ def fitting_lanes(n_int, n_diff):
     return differences, keep, weights_before, right, forward, values, np.full((LANES, 4), -1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def fill_lane(lanes, b, d, cut, valid, s, inv_gain, slow, shared, y, x, jumps, flags):
     """Put a pixel into a lane: its differences, which are cut, and how many each integration has."""
     values = lanes[5]
@@ -79,7 +79,7 @@ def fill_lane(lanes, b, d, cut, valid, s, inv_gain, slow, shared, y, x, jumps, f
     pixels[b, _FLAGS] = flags
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def fit_lanes(lanes):
     """Fit all lanes: slopes, sums of weights, and the difference with the largest statistic."""
     d, keep, backward, right, forward, values, _ = lanes
@@ -173,7 +173,7 @@ def fit_lanes(lanes):
             sign[b] = z if take else sign[b]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def settle(lanes, n_int, scale, threshold, events, n_event, free_lanes, out):
     """
     Cut the most significant jump of each fitted lane, or store what has none and free its lane.
@@ -232,7 +232,7 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free_lanes, out):
     return n_free, events, n_event
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def fit_pixels(ramp, group_dq, ys, xs, start, cuts, fit, out):
     """
     Fit the ramps of the pixels ``ys``, ``xs``, and find their jumps.

@@ -19,7 +19,7 @@ _OWN = 1
 _NEIGHBOR = 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def tabulate(levels, slopes, n_int, s, true_s, inv_gain, step):
     """
     What the fit makes of ramps without hits: its slope, and how noise enters it.
@@ -55,7 +55,7 @@ def tabulate(levels, slopes, n_int, s, true_s, inv_gain, step):
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def variances(values, n_int, n_diff, s, inv_gain, step):
     """Poisson and read variance, (DN/s)^2, that the fit quotes for slopes in DN/s, (2, n)."""
     out = np.empty((2, values.size))
@@ -67,7 +67,7 @@ def variances(values, n_int, n_diff, s, inv_gain, step):
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(error_model="numpy", inline="always")
 def _place(value, scale, last):
     """Node of a table, even in the fourth root of the value, and the place behind it."""
     place = math.sqrt(math.sqrt(max(value, 0.0))) * scale
@@ -75,7 +75,7 @@ def _place(value, scale, last):
     return k, min(place - k, 1.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def draw_slopes(mean, electrons, time, normals, table, offset, scale, quoted, quoted_scale, out):
     """
     Slopes of pixels without hits, and their quoted variances.
@@ -105,7 +105,7 @@ def draw_slopes(mean, electrons, time, normals, table, offset, scale, quoted, qu
         var_read[y, x] = quoted[1, k] + part * (quoted[1, k + 1] - quoted[1, k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@njit(error_model="numpy", inline="always")
 def _usable(charge, extra, first, limit, g0, g1):
     """
     Differences before the group in which a pixel is full.
@@ -120,7 +120,7 @@ def _usable(charge, extra, first, limit, g0, g1):
     return g1 - g0 - 1 if group >= g1 else max(group - g0 - 1, 0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _list(rate, hits, electrons):
     """
     Lists of what comes into each pixel, one entry for a group.
@@ -157,7 +157,7 @@ def _list(rate, hits, electrons):
     return head, link, slot, charge, n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
     """
     Jumps that the fit finds, (n_jump, 5) as from `fit_pixels`, and which entries are cut by it.
@@ -206,7 +206,7 @@ def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
     return jumps[:n_jump].copy(), cut
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _cut_neighbors(rate, entries, cut, n, jumps, own_jumps, groups, neighbor):
     """Cut the entries beside large jumps (``own``), or new ones without charge; returns what may grow."""
     ny, nx = rate.shape
@@ -246,7 +246,7 @@ def _cut_neighbors(rate, entries, cut, n, jumps, own_jumps, groups, neighbor):
     return link, slot, charge, cut
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _sums(lengths, n, v, s, n_differences, n_whole):
     """Sums of the weights and of their squares over the segments of a pixel."""
     total, squares = weight_sums(n_differences, v, s)
@@ -259,7 +259,7 @@ def _sums(lengths, n, v, s, n_differences, n_whole):
     return total, squares
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def hit_slopes(mean, hits, electrons, groups, noise, truth, thresholds, rng, out):
     """
     Change the slopes of pixels that lose groups to hits or saturation, or keep a hit.

@@ -20,7 +20,7 @@ LEAK = 0.05
 S_MIN = 1e-6
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(error_model="numpy", inline="always")
 def averaged_variance(s, v, shared):
     """
     Variance s of a read, less what neighboring differences of averaged groups share of their photons, v.
@@ -33,13 +33,13 @@ def averaged_variance(s, v, shared):
     return floor if shared > 0.0 and abs(total) < floor else total
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(error_model="numpy", inline="always")
 def at(values, y, x):
     """Value of a pixel: maps hold one for all (1, 1) or one for each (ny, nx)."""
     return values[y if values.shape[0] > 1 else 0, x if values.shape[1] > 1 else 0]
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(error_model="numpy", inline="always")
 def weights(slope, s, inv_gain, slow, shared):
     """Variance v of a difference, l and 1 - l of the weights, and 1 / (s (1/l - l))."""
     v = slope * inv_gain
@@ -55,7 +55,7 @@ def weights(slope, s, inv_gain, slow, shared):
     return v, lam, q * lam, (1.0 + q) / (s * q * (2.0 + q))
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(error_model="numpy", inline="always")
 def store(out, y, x, slope, noise, total, squares, scale):
     """
     Slope of a pixel and the two parts of its variance, from the sums of weights and their squares.
@@ -77,13 +77,13 @@ def store(out, y, x, slope, noise, total, squares, scale):
     out[2][y, x] = max(var - photon, 0.0) * scale * scale
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(error_model="numpy", inline="always")
 def no_slope(out, y, x):
     """Pixel without a slope."""
     out[0][y, x] = out[1][y, x] = out[2][y, x] = np.nan
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def own_charge(jumps, nx, n_diff):
     """
     Significance of jumps without what leaked from the jumps of the four neighbors at the same difference.
@@ -110,7 +110,7 @@ def own_charge(jumps, nx, n_diff):
     return size - LEAK * leaked
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def gather(data, levels, response, y, x, g0, g1, d, valid):
     """Linear differences of one pixel, and how many are usable in each integration."""
     drift, bias, reset = levels
@@ -161,7 +161,7 @@ def gather(data, levels, response, y, x, g0, g1, d, valid):
     return saturated
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def widen(cut, i, n_diff):
     """Cut difference ``i`` and those beside it in its integration: a hit amid averaged frames shows in two."""
     k = i // n_diff
@@ -169,7 +169,7 @@ def widen(cut, i, n_diff):
         cut[j] = True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def cut_by_flags(group_dq, y, x, g0, g1, cut, valid, averaged):
     """
     Cut the differences of one pixel that the flags of its groups forbid.

@@ -100,7 +100,7 @@ def _cubic(integrals, place):
     return value + t * (slope + t * (bend + t * twist))
 
 
-@njit(cache=True)
+@njit()
 def _integrals_at(x, low, scale, first, last, integrals):
     """Z, and its integral over wavelength, from the beginning of a band to a wavelength in it."""
     place = (x - low) * scale
@@ -116,7 +116,7 @@ def _integrals_at(x, low, scale, first, last, integrals):
     return zero, value + t * (slope + t * (bend + t * twist))
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@njit(fastmath={"reassoc", "contract"})
 def _turns(wave, turn, begin, end, low, scale, first, n_cells, integrals):
     """Sum of the changes of slope at wavelengths ``begin`` to ``end`` inside a band, times the integrals there."""
     total = 0.0
@@ -133,7 +133,7 @@ def _turns(wave, turn, begin, end, low, scale, first, n_cells, integrals):
     return total
 
 
-@njit(cache=True)
+@njit()
 def band_means(wave, fnu, slope, turn, span, edge, integrals, tolerance, out):
     """
     Photon-counting means of F_nu in bands, without making a matrix of weights.

@@ -9,7 +9,7 @@ _TILE = 512  # wavelengths, and
 _ROWS = 16  # rows, whose sums stay in the cache
 
 
-@njit(cache=True)
+@njit()
 def weighted_sums(weights, spectra):
     """
     Sums of spectra, shape (n_age, n_wave), with the weights of each row: shape (n, n_wave).
@@ -61,7 +61,7 @@ def weighted_sums(weights, spectra):
     return out
 
 
-@njit(cache=True)
+@njit()
 def mix_light(
     weight,
     young,
@@ -120,7 +120,7 @@ def mix_light(
             out[i, j] += lost * dust[d, j]
 
 
-@njit(cache=True)
+@njit()
 def block_fluxes(
     wave, inverse_step, to_lnu, light, agn, model_of_row, power, dim, sky, z, scale,
     span, edge, integrals, tolerance, out,

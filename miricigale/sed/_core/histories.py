@@ -13,7 +13,7 @@ YOUNG = 10  # Myr
 _BLOCK = 64
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@njit(fastmath={"reassoc", "contract"})
 def _exponential(n, tau, delayed):
     """Compute ``exp(-t / tau)``, or ``t exp(-t / tau)``, for t = 0 ... n - 1, up to a factor."""
     # a rising exponential is counted from its last step, so that nothing overflows
@@ -32,7 +32,7 @@ def _exponential(n, tau, delayed):
     return out
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@njit(fastmath={"reassoc", "contract"})
 def _finish(rate, f_burst, age_burst, tau_burst):
     """Add an exponential burst in the last steps that makes a fraction of all stars; sum 1e-6."""
     n = rate.size
@@ -128,7 +128,7 @@ def age_steps(age, n_steps):
     return runs, mixed, rows.indptr, rows.indices, rows.data
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@njit(fastmath={"reassoc", "contract"})
 def _moments(history, first, last):
     """Sums of mass and of mass times (step - first), for steps counted back from the end."""
     n = history.size
@@ -141,7 +141,7 @@ def _moments(history, first, last):
     return 1e6 * zero, 1e6 * first_moment
 
 
-@njit(cache=True)
+@njit()
 def split_by_age(histories, end, n_young, age, runs, mixed, indptr, indices, data):
     """
     Masses in Msun at tabulated ages, of young and of old stars, shape (2, n, n_age).
@@ -157,7 +157,7 @@ def split_by_age(histories, end, n_young, age, runs, mixed, indptr, indices, dat
     return mass
 
 
-@njit(cache=True)
+@njit()
 def _split(history, n_young, age, runs, mixed, indptr, indices, data, mass):
     """One history of `split_by_age`; adds to ``mass``, shape (2, n_age)."""
     n = history.size

@@ -72,7 +72,7 @@ def meiksin_transmission(wave, redshift):
     return _meiksin(wave, float(redshift), *_lls_terms(), *_meiksin_lines())
 
 
-@njit(cache=True)
+@njit()
 def _meiksin(wave, redshift, first, series, lines, depth):
     out = np.ones(wave.size)
     if redshift <= 0.0:
@@ -184,7 +184,7 @@ def inoue_transmission(wave, redshift, lines):
     return _inoue(wave, 1.0 + float(redshift), *lines)
 
 
-@njit(cache=True)
+@njit()
 def _inoue(wave, z1, lines, forest, damped):
     out = np.ones(wave.size)
     highest = lines[0] * z1
@@ -223,7 +223,7 @@ def _inoue(wave, z1, lines, forest, damped):
     return out
 
 
-@njit(cache=True)
+@njit()
 def _inoue_forest(x, z1):
     """Lyman continuum of the forest, eq. 25 to 27; x = wavelength / limit."""
     x21 = x**2.1
@@ -240,7 +240,7 @@ def _inoue_forest(x, z1):
     return 5.22e-4 * (z1**3.4 * x21 - x**5.5)
 
 
-@njit(cache=True)
+@njit()
 def _inoue_damped(x, z1):
     """Lyman continuum of damped systems, eq. 28 and 29."""
     root = x**-0.3
@@ -252,7 +252,7 @@ def _inoue_damped(x, z1):
     return far - 0.02916 * x**3
 
 
-@njit(cache=True)
+@njit()
 def _inoue_damped_near(x, z1):
     """The same for x < 1: eq. 28 and 29 with their lower limit at redshift 0."""
     root = x**-0.3

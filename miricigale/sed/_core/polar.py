@@ -75,7 +75,7 @@ def polar_share(opening_angle):
     return DISK_MEAN - s**2 / 6.0 - 2.0 * s**3 / 9.0
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@njit(fastmath={"reassoc", "contract"}, error_model="numpy")
 def _dimmed(absorption, weight, face_on, disk, ebv, dims_disk, out):
     """Fill ``out`` with the disk behind polar dust, if it is; return the power taken from ``face_on``."""
     lost = 0.0
@@ -88,7 +88,7 @@ def _dimmed(absorption, weight, face_on, disk, ebv, dims_disk, out):
     return lost
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@njit(fastmath={"reassoc", "contract"}, error_model="numpy")
 def _modified_blackbody(front, exponent, thick, weight, temperature, beta, out):
     """Fill ``out`` with the emission of polar dust on any scale; return its power."""
     n = front.size
@@ -111,7 +111,7 @@ def _modified_blackbody(front, exponent, thick, weight, temperature, beta, out):
     return power
 
 
-@njit(cache=True)
+@njit()
 def add_polar(grid, face_on, disk, dust, ebv, temperature, beta, share, dims_disk):
     """
     Disk, torus and polar dust for one watt of dust emission.
