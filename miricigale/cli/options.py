@@ -22,7 +22,7 @@ class Parser(argparse.ArgumentParser):
         hint = ""
         if choice:
             names = [name.strip(" '") for name in choice[2].split(",")]
-            hint = _nearest(choice[1], names) or _meant(_BY_PURPOSE.get(choice[1]), names)
+            hint = _nearest_command(choice[1], names)
         elif unknown:
             flags = [word.partition("=")[0] for word in unknown[1].split() if word[0] == "-"]
             hint = "".join(_nearest_option(flag, self.every_name) for flag in flags)
@@ -34,143 +34,49 @@ class Parser(argparse.ArgumentParser):
     every_name = ()
 
 
-#: What users type for a command of another name.
-_BY_PURPOSE = {
-    "help": "--help",
-    "depth": "plan",
-    "etc": "plan",
-    "exptime": "plan",
-    "sensitivity": "plan",
-    "measure": "photometry",
-    "simulate": "run",
-    "study": "run",
-}
+def _other_names(kind):
+    """Return the names of other programs for commands or options of ours."""
+    return declarations("other_names.toml")[kind]
 
 
-#: What users type for an option of another name: the first of these that a command has.
-_OPTIONS_BY_PURPOSE = {
-    "filters": ["--bands", "--filter"],
-    "bands": ["--filter"],
-    "band": ["--filter", "--bands"],
-    "exptime": ["--time"],
-    "exposure": ["--time"],
-    "times": ["--time"],
-    "mag": ["--depth"],
-    "limit": ["--depth"],
-    "budget": ["--hours"],
-    "ra": ["--position"],
-    "dec": ["--position"],
-    "coord": ["--position"],
-    "out": ["--output"],
-    "outdir": ["--output"],
-    "out-dir": ["--output"],
-    "outfile": ["--output"],
-    "dir": ["--output"],
-    "cat": ["--catalog"],
-    "prior": ["--highres"],
-    "reference": ["--highres"],
-    "detection-image": ["--highres"],
-    "seg": ["--segmentation"],
-    "segm": ["--segmentation"],
-    "segmap": ["--segmentation"],
-    "rms": ["--error"],
-    "err": ["--error"],
-    "wht": ["--weight"],
-    "zp": ["--zero-point"],
-    "zeropoint": ["--zero-point"],
-    "z": ["--redshift"],
-    "zspec": ["--z-spec"],
-    "z-phot": ["--redshift"],
-    "grid": ["--axes"],
-    "model": ["--axes"],
-    "templates": ["--axes"],
-    "units": ["--flux-unit", "--unit"],
-    "columns": ["--map"],
-    "translate": ["--map"],
-    "survey": ["--map"],
-    "ebmv": ["--ebv"],
-    "clobber": ["--overwrite"],
-    "force": ["--overwrite", "--redo"],
-    "n-threads": ["--threads"],
-    "nthreads": ["--threads"],
-    "ncores": ["--threads"],
-    "ncpu": ["--threads"],
-    "cores": ["--threads"],
-    "jobs": ["--threads"],
-    "n-jobs": ["--threads"],
-    "workers": ["--threads"],
-    "fast": ["--quick"],
-    "dry-run": ["--plan", "--print-config"],
-    "stage": ["--until"],
-    "stages": ["--until"],
-    "stop-after": ["--until"],
-    "scale": ["--pixel-scale"],
-    "pixscale": ["--pixel-scale"],
-    "plot": ["--plots"],
-    "html": ["--page"],
-}
+def _meant(name):
+    return f"; did you mean {name!r}?"
 
 
-#: What to say about options of other programs without a counterpart, if a command has the option named first.
-_SENTENCES = {
-    "zmax": (
-        "--axes",
-        "the grid has the redshifts; BayesFitter(axes={...}) in Python takes others",
-    ),
-    "zmin": (
-        "--axes",
-        "the grid has the redshifts; BayesFitter(axes={...}) in Python takes others",
-    ),
-    "psf-size": ("--psf", "the PSF is taken as it is in its file"),
-    "aperture": (
-        "--highres",
-        "total fluxes are fitted; miricigale.photometry.aperture_photometry in Python has apertures",
-    ),
-    "sampler": (
-        "--axes",
-        "the command fits on a grid; BayesFitter(engine='nautilus') in Python samples",
-    ),
-}
-_SENTENCES["z-max"] = _SENTENCES["zmax"]
-_SENTENCES["z-min"] = _SENTENCES["zmin"]
-
-
-def _meant(name, names):
-    """Say which name is meant, if it is there."""
-    if name in names or name == "--help":
-        return f"; did you mean {name!r}?"
-    return ""
-
-
-def _nearest(name, names):
-    """Say which name may be meant; empty if none is near."""
+def _nearest_command(name, names):
+    """Say which command, or choice, may be meant; empty if none is near."""
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if close:
-        return f"; did you mean {close[0]!r}?"
+        return _meant(close[0])
+    command = _other_names("commands").get(name)
+    if command in names or command == "--help":
+        return _meant(command)
     return ""
 
 
 def _nearest_option(flag, names):
     """Say which option of a command may be meant, or that an argument has none."""
-    argument = flag.lstrip("-").replace("-", "_").upper()
+    bare = flag.lstrip("-")
+    argument = bare.replace("-", "_").upper()
     if argument in names:
         return f"; {argument} has no option before it"
     flags = [name for name in names if name.startswith("-")]
-    word = flag.lstrip("-").replace("_", "-")
-    for name in _OPTIONS_BY_PURPOSE.get(word, ()):
+    word = bare.replace("_", "-")
+    for name in _other_names("options").get(word, ()):
         if name in flags:
-            return f"; did you mean {name!r}?"
-    if word in _SENTENCES and _SENTENCES[word][0] in flags:
-        return f"; {_SENTENCES[word][1]}"
+            return _meant(name)
+    option, sentence = _other_names("sentences").get(word, (None, ""))
+    if option in flags:
+        return f"; {sentence}"
     # the last word of an option, such as --unit for --flux-unit
-    ending = [name for name in flags if name.endswith("-" + flag.lstrip("-"))]
+    ending = [name for name in flags if name.endswith("-" + bare)]
     if len(ending) == 1:
-        return f"; did you mean {ending[0]!r}?"
+        return _meant(ending[0])
     # the dashes that all have make short names seem alike
-    bare = {name.lstrip("-"): name for name in flags}
-    close = difflib.get_close_matches(flag.lstrip("-"), bare, n=1, cutoff=0.65)
+    full_names = {name.lstrip("-"): name for name in flags}
+    close = difflib.get_close_matches(bare, full_names, n=1, cutoff=0.65)
     if close:
-        return f"; did you mean {bare[close[0]]!r}?"
+        return _meant(full_names[close[0]])
     return ""
 
 
@@ -264,9 +170,9 @@ def refuse(args, names, wanted):
             raise argument_error(name, wanted, value)
 
 
-def declarations():
-    """Return what ``commands.toml`` declares: of each command by name, and of ``shared`` options."""
-    return tomllib.loads((resources.files("miricigale.cli") / "commands.toml").read_text("utf-8"))
+def declarations(file="commands.toml"):
+    """Return what a file declares: of each command and of ``shared`` options, or names of other programs."""
+    return tomllib.loads((resources.files("miricigale.cli") / file).read_text("utf-8"))
 
 
 @contextlib.contextmanager

@@ -82,7 +82,6 @@ def njit(**options):
     -------
     decorator : callable
     """
-
     options = {"cache": True, "nogil": True} | options
 
     def decorate(function):
