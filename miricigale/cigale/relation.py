@@ -66,7 +66,7 @@ def near_relation(fitter, photometry, results, max_deviation, *, redshift, seed)
             i = range(len(results))[rows][j]
             draws_near = is_near[j]
             if np.mean(draws_near) < _LEAST:
-                new["flags"][i] |= int(FitFlags.OFF_RELATION)
+                new["flags"][i] |= FitFlags.OFF_RELATION
                 continue
             index = samples.index[j][draws_near]
             scale = samples.scale[j][draws_near]

@@ -180,7 +180,7 @@ class _Candidates:
         else:
             ambiguous = AssociationFlags.SEVERAL_FIRST
         flags[self.count[k] > 1] |= int(ambiguous)
-        flags[(self.count[k] > 0) & (self.partner[k] < 0)] |= int(AssociationFlags.NOT_MUTUAL)
+        flags[(self.count[k] > 0) & (self.partner[k] < 0)] |= AssociationFlags.NOT_MUTUAL
         flags[self.count[k] == 0] |= _NONE
         flags[~self.finite[k]] = _LOST
         return flags

@@ -192,9 +192,9 @@ class CatalogFits(Interactive):
         if kind == "fixed":
             n_wanted = 2
         n_detected = np.sum(data.measured & (data.flux >= 2.0 * data.flux_err), axis=1)
-        is_fitted = (flags & int(FitFlags.UNFITTED)) == 0
+        is_fitted = (flags & FitFlags.UNFITTED) == 0
         too_few = is_fitted & (n_detected < min(n_free, n_wanted))
-        flags[too_few] |= int(FitFlags.FEW_FOR_PARAMETERS)
+        flags[too_few] |= FitFlags.FEW_FOR_PARAMETERS
         settings = self._settings(filters) | {"redshift": kind}
         settings["unused_bands"] = unused_bands(photometry, filters)
         if kind == "fixed":

@@ -87,7 +87,7 @@ def read_catalog(path, catalog_map=None, **options):
         catalog = check_catalog(table, argument=path.name)
     texts = list(catalog_messages(lost, [coded]))
     for codes in coded.values():
-        catalog["flags"][~np.isnan(codes)] |= int(CatalogFlags.MISSING_CODE)
+        catalog["flags"][~np.isnan(codes)] |= CatalogFlags.MISSING_CODE
     texts += _missing_fluxes(catalog)
     # counts need an area that is right
     texts += list(_hours(table, catalog)) or _odd_units(catalog)
@@ -109,7 +109,7 @@ def _flags_of_stars(table):
 
 def _missing_fluxes(catalog):
     """Warnings about sources without a flux."""
-    lost = (catalog["flags"] & int(CatalogFlags.NO_FLUX)) > 0
+    lost = (catalog["flags"] & CatalogFlags.NO_FLUX) > 0
     if np.any(lost):
         first = ", ".join(map(str, catalog["id"][lost][:5].tolist()))
         ellipsis = ""

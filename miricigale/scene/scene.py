@@ -437,7 +437,7 @@ class Scene(Interactive):
         truth = self._painted[1]
         marks = None
         if sources:
-            shown = (truth["flags"] & int(SceneFlags.OUTSIDE_IMAGE)) == 0
+            shown = (truth["flags"] & SceneFlags.OUTSIDE_IMAGE) == 0
             marks = truth["x"][shown], truth["y"][shown]
         label = f"{plain_text(self._filter)} (MJy / sr)"
         image = self.render().data

@@ -174,13 +174,13 @@ def _row_flags(model, values, n):
     for name, parameter in model.parameters.items():
         finite = np.isfinite(values[name])
         low, high = parameter.bounds
-        flags[~finite] |= int(ModelFlags.NOT_FINITE)
+        flags[~finite] |= ModelFlags.NOT_FINITE
         outside = finite & ((values[name] < low) | (values[name] > high))
-        flags[outside] |= int(ModelFlags.OUT_OF_BOUNDS)
+        flags[outside] |= ModelFlags.OUT_OF_BOUNDS
     good = flags == 0
     universe = np.zeros(n)
     universe[good] = model.cosmology.age(values["redshift"][good]).to_value(u.Gyr)
-    flags[good & (values["age"] > universe)] |= int(ModelFlags.OLDER_THAN_UNIVERSE)
+    flags[good & (values["age"] > universe)] |= ModelFlags.OLDER_THAN_UNIVERSE
     for component in model.components:
         if not component.refuses or not np.any(good):
             continue
@@ -189,7 +189,7 @@ def _row_flags(model, values, n):
         rows = np.flatnonzero(good)
         different, index = distinct(_keys(values, names, rows))
         bad = [bool(component.invalid(dict(zip(names, row, strict=True)))) for row in different]
-        flags[rows[np.array(bad)[index]]] |= int(ModelFlags.NOT_IN_LIBRARY)
+        flags[rows[np.array(bad)[index]]] |= ModelFlags.NOT_IN_LIBRARY
     return flags
 
 
@@ -362,10 +362,10 @@ def flux_table(model, table, filters):
         flux[rows], got = blocks.run(rows)
         for name in names:
             derived[name][rows] = got[name]
-        flags[rows[np.any(np.isnan(flux[rows]), axis=1)]] |= int(ModelFlags.NOT_COVERED)
+        flags[rows[np.any(np.isnan(flux[rows]), axis=1)]] |= ModelFlags.NOT_COVERED
         if model.has_agn:
             without = (values["frac_agn"][rows] > 0) & (got["agn_power"] == 0)
-            flags[rows[without]] |= int(ModelFlags.NO_AGN_POWER)
+            flags[rows[without]] |= ModelFlags.NO_AGN_POWER
     if "id" in table.colnames:
         out = {"id": (table["id"], table["id"].info.description)}
     else:

@@ -141,7 +141,7 @@ def _notices(page, numbers):
         page.notice("nothing")
         return
     poor = numbers["chi2"][good] > _POOR_CHI2
-    edge = numbers["flags"][good] & int(FitFlags.REDSHIFT_EDGE) != 0
+    edge = numbers["flags"][good] & FitFlags.REDSHIFT_EDGE != 0
     for name, is_affected in (("high_chi2", poor), ("redshift_edge", edge)):
         share = _mean(is_affected)
         if share > _NOTICE_SHARE:
@@ -377,7 +377,7 @@ def _left_out(page, rows, numbers):
         n = np.count_nonzero(numbers["flags"] & value)
         if n:
             fitted = " Not fitted."
-            if not value & int(FitFlags.UNFITTED):
+            if not value & FitFlags.UNFITTED:
                 fitted = ""
             counts.append({"flag": f"{value} {name}", "meaning": meaning + fitted, "objects": n})
     page.table("flags", counts)

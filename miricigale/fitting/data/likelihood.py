@@ -332,9 +332,9 @@ class PhotometryReader:
             )
             has_flux = np.abs(band_flux) < _MAX_FLUX
             has_error = (band_err > _MIN_ERROR) & (band_err < _MAX_FLUX)
-            flags[~np.isnan(band_flux) & ~has_flux] |= int(FitFlags.BAD_FLUX)
+            flags[~np.isnan(band_flux) & ~has_flux] |= FitFlags.BAD_FLUX
             # a flux without error is a missing band; an error that cannot be used is flagged
-            flags[has_flux & ~has_error & ~np.isnan(band_err)] |= int(FitFlags.BAD_ERROR)
+            flags[has_flux & ~has_error & ~np.isnan(band_err)] |= FitFlags.BAD_ERROR
             usable = has_flux & has_error
             flux[:, column] = band_flux
             flux_err[:, column] = band_err
@@ -351,9 +351,9 @@ class PhotometryReader:
             sigma[:, column] = np.where(usable, total_err, np.inf)
         # flags of whole objects
         n_bands = np.isfinite(sigma).sum(axis=1)
-        flags[(n_bands > 0) & (n_bands == limit.sum(axis=1))] |= int(FitFlags.ALL_LIMITS)
-        flags[n_bands == 0] |= int(FitFlags.NO_BAND)
-        flags[(n_bands > 0) & (n_bands < self.n_bands_min)] |= int(FitFlags.FEW_BANDS)
+        flags[(n_bands > 0) & (n_bands == limit.sum(axis=1))] |= FitFlags.ALL_LIMITS
+        flags[n_bands == 0] |= FitFlags.NO_BAND
+        flags[(n_bands > 0) & (n_bands < self.n_bands_min)] |= FitFlags.FEW_BANDS
         ids = read_ids(table)
         # of several rows with an id the first is fitted
         first_of_id = np.zeros(n, dtype=bool)
@@ -361,7 +361,7 @@ class PhotometryReader:
         is_duplicate = ~first_of_id
         if repeated is not None:
             is_duplicate |= repeated
-        flags[is_duplicate] |= int(FitFlags.DUPLICATE_ID)
+        flags[is_duplicate] |= FitFlags.DUPLICATE_ID
         return FitData(ids, flux, flux_err, sigma, limit, flags)
 
 

@@ -45,7 +45,7 @@ def between_results(fit, data, posteriors, pairs):
     flags = np.array(data.flags)
     converged = np.array([posterior.converged for posterior in posteriors], bool)
     # results rest on fewer models than were asked for
-    flags[~converged] |= int(FitFlags.NOT_CONVERGED)
+    flags[~converged] |= FitFlags.NOT_CONVERGED
     node = np.array([posterior.best_node for posterior in posteriors]).reshape(n, -1)
     log_errors = fit.log_errors(data)
     data = fit.with_template_error(data, node[:, 0])
@@ -88,7 +88,7 @@ def with_axis_summaries(results):
     quantiles = np.full((n, len(names), DERIVED_LEVELS.size), np.nan)
     flags = np.array(results.flags)
     fitted = np.isfinite(results.chi2)
-    flags[fitted] |= int(FitFlags.NOT_CONVERGED)
+    flags[fitted] |= FitFlags.NOT_CONVERGED
     for i in np.flatnonzero(fitted):
         single = results[i]
         for j, name in enumerate(names):

@@ -44,8 +44,8 @@ def draw_samples(fit, data, log_prior, n_draws, seed, **parallel):
     columns = Draws.concatenate(parts)
     flags = data.flags | columns.pop("flags")
     unfitted = ~np.isfinite(columns["scale"]).all(axis=1)
-    unfitted &= (flags & int(FitFlags.UNFITTED)) == 0
-    flags[unfitted] |= int(FitFlags.NO_SIGNAL)
+    unfitted &= (flags & FitFlags.UNFITTED) == 0
+    flags[unfitted] |= FitFlags.NO_SIGNAL
     return Samples(fit.grid, data.ids, flags, axes=fit.priors.axes, seed=seed, **columns)
 
 

@@ -295,10 +295,10 @@ class GridFit:
             log_prior = fixed_log_prior(values, z, allowed, self.given.redshift_tolerance, flags)
         else:
             if not allowed.any():
-                flags |= int(FitFlags.NO_MODEL)
+                flags |= FitFlags.NO_MODEL
             of_grid = np.log(prior, where=allowed, out=np.full(z.size, -np.inf))
             log_prior = np.tile(of_grid, (len(flags), 1))
-        log_prior[(flags & int(FitFlags.UNFITTED)) != 0] = -np.inf
+        log_prior[(flags & FitFlags.UNFITTED) != 0] = -np.inf
         n_free = 1 + sum(axis.values.size > 1 for axis in self.priors.axes.values())
         if redshift is None:
             return log_prior, n_free, "free"
@@ -481,7 +481,7 @@ class GridFit:
         flags = np.array(data.flags)
         if self.compat == "cigale":
             vanished = out.chi2 > VANISHING_CHI2
-            flags[vanished] |= int(FitFlags.NO_LIKELIHOOD)
+            flags[vanished] |= FitFlags.NO_LIKELIHOOD
             for array in (*out[:-1], *out.joint.values()):
                 missing = np.nan
                 if array.dtype.kind == "i":
@@ -492,7 +492,7 @@ class GridFit:
         if self.between is None:
             largest = np.minimum(out.galaxy.max(axis=1), pdf["redshift"].max(axis=1))
             one_node = (largest > _ONE_NODE_WEIGHT) & (out.galaxy.shape[1] > 1)
-            flags[one_node] |= int(FitFlags.ONE_NODE)
+            flags[one_node] |= FitFlags.ONE_NODE
         if "frac_agn" in axes:
             pdf["frac_agn"] = out.zf.sum(axis=1)
         for name, axis in axes.items():

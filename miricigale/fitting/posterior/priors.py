@@ -461,10 +461,10 @@ def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
     weights = np.maximum(np.diff(integrals_to(edges, nodes, density, total), axis=1), 0.0)
     integral = total[:, -1:]
     is_usable = np.isfinite(integral[:, 0]) & (integral[:, 0] > 0)
-    flags[~is_usable] |= int(FitFlags.NO_REDSHIFT)
+    flags[~is_usable] |= FitFlags.NO_REDSHIFT
     with np.errstate(divide="ignore", invalid="ignore"):
         out = np.where(allowed & is_usable[:, None], np.log(weights / integral), -np.inf)
-    flags[is_usable & ~np.isfinite(out).any(axis=1)] |= int(FitFlags.NO_MODEL)
+    flags[is_usable & ~np.isfinite(out).any(axis=1)] |= FitFlags.NO_MODEL
     return out
 
 
@@ -492,10 +492,10 @@ def fixed_log_prior(values, grid_redshift, allowed, tolerance, flags):
             # a single redshift has no cell
             limit = np.maximum(limit, 1e-3)
     outside = ~missing & (distance > limit)
-    flags[missing] |= int(FitFlags.NO_REDSHIFT)
-    flags[outside] |= int(FitFlags.REDSHIFT_OUTSIDE)
+    flags[missing] |= FitFlags.NO_REDSHIFT
+    flags[outside] |= FitFlags.REDSHIFT_OUTSIDE
     out = np.full((n, z.size), -np.inf)
     out[np.arange(n), node] = np.where(allowed[node], 0.0, -np.inf)
     out[missing | outside] = -np.inf
-    flags[~missing & ~outside & ~np.isfinite(out).any(axis=1)] |= int(FitFlags.NO_MODEL)
+    flags[~missing & ~outside & ~np.isfinite(out).any(axis=1)] |= FitFlags.NO_MODEL
     return out

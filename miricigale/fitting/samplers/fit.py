@@ -249,10 +249,10 @@ class SamplerFit:
             "pairs": {(x, y): np.full((n, size[x], size[y]), np.nan) for x, y in pairs},
             "best": {name: np.full(n, np.nan) for name in tuple(axes) + quantities},
         }
-        for row in np.flatnonzero((flags & int(FitFlags.UNFITTED)) == 0):
+        for row in np.flatnonzero((flags & FitFlags.UNFITTED) == 0):
             posterior = self._sample(data._take(row), spaces[row], seed, axes, pairs)
             if posterior is None:
-                flags[row] |= int(FitFlags.NO_MODEL)
+                flags[row] |= FitFlags.NO_MODEL
             for name, value in (posterior or {}).items():
                 if isinstance(value, dict):
                     for key, array in out[name].items():

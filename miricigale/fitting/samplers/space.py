@@ -298,8 +298,8 @@ class Space:
         missing = np.isnan(values)
         low, high = limits
         outside = ~missing & ~((values >= low) & (values <= high))
-        flags[missing] |= int(FitFlags.NO_REDSHIFT)
-        flags[outside] |= int(FitFlags.REDSHIFT_OUTSIDE)
+        flags[missing] |= FitFlags.NO_REDSHIFT
+        flags[outside] |= FitFlags.REDSHIFT_OUTSIDE
         good = np.where(missing | outside, 0.5 * (low + high), values)
         return [self.with_prior("redshift", float(z)) for z in good]
 
@@ -317,7 +317,7 @@ class Space:
             if np.isfinite(heights).all():
                 prior = Table(nodes, np.array(heights)).cut(low, high)
             if prior is None:
-                flags[row] |= int(FitFlags.NO_MODEL)
+                flags[row] |= FitFlags.NO_MODEL
                 prior = Flat(low, high)
             out.append(self.with_prior("redshift", prior))
         return out

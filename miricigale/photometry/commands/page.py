@@ -119,7 +119,7 @@ def _notices(page, bands, highres):
             page.notice("no_psfs")
         # many poor fits of bright sources point to a wrong PSF
         bright = np.nan_to_num(result.snr) > _BRIGHT
-        poor = bright & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
+        poor = bright & (result.flags & ForcedFlags.POOR_FIT != 0)
         n = np.count_nonzero(bright)
         n_poor = np.count_nonzero(poor)
         if n >= 5 and n_poor > 0.5 * n:
@@ -229,7 +229,7 @@ def _examples(result):
     elif good.any():
         best = np.argmax(np.where(good, snr, -np.inf))
         chosen.append((int(best), "the brightest"))
-    poor = good & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
+    poor = good & (result.flags & ForcedFlags.POOR_FIT != 0)
     if poor.any():
         poorest = np.argmax(np.where(poor, result.chi2, -np.inf))
         chosen.append((int(poorest), "the poorest fit"))

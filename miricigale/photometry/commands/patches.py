@@ -320,7 +320,7 @@ def measure_patch(inputs, grid, k, catalog, n_threads):
     if part:
         cut = _is_cut(segments, part, prior.shape, xy)
         for flags in columns:
-            flags[cut] |= int(ForcedFlags.CUT)
+            flags[cut] |= ForcedFlags.CUT
         if inputs.segmentation is not None:
             # its position may be in another core than that of the whole, and in none
             is_kept |= cut

@@ -90,7 +90,7 @@ def own_segments(segmentation, labels, xy):
         distance = np.hypot(xy[rows, 1] - middle[0], xy[rows, 0] - middle[1])
         losers = np.delete(rows, np.nanargmin(np.nan_to_num(distance, nan=np.inf)))
         label[losers] = 0
-        flags[losers] |= int(ForcedFlags.SHARED_SEGMENT)
+        flags[losers] |= ForcedFlags.SHARED_SEGMENT
     return label, flags
 
 

@@ -240,9 +240,9 @@ def source_flags(fit, diagnostics, place, flux, blending):
         (place[diagnostics.poor], ForcedFlags.POOR_FIT),
     ):
         flags[rows] |= int(flag)
-    cut = np.flatnonzero(fit.main & (flags[place] & int(ForcedFlags.MASKED) > 0))
+    cut = np.flatnonzero(fit.main & (flags[place] & ForcedFlags.MASKED > 0))
     cut = cut[_cut_by_rim(fit.arrays.usable, fit.bank.box[cut])]
-    flags[place[cut]] |= int(ForcedFlags.EDGE)
-    flags[place[fit.main & (diagnostics.rim > _RIM_LIGHT)]] |= int(ForcedFlags.EDGE)
-    flags[np.isnan(flux) & (flags & int(ForcedFlags.DEGENERATE) == 0)] |= int(ForcedFlags.NO_DATA)
+    flags[place[cut]] |= ForcedFlags.EDGE
+    flags[place[fit.main & (diagnostics.rim > _RIM_LIGHT)]] |= ForcedFlags.EDGE
+    flags[np.isnan(flux) & (flags & ForcedFlags.DEGENERATE == 0)] |= ForcedFlags.NO_DATA
     return flags, coverage

@@ -186,11 +186,11 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     peaks, _ = _peaks(fit, plane, xy, models, residuals, inverse)
     flags, coverage = _flags(fit, place, n_all, flux, blending, poor)
     is_canceling = canceling(flux, errors[""], _spread_over(core_flux, place, n_all))
-    flags[is_canceling] |= int(ForcedFlags.CANCELING)
+    flags[is_canceling] |= ForcedFlags.CANCELING
     flags[:n] |= catalog.flags
-    flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
+    flags[n:] |= ForcedFlags.NOT_IN_CATALOG
     has_neighbor = unexplained_neighbors(peaks, xy, flux)
-    flags[has_neighbor & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    flags[has_neighbor & np.isfinite(flux)] |= ForcedFlags.UNEXPLAINED_NEIGHBOR
     # columns of all sources, from which the catalog's and the new ones are taken
     columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage}
     columns["chi2"] = _spread_over(chi2, place, n_all)
@@ -341,17 +341,17 @@ def _flags(fit, place, n_all, flux, blending, poor):
     coverage = np.zeros(n_all)
     inside[place] = fit.light[:, 0]
     coverage[place] = np.clip(fit.light[:, 1], 0.0, 1.0)
-    flags[inside < 0.9] |= int(ForcedFlags.EDGE)
-    flags[coverage < 0.9 * np.minimum(inside, 1.0)] |= int(ForcedFlags.MASKED)
+    flags[inside < 0.9] |= ForcedFlags.EDGE
+    flags[coverage < 0.9 * np.minimum(inside, 1.0)] |= ForcedFlags.MASKED
     for rows, flag in (
         (fit.degenerate, ForcedFlags.DEGENERATE),
         (fit.noisy, ForcedFlags.NOISY_SEGMENT),
         (blending > 2, ForcedFlags.BLENDED),
         (poor, ForcedFlags.POOR_FIT),
     ):
-        flags[place[rows]] |= int(flag)
-    lost = np.isnan(flux) & (flags & int(ForcedFlags.DEGENERATE) == 0)
-    flags[lost] |= int(ForcedFlags.NO_DATA)
+        flags[place[rows]] |= flag
+    lost = np.isnan(flux) & (flags & ForcedFlags.DEGENERATE == 0)
+    flags[lost] |= ForcedFlags.NO_DATA
     return flags, coverage
 
 

@@ -151,13 +151,13 @@ def package(fit, diagnostics, new_xy, catalog, meta):
             error[place[measured]] = np.sqrt(np.maximum(term.diagonal()[place[measured]], 0.0))
     flags, coverage = source_flags(fit, diagnostics, place, flux, blending)
     flags[:n] |= catalog.flags
-    flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
+    flags[n:] |= ForcedFlags.NOT_IN_CATALOG
     xy = np.concatenate([catalog.xy, new_xy])
     has_neighbor = unexplained_neighbors(diagnostics.peaks, xy + fit.displacement(xy), flux)
-    flags[has_neighbor & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
+    flags[has_neighbor & np.isfinite(flux)] |= ForcedFlags.UNEXPLAINED_NEIGHBOR
     core_flux = np.full(n_all, np.nan)
     core_flux[place[main]] = diagnostics.core_flux[main]
-    flags[canceling(flux, flux_err[0], core_flux)] |= int(ForcedFlags.CANCELING)
+    flags[canceling(flux, flux_err[0], core_flux)] |= ForcedFlags.CANCELING
     chi2[place[main]] = diagnostics.chi2[main]
     residual_fraction[place[main]] = diagnostics.residual_fraction[main]
     # columns of all sources, from which the catalog's and the new ones are taken

@@ -152,14 +152,14 @@ def cutouts(
         for row, piece, record in zip(galaxy.rows, galaxy.pieces, galaxy.records(), strict=True):
             templates[chosen[row]] = piece
             fitted[chosen[row]] = record
-            flags[chosen[row]] |= int(ForcedFlags.SHREDDED)
+            flags[chosen[row]] |= ForcedFlags.SHREDDED
     in_pieces = set(itertools.chain.from_iterable(galaxy.rows for galaxy in galaxies))
     for row, (k, model) in enumerate(zip(chosen, models, strict=True)):
         if model is not None:
             templates[k] = model.cutout
             fitted[k] = (*model.record, 0.0, 1.0)
         elif templates[k] is None or row not in in_pieces:
-            flags[k] |= int(ForcedFlags.NOISY_SEGMENT)
+            flags[k] |= ForcedFlags.NOISY_SEGMENT
     # sources without a fit have the shape that is expected of them
     lacking = int(ForcedFlags.NOISY_SEGMENT | ForcedFlags.SHREDDED)
     for k in np.flatnonzero(flags & lacking == int(ForcedFlags.NOISY_SEGMENT)):

@@ -198,7 +198,7 @@ class SourceTemplates:
         label, flags = own_segments(segments, label, xy)
         width = 1 / np.sqrt(psf.max() / psf.sum())
         full, flat = saturated_cores(fine.flux, fine.usable, segments, label, xy, width)
-        flags[full] |= int(ForcedFlags.SATURATED)
+        flags[full] |= ForcedFlags.SATURATED
         data = fine.flux
         variance = fine.sigma
         del fine
