@@ -5,12 +5,11 @@ from astropy.table import QTable
 
 from miricigale.evaluation import agn_fraction
 from miricigale.utils.column_units import quantity_table
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, read_ids, require_columns
-from miricigale.utils.units import FNU, LUMINOSITY, to_array
+from miricigale.utils.units import FNU, LUMINOSITY, are_not_negative, to_array
 from miricigale.utils.values import value_class
 
 #: Most bins of flux in which errors of a band are looked at, and least number of fluxes in each.
@@ -106,8 +105,8 @@ def add_light(photometry, light, *, curves, seed):
     ids = read_ids(table)
     for band, agn_flux in light.items():
         agn_flux = to_array(agn_flux, FNU, "light", ndim=1)
-        if not np.all(np.isfinite(agn_flux) & (agn_flux >= 0)):
-            raise argument_error("light", f"finite and 0 or more in {band}", "others")
+        wanted = f"finite and 0 or more in {band}"
+        check_that(are_not_negative(agn_flux), "light", wanted, "others")
         flux = to_array(table[band], FNU, band)
         error = to_array(table[error_column(band)], FNU, error_column(band))
         changed = np.isfinite(flux) & np.isfinite(error) & (error > 0) & (agn_flux > 0)

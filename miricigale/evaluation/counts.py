@@ -10,7 +10,15 @@ from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, require_columns, unique_ids
-from miricigale.utils.units import FNU, LUMINOSITY, MASS, ab_magnitude, positive, to_array
+from miricigale.utils.units import (
+    FNU,
+    LUMINOSITY,
+    MASS,
+    ab_magnitude,
+    is_ascending,
+    positive,
+    to_array,
+)
 
 _TABLES = declared("miricigale.evaluation", "population.toml")
 #: Light of galaxies together in nW / m2 / sr: band, wavelength (um), least flux (uJy), value,
@@ -320,7 +328,7 @@ def number_counts(flux, area, edges):
     [1800. 5400.] 1 / deg2
     """
     edges = floats(edges)
-    check_that(edges.ndim == 1 and np.all(np.diff(edges) > 0), "edges", "ascending", edges)
+    check_that(is_ascending(edges), "edges", "ascending", edges)
     flux = to_array(flux, FNU, "flux", ndim=1)
     mag = ab_magnitude(flux[flux > 0] * FNU)
     n, _ = np.histogram(mag, edges)

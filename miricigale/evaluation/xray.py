@@ -9,11 +9,11 @@ from scipy.special import expit, ndtr, ndtri
 
 from miricigale.evaluation.metrics import fraction_interval, one_by_one
 from miricigale.sed.xray import stern2015, xray_flux
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
+from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_columns
-from miricigale.utils.units import to_array
+from miricigale.utils.units import is_ascending, to_array
 
 _CGS = u.erg / u.s / u.cm**2
 #: Share of the X-rays that absorption leaves in Yang et al. 2021.
@@ -160,8 +160,7 @@ def completeness(values, found, edges):
     values = values[np.isfinite(detected)]
     detected = detected[np.isfinite(detected)] > 0
     edges = floats(edges)
-    if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
-        raise argument_error("edges", "ascending", edges)
+    check_that(is_ascending(edges, least=2), "edges", "ascending", edges)
     n, _ = np.histogram(values, edges)
     n_found, _ = np.histogram(values[detected], edges)
     shares = []

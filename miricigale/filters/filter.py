@@ -25,6 +25,7 @@ from miricigale.utils.units import (
     Frozen,
     frozen_array,
     frozen_quantity,
+    is_ascending,
     is_number,
     to_array,
 )
@@ -123,8 +124,8 @@ class Filter(Frozen, Interactive):
         if wave.size < 2 or wave.shape != throughput.shape:
             shapes = f"{wave.shape} and {throughput.shape}"
             raise argument_error("throughput", "as many values as 'wave', two or more", shapes)
-        if not (wave[0] > 0 and np.all(np.diff(wave) > 0)):
-            raise argument_error("wave", "positive and strictly ascending", wave)
+        good = wave[0] > 0 and is_ascending(wave)
+        check_that(good, "wave", "positive and strictly ascending", wave)
         if np.any(throughput < 0) or not np.any(throughput > 0):
             raise argument_error("throughput", "not negative, and somewhere positive", throughput)
         wave, throughput = _padded(wave, throughput)

@@ -6,7 +6,7 @@ import numpy as np
 from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
-from miricigale.utils.units import FNU, WAVE, to_array
+from miricigale.utils.units import FNU, WAVE, is_ascending, to_array
 
 
 def check_wave(wave):
@@ -15,8 +15,8 @@ def check_wave(wave):
         wave = to_array(wave, WAVE, "wave")
     else:
         wave = floats(wave)
-    if wave.ndim != 1 or wave.size < 2 or not np.all(np.diff(wave) > 0):
-        raise argument_error("wave", "two or more strictly ascending wavelengths", wave)
+    wanted = "two or more strictly ascending wavelengths"
+    check_that(is_ascending(wave, least=2), "wave", wanted, wave)
     return wave
 
 

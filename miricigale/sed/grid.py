@@ -13,7 +13,7 @@ from miricigale.utils.file_formats import read_write, register
 from miricigale.utils.named_values import attributes, subset
 from miricigale.utils.options import check_that
 from miricigale.utils.store import open_parts, write_parts
-from miricigale.utils.units import Frozen, frozen_array
+from miricigale.utils.units import Frozen, frozen_array, is_ascending
 from miricigale.utils.values import value_class
 
 _SPAN = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)um")
@@ -209,9 +209,9 @@ class ModelGrid(Frozen):
         z = self.redshift
         f = self.frac_agn
         n_alike = self.agn_multiplicity
-        check_that(np.all(np.diff(z) > 0) and np.all(z >= 0), "redshift", "ascending and >= 0", z)
-        if f.size == 0 or np.any(np.diff(f) <= 0) or not (f[0] >= 0 and f[-1] < 1):
-            raise argument_error("frac_agn", "ascending values in [0, 1)", f"{f}")
+        check_that(is_ascending(z) and z[0] >= 0, "redshift", "ascending and >= 0", z)
+        good = is_ascending(f) and f[0] >= 0 and f[-1] < 1
+        check_that(good, "frac_agn", "ascending values in [0, 1)", f)
         check_that(n_a or f.tolist() == [0.0], "frac_agn", "[0] for a grid without AGN", f)
         check_that(np.all(n_alike >= 1), "agn_multiplicity", ">= 1", n_alike)
         for name in ("galaxy", "agn", "dust_luminosity"):

@@ -16,7 +16,7 @@ from miricigale.utils.missing_values import own_mask
 from miricigale.utils.named_values import subset, without
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
-from miricigale.utils.units import WAVE
+from miricigale.utils.units import WAVE, is_ascending
 
 #: Roles whose parameters shape the galaxy.
 _COLD = 30.0  # um at rest, beyond which dust heated by the mean field shines
@@ -35,7 +35,7 @@ def check_axes(model, axes):
         if np.any(own_mask(values)):
             raise argument_error(name, "values without a mask", values)
         array = parameter.array(values)
-        check_that(array.size != 0 and np.all(np.diff(array) > 0), name, "ascending values", array)
+        check_that(is_ascending(array), name, "ascending values", array)
         for value in array:
             parameter.check(value)
         out[name] = array

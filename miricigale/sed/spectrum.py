@@ -26,7 +26,15 @@ from miricigale.utils.named_values import without
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table, table_suffix, write_table
-from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, is_number, to_array
+from miricigale.utils.units import (
+    FNU,
+    WAVE,
+    Frozen,
+    frozen_quantity,
+    is_ascending,
+    is_number,
+    to_array,
+)
 from miricigale.utils.values import value_class
 
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
@@ -207,8 +215,8 @@ class SED(Frozen, Interactive):
         fnu = frozen_quantity(fnu * FNU, FNU, "fnu")
         wanted = f"of the shape of 'wave', two points or more ({wave.shape})"
         check_that(wave.size >= 2 and wave.shape == fnu.shape, "fnu", wanted, fnu.shape)
-        if np.any(np.diff(wave.value) <= 0) or wave.value[0] <= 0:
-            raise argument_error("wave", "positive and strictly ascending", "something else")
+        good = is_ascending(wave.value) and wave.value[0] > 0
+        check_that(good, "wave", "positive and strictly ascending", "something else")
         check_that(0 <= self.redshift < np.inf, "redshift", ">= 0", self.redshift)
         self.__dict__.update(wave=wave, fnu=fnu, redshift=float(self.redshift))
         self.__dict__.update(meta=dict(self.meta), components=dict(self.components))

@@ -14,13 +14,13 @@ from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import SED
 from miricigale.sed.stated_units import stated_units
 from miricigale.utils.curve_columns import unit_of_fluxes, unit_of_wavelengths
-from miricigale.utils.exceptions import ModelWarning, argument_error, data_error, file_errors, warn
+from miricigale.utils.exceptions import ModelWarning, data_error, file_errors, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats, plain_floats
 from miricigale.utils.options import check_choice, check_data, check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_table
-from miricigale.utils.units import FNU, WAVE
+from miricigale.utils.units import FNU, WAVE, is_ascending
 
 _SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii", ".spec")
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
@@ -197,8 +197,8 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
         z = np.zeros(1)
     else:
         z = np.atleast_1d(floats(redshift))
-    if z.ndim != 1 or not (np.all(np.diff(z) > 0) and z[0] >= 0 and np.isfinite(z[-1])):
-        raise argument_error("redshift", "finite, ascending and >= 0", f"{redshift}")
+    good = is_ascending(z) and z[0] >= 0 and np.isfinite(z[-1])
+    check_that(good, "redshift", "finite, ascending and >= 0", redshift)
     if redshift is None:
         flux = np.array([[_fluxes(name, sed, filters) for name, sed in seds.items()]])
     else:

@@ -12,8 +12,9 @@ from miricigale.sed.grid_spectra import row_values
 from miricigale.sed.spectrum import distance
 from miricigale.sed.xray import check_band
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
-from miricigale.utils.units import positive, to_array
+from miricigale.utils.units import is_ascending, positive, to_array
 from miricigale.utils.values import value_class
 
 #: Slopes between 2500 A and 2 keV, the values of X-CIGALE.
@@ -168,8 +169,7 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
         got = f"{grid.galaxy_shape.colnames} and {grid.agn_parameters.colnames}"
         raise argument_error("grid", "one of a model with ages, and without X-rays yet", got)
     slopes = to_array(alpha_ox, u.dimensionless_unscaled, "alpha_ox", ndim=1, finite=True)
-    if slopes.size == 0 or np.any(np.diff(slopes) <= 0):
-        raise argument_error("alpha_ox", "ascending values", f"{slopes}")
+    check_that(is_ascending(slopes), "alpha_ox", "ascending values", slopes)
     xrays = XRays(**options)
     z = grid.redshift
     far = distance(grid.redshift, model.cosmology)

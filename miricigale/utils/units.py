@@ -258,6 +258,16 @@ def is_number(value, kind=np.number):
     return array.ndim == 0 and np.issubdtype(array.dtype, kind)
 
 
+def is_ascending(values, least=1):
+    """Whether an array has one dimension and ``least`` values or more, each above the one before; NaN is not."""
+    return values.ndim == 1 and values.size >= least and bool(np.all(np.diff(values) > 0))
+
+
+def are_not_negative(values):
+    """Whether all values of an array are finite, and 0 or more."""
+    return bool(np.all(np.isfinite(values) & (values >= 0)))
+
+
 def check_count(value, name, least=1):
     """Return an integer after checking that it is one, not below ``least`` (a `ValueError`)."""
     good = is_number(value, np.integer) and value >= least

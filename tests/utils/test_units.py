@@ -6,7 +6,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
-from miricigale.utils.units import flux_unit, frozen_array, frozen_quantity, scalar, to_array
+from miricigale.utils.units import (
+    are_not_negative,
+    flux_unit,
+    frozen_array,
+    frozen_quantity,
+    is_ascending,
+    scalar,
+    to_array,
+)
 
 
 def test_converts():
@@ -89,3 +97,20 @@ def test_complex_numbers_and_units_of_numbers_without_one_are_refused():
     refuses("'redshift' must be real numbers, got complex", to_array, [1j], u.one, "redshift")
     message = "'redshift' must be convertible to a number without a unit, got km / s"
     refuses(message, to_array, [1] * u.km / u.s, u.one, "redshift", error=u.UnitsError)
+
+
+@pytest.mark.parametrize("values", [[1.0, 2.0], [-1.0, 0.0, np.inf]])
+def test_ascending(values):
+    assert is_ascending(np.array(values), least=2)
+    assert not is_ascending(np.array(values), least=4)
+
+
+@pytest.mark.parametrize("values", [[], [1.0, 1.0], [2.0, 1.0], [1.0, np.nan], [[1.0, 2.0]]])
+def test_not_ascending(values):
+    assert not is_ascending(np.array(values))
+
+
+def test_not_negative():
+    assert are_not_negative(np.array([[0.0, 1.0], [2.0, 3.0]]))
+    for value in (-1.0, np.nan, np.inf):
+        assert not are_not_negative(np.array([1.0, value]))

@@ -5,12 +5,12 @@ import numpy as np
 from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.results.percentile_columns import LEVELS
 from miricigale.fitting.results.table_columns import ODDS
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import places
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_table
+from miricigale.utils.units import are_not_negative
 
 #: Names of the percentiles of a class, and what the columns of a redshift are.
 _PERCENTILES = ("p16", "p50", "p84")
@@ -211,6 +211,6 @@ def _prior(prior, names, n):
     check_that(set(prior) == set(names), "prior", f"of the classes {names}", sorted(prior))
     # one share for all objects, or one for each
     weight = np.array([np.broadcast_to(floats(prior[name]), (n,)) for name in names])
-    if not np.all(np.isfinite(weight) & (weight >= 0)) or not np.all(weight.sum(axis=0) > 0):
-        raise argument_error("prior", "finite, >= 0 and not all 0", f"{prior}")
+    good = are_not_negative(weight) and np.all(weight.sum(axis=0) > 0)
+    check_that(good, "prior", "finite, >= 0 and not all 0", prior)
     return weight

@@ -7,7 +7,8 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
-from miricigale.utils.units import LUMINOSITY
+from miricigale.utils.options import check_that
+from miricigale.utils.units import LUMINOSITY, is_ascending
 
 #: Log10 of luminosities in erg/s that edges may have: from below that of the Sun to above that of all galaxies.
 _LOG_LUMINOSITY = (30.0, 60.0)
@@ -55,23 +56,21 @@ class AGNBins:
         min_edges = {"redshift": 2, "log_luminosity": 1, "frac_agn": 2}
         for name, n_least in min_edges.items():
             wanted = f"{n_least} or more ascending edges"
+            value = getattr(self, name)
             try:
-                edges = floats(getattr(self, name))
+                edges = floats(value)
             except (TypeError, ValueError):
-                raise argument_error(name, wanted, repr(getattr(self, name))) from None
-            if edges.ndim != 1 or edges.size < n_least or not np.all(np.diff(edges) > 0):
-                raise argument_error(name, wanted, f"{getattr(self, name)}")
-            if not np.all(np.isfinite(edges)):
-                raise argument_error(name, "finite edges", f"{getattr(self, name)}")
+                raise argument_error(name, wanted, repr(value)) from None
+            check_that(is_ascending(edges, n_least), name, wanted, value)
+            check_that(np.all(np.isfinite(edges)), name, "finite edges", value)
             object.__setattr__(self, name, tuple(edges.tolist()))
-        if self.redshift[0] < 0:
-            raise argument_error("redshift", "edges of 0 or more", f"{self.redshift}")
+        check_that(self.redshift[0] >= 0, "redshift", "edges of 0 or more", self.redshift)
         low, high = _LOG_LUMINOSITY
         if self.log_luminosity[0] < low or self.log_luminosity[-1] > high:
             wanted = f"log10 of luminosities in erg/s, from {low:g} to {high:g}"
             raise argument_error("log_luminosity", wanted, f"{self.log_luminosity}")
-        if self.frac_agn[0] != 0 or self.frac_agn[-1] != 1:
-            raise argument_error("frac_agn", "edges from 0 to 1", f"{self.frac_agn}")
+        good = self.frac_agn[0] == 0 and self.frac_agn[-1] == 1
+        check_that(good, "frac_agn", "edges from 0 to 1", self.frac_agn)
 
     @property
     def shape(self):

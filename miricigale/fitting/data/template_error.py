@@ -6,11 +6,10 @@ from astropy.utils.decorators import deprecated
 
 from miricigale.filters import FilterSet
 from miricigale.refdata import locate
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
-from miricigale.utils.options import check_kind
+from miricigale.utils.options import check_kind, check_that
 from miricigale.utils.table_files import read_table
-from miricigale.utils.units import WAVE, frozen_array, to_array
+from miricigale.utils.units import WAVE, are_not_negative, frozen_array, is_ascending, to_array
 from miricigale.utils.values import value_class
 
 
@@ -54,10 +53,10 @@ class TemplateError:
     def __post_init__(self):
         wave = to_array(self.wave, WAVE, "wave", ndim=1)
         error = floats(self.error)
-        if wave.size == 0 or not (wave[0] > 0 and np.all(np.diff(wave) > 0)):
-            raise argument_error("wave", "ascending values above 0", f"{wave}")
-        if error.shape != wave.shape or not np.all(np.isfinite(error) & (error >= 0)):
-            raise argument_error("error", f"{wave.size} finite values, 0 or more", f"{error}")
+        good = is_ascending(wave) and wave[0] > 0
+        check_that(good, "wave", "ascending values above 0", wave)
+        good = error.shape == wave.shape and are_not_negative(error)
+        check_that(good, "error", f"{wave.size} finite values, 0 or more", error)
         self.__dict__.update(wave=frozen_array(wave) * WAVE, error=frozen_array(error))
 
     def __call__(self, wave):

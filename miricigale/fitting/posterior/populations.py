@@ -12,7 +12,7 @@ from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
-from miricigale.utils.units import MASS, is_number, to_array
+from miricigale.utils.units import MASS, are_not_negative, is_ascending, is_number, to_array
 from miricigale.utils.values import value_class
 
 #: Part of the galaxies whose specific accretion rate lambda is above 0.01.
@@ -57,8 +57,8 @@ def agn_fraction_prior(frac_agn):
     array([0.9247, 0.0497, 0.017 , 0.0073, 0.0013])
     """
     frac = floats(frac_agn)
-    if frac.ndim != 1 or frac.size < 2 or frac[0] != 0 or not np.all(np.diff(frac) > 0):
-        raise argument_error("frac_agn", "ascending values from 0", f"{frac_agn}")
+    good = is_ascending(frac, least=2) and frac[0] == 0
+    check_that(good, "frac_agn", "ascending values from 0", frac_agn)
     edges = cell_edges(frac, (0.0, 1.0))[1:-1]
     log = np.linspace(-2.0, 2.0, 4001)
     # number for each dex of lambda, and the part of it above each lambda
@@ -103,8 +103,8 @@ def red_dot_prior(redshift):
     array([0.01, 0.38, 0.43, 0.15, 0.03])
     """
     z = floats(redshift)
-    if z.ndim != 1 or z.size < 2 or not (z[0] >= 0 and np.all(np.diff(z) > 0)):
-        raise argument_error("redshift", "two or more, ascending from 0 or more", f"{redshift}")
+    good = is_ascending(z, least=2) and z[0] >= 0
+    check_that(good, "redshift", "two or more, ascending from 0 or more", redshift)
     deviation = (np.log1p(z) - np.log1p(_RED_DOT_REDSHIFT)) / _RED_DOT_WIDTH
     # density in ln(1 + z) times the widths of the cells
     weights = np.exp(-0.5 * deviation**2) * np.diff(cell_edges(np.log1p(z)))
@@ -172,8 +172,8 @@ class MassPrior:
         mass = 10.0 ** (np.arange(cls.last * cls.per_dex + 1) / cls.per_dex)
         density = mass_function(mass * MASS, redshift[:, None])
         density = to_array(density, u.dimensionless_unscaled, "mass_function")
-        if not np.all(np.isfinite(density) & (density >= 0)):
-            raise argument_error("mass_function", "densities of 0 or more and finite", "others")
+        wanted = "densities of 0 or more and finite"
+        check_that(are_not_negative(density), "mass_function", wanted, "others")
         if redshift.size > 1:
             cells = np.diff(cell_edges(redshift, (0.0, np.inf)))
         else:

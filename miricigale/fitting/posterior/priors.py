@@ -15,7 +15,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats, own_mask, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
 from miricigale.utils.random import stream
-from miricigale.utils.units import to_array
+from miricigale.utils.units import are_not_negative, is_ascending, to_array
 from miricigale.utils.values import value_class
 
 #: Power of the redshift in `magnitude_prior`.
@@ -262,8 +262,8 @@ def _axis(name, values, unit, kind, priors, bounds):
         weights = to_array(prior, u.dimensionless_unscaled, argument)
     wanted = f"{values.size} weights, for {name} = {values}"
     check_that(weights.shape == values.shape, argument, wanted, f"shape {weights.shape}")
-    if not np.all(np.isfinite(weights) & (weights >= 0)) or not weights.sum() > 0:
-        raise argument_error(argument, "finite, >= 0 and not all 0", f"{weights}")
+    good = are_not_negative(weights) and weights.sum() > 0
+    check_that(good, argument, "finite, >= 0 and not all 0", weights)
     return GridAxis(name, values, unit, kind, weights / weights.sum(), None, bounds)
 
 
@@ -414,8 +414,8 @@ def read_density(redshift_prior, n):
     if nodes.ndim != 1 or nodes.size < 2 or density.shape not in (nodes.shape, (n, nodes.size)):
         shapes = f"shapes {nodes.shape} and {density.shape}"
         raise argument_error("redshift_prior", wanted, shapes)
-    if not np.all(np.diff(nodes) > 0) or not nodes[0] >= 0:
-        raise argument_error("redshift_prior[0]", ">= 0 and ascending", f"{nodes}")
+    good = is_ascending(nodes) and nodes[0] >= 0
+    check_that(good, "redshift_prior[0]", ">= 0 and ascending", nodes)
     if np.any(density < 0) or np.any(np.isinf(density)):
         raise argument_error("redshift_prior[1]", "finite and not negative", "others")
     return nodes, density

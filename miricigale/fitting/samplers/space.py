@@ -12,6 +12,7 @@ from miricigale.fitting.posterior.priors import integrals_to, known_redshifts, r
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.units import are_not_negative
 from miricigale.utils.values import value_class
 
 #: Part of a prior without limits that may lie outside the cells of its axis.
@@ -242,8 +243,8 @@ def _choice(argument, values, weights, parameter):
     weights = floats(weights)
     text = f"a weight for each of {len(values)} values"
     check_that(weights.shape == (len(values),), argument, text, f"shape {weights.shape}")
-    if not (np.all(np.isfinite(weights) & (weights >= 0)) and weights.sum() > 0):
-        raise argument_error(argument, "weights that are finite, >= 0 and not all 0", f"{weights}")
+    good = are_not_negative(weights) and weights.sum() > 0
+    check_that(good, argument, "weights that are finite, >= 0 and not all 0", weights)
     # values ascend, as nodes of an axis do
     order = np.argsort(values)
     values = np.array(values)[order]

@@ -22,7 +22,7 @@ from miricigale.utils.named_values import places
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_columns, require_columns
-from miricigale.utils.units import FNU, WAVE, to_array
+from miricigale.utils.units import FNU, WAVE, is_ascending, to_array
 
 _COLUMNS = declared("miricigale.fitting", "columns.toml")["zero_points"]
 #: Fluxes of lower S/N say more of their noise than of the models.
@@ -203,9 +203,9 @@ def measure_template_error(results, *, model_error=0.0, edges=None):
     if edges is None:
         edges = _EDGES * WAVE
     edges = to_array(edges, WAVE, "edges", ndim=1)
-    # comparisons with NaN are false: a bin with such an edge is refused too
-    increasing = edges.size > 1 and np.all(np.diff(edges) > 0)
-    check_that(increasing, "edges", "two wavelengths or more that increase", edges)
+    check_that(
+        is_ascending(edges, least=2), "edges", "two wavelengths or more that increase", edges
+    )
     band_error = per_band(model_error, results.filters, "model_error")
     flux, error, _, good = _residuals(results)
     # errors of bands are part of those that models leave unexplained

@@ -12,7 +12,7 @@ from photutils.segmentation import SegmentationImage, make_2dgaussian_kernel
 from miricigale.photometry.detection.segments import dilate_segments, dilation_rule
 from miricigale.photometry.images.arrays import image_arrays, pixel_scale
 from miricigale.photometry.images.mosaics import as_mosaic
-from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
+from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names, check_positive, check_that
@@ -20,7 +20,7 @@ from miricigale.utils.package_tables import declared
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
 from miricigale.utils.tables import Flags, described_columns
-from miricigale.utils.units import ANGLE, FNU, positive
+from miricigale.utils.units import ANGLE, FNU, is_ascending, positive
 
 
 class DetectionFlags(Flags):
@@ -295,8 +295,8 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
             low = min(negative.min(), positive.min(initial=np.inf))
             snr_edges = np.append(np.linspace(low, max(top, low + 1e-6), 11), np.inf)
     edges = floats(snr_edges)
-    if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
-        raise argument_error("snr_edges", "two numbers or more that ascend", snr_edges)
+    good = is_ascending(edges, least=2)
+    check_that(good, "snr_edges", "two numbers or more that ascend", snr_edges)
     n_positive, _ = np.histogram(positive, edges)
     n_negative, _ = np.histogram(negative, edges)
     n_low, n_high = poisson_conf_interval(n_negative, interval="frequentist-confidence")

@@ -8,7 +8,8 @@ from photutils.segmentation import SegmentationImage
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_that
+from miricigale.utils.units import is_ascending
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +54,8 @@ class DilationRule:
     def __post_init__(self):
         areas = np.atleast_1d(floats(self.areas))
         factors = np.atleast_1d(floats(self.factors))
-        if areas.ndim != 1 or np.any(areas <= 0) or np.any(np.diff(areas) <= 0):
-            raise argument_error("areas", "positive and ascending", self.areas)
+        good = is_ascending(areas) and areas[0] > 0
+        check_that(good, "areas", "positive and ascending", self.areas)
         if factors.shape != areas.shape or not np.all(factors >= 1):
             wanted = f"{len(areas)} numbers of at least 1, one for each area"
             raise argument_error("factors", wanted, self.factors)

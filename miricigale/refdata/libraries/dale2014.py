@@ -12,6 +12,7 @@ from miricigale.refdata.tables import load_ssp
 from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.options import check_data
 from miricigale.utils.package_tables import declared
+from miricigale.utils.units import is_ascending
 
 SPECTRA = "spectra.0.00AGN.dat"
 CALIBRATION = "dhcal.dat"
@@ -149,14 +150,14 @@ def _read_spectra(data, place):
     problem = f"must have {N_WAVE} rows, got {wave.size}: truncated or another version"
     check_data(wave.size == N_WAVE, place, problem)
     problem = "must have ascending wavelengths in um, from 1 or less to 1000 or more"
-    check_data(np.all(np.diff(wave) > 0) and wave[0] <= 1.0 and wave[-1] >= 1e3, place, problem)
+    check_data(is_ascending(wave) and wave[0] <= 1.0 and wave[-1] >= 1e3, place, problem)
     return wave, table[:, 1:]
 
 
 def _read_stars(data, place):
     wave, light, _, _ = _numbers(data, place, 4, "wavelength in A and starlight in W/A").T
     wave = wave / 1e4
-    if not np.all(np.diff(wave) > 0) or wave[0] > 1.0 or wave[-1] < 5.0 or np.any(light < 0):
+    if not is_ascending(wave) or wave[0] > 1.0 or wave[-1] < 5.0 or np.any(light < 0):
         problem = "must hold starlight, not negative, at ascending wavelengths from 1 to 5 um"
         raise data_error(place, problem)
     return wave, light

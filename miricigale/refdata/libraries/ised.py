@@ -19,6 +19,7 @@ import numpy as np
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import unpacked_size
 from miricigale.utils.package_tables import declared
+from miricigale.utils.units import is_ascending
 from miricigale.utils.values import value_class
 
 #: Quantities after the spectra, in their order.
@@ -110,7 +111,7 @@ def read_ised(path):
         source = _Records(data, order, path)
     out = _content(source)
     for name, array in (("ages", out.age), ("wavelengths", out.wave)):
-        if array.size < 2 or not np.all(np.diff(array) > 0) or array[0] < 0:
+        if not is_ascending(array, least=2) or array[0] < 0:
             raise _foreign(path, f"{name} must be positive and ascending")
     for name, array in (("spectra", out.spectra), *out.quantities.items()):
         if not np.all(np.isfinite(array)):

@@ -16,7 +16,7 @@ from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_data
 from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table
-from miricigale.utils.units import to_array
+from miricigale.utils.units import is_ascending, to_array
 
 #: Values of the whole library: 19,200 spectra.
 SKIRTOR_AXES = declared("miricigale.refdata.libraries", "formats.toml")["skirtor"]
@@ -188,8 +188,9 @@ def _check_numbers(table, source):
 
 def _check_wave(wave, source):
     """SKIRTOR has 132 wavelengths from 0.001 to 1000 um."""
-    ascending = np.all(np.diff(wave) > 0.0)
-    if not (ascending and np.isclose(wave[0], 1e-3, 1e-3) and np.isclose(wave[-1], 1e3, 1e-3)):
+    if not (
+        is_ascending(wave) and np.isclose(wave[0], 1e-3, 1e-3) and np.isclose(wave[-1], 1e3, 1e-3)
+    ):
         got = f"{wave[0]:g} to {wave[-1]:g}"
         raise data_error(source, f"must have wavelengths from 0.001 to 1000 um, got {got}")
 

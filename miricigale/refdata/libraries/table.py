@@ -14,7 +14,7 @@ from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.named_values import convert_values, subset
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.store import open_parts, write_parts
-from miricigale.utils.units import WAVE, frozen_array, to_array
+from miricigale.utils.units import WAVE, frozen_array, is_ascending, to_array
 from miricigale.utils.values import value_class
 
 #: Layout of files.
@@ -72,10 +72,9 @@ class LibraryTable:
         else:
             wave = self.wave
         wave = self.__dict__["wave"] = frozen_array(wave)
-        good = wave.ndim == 1 and wave.size > 1 and np.all(np.isfinite(wave)) and wave[0] > 0
-        if not good or not np.all(np.diff(wave) > 0):
-            got = f"{wave.size} of shape {wave.shape}"
-            raise argument_error("wave", "two or more positive, ascending wavelengths", got)
+        good = is_ascending(wave, least=2) and wave[0] > 0 and np.isfinite(wave[-1])
+        got = f"{wave.size} of shape {wave.shape}"
+        check_that(good, "wave", "two or more positive, ascending wavelengths", got)
         self._check_names()
         n = self.n_rows
         shapes = {"axes": (n,), "values": (n,), "spectra": (n, wave.size)}

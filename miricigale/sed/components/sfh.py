@@ -13,7 +13,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import own_mask
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table
-from miricigale.utils.units import to_array
+from miricigale.utils.units import is_ascending, to_array
 
 _RATE = u.Msun / u.yr
 
@@ -254,7 +254,7 @@ def _bins(table):
     check_that("time" in table.colnames and names, "table", wanted, table.colnames)
     check_that(len(table) >= 2, "table", "of two rows or more", len(table))
     time = _column(table, "time", u.Myr)
-    check_that(np.all(np.diff(time) > 0), "time", "ascending", "times that do not ascend")
+    check_that(is_ascending(time), "time", "ascending", "times that do not ascend")
     rates = np.array([_column(table, name, _RATE) for name in names])
     for name, rate in zip(names, rates, strict=True):
         check_that(not np.any(rate < 0), name, "rates of 0 or more", f"{rate.min():g}")
