@@ -78,14 +78,13 @@ class InjectionSection(Section):
     n_trials: int = option(1, "How often sources are injected.", low=1)
 
 
-@dataclasses.dataclass(frozen=True)
 class InjectionConfig(Configuration):
     """What a run of injection depends on."""
 
     heading: ClassVar = "# miricigale inject; a record of what was asked for"
 
-    run: RunSection = dataclasses.field(default_factory=RunSection)
-    injection: InjectionSection = dataclasses.field(default_factory=InjectionSection)
+    run: RunSection
+    injection: InjectionSection
 
 
 @dataclasses.dataclass(frozen=True)

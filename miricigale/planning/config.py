@@ -250,7 +250,6 @@ class OverheadSection(Section):
     )
 
 
-@dataclasses.dataclass(frozen=True)
 class PlanConfig(Configuration):
     """
     Everything that a plan depends on; each attribute is a section of the TOML file.
@@ -306,18 +305,18 @@ class PlanConfig(Configuration):
         "fit.experiments": EarlierKey(),
     }
 
-    plan: PlanSection = dataclasses.field(default_factory=PlanSection)
-    catalog: CatalogSection = dataclasses.field(default_factory=CatalogSection)
-    sample: SampleSection = dataclasses.field(default_factory=SampleSection)
+    plan: PlanSection
+    catalog: CatalogSection
+    sample: SampleSection
     # dust that the models of the fit have, as in the presets of runs
-    sed: SedSection = dataclasses.field(default_factory=SedSection)
-    agn: AgnSection = dataclasses.field(default_factory=AgnSection)
-    exposures: ExposureSection = dataclasses.field(default_factory=ExposureSection)
-    background: BackgroundSection = dataclasses.field(default_factory=BackgroundSection)
-    noise: NoiseSection = dataclasses.field(default_factory=NoiseSection)
+    sed: SedSection
+    agn: AgnSection
+    exposures: ExposureSection
+    background: BackgroundSection
+    noise: NoiseSection
     fit: FitBasics = dataclasses.field(default_factory=lambda: FitBasics(min_detected=1))
-    survey: SurveySection = dataclasses.field(default_factory=SurveySection)
-    overheads: OverheadSection = dataclasses.field(default_factory=OverheadSection)
+    survey: SurveySection
+    overheads: OverheadSection
 
     def __post_init__(self):
         exposures = self.exposures

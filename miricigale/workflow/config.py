@@ -1,6 +1,5 @@
 """Typed run configuration: frozen dataclasses from TOML, strict about every key."""
 
-import dataclasses
 from importlib import resources
 from typing import ClassVar
 
@@ -33,7 +32,6 @@ from miricigale.workflow.sections import (
 from miricigale.workflow.truths import ALL, CUTOUTS, NEEDS_AGN, perturbed_values
 
 
-@dataclasses.dataclass(frozen=True)
 class StudyConfig(Configuration):
     """
     Everything that a run depends on.
@@ -65,23 +63,23 @@ class StudyConfig(Configuration):
         ),
     }
 
-    run: RunSection = dataclasses.field(default_factory=RunSection)
-    catalog: CatalogSection = dataclasses.field(default_factory=CatalogSection)
-    pointing: PointingSection = dataclasses.field(default_factory=PointingSection)
-    sed: SedSection = dataclasses.field(default_factory=SedSection)
-    exposures: ExposureSection = dataclasses.field(default_factory=ExposureSection)
-    scene: SceneSection = dataclasses.field(default_factory=SceneSection)
-    highres: HighresSection = dataclasses.field(default_factory=HighresSection)
-    detector: DetectorSection = dataclasses.field(default_factory=DetectorSection)
-    reduction: ReductionSection = dataclasses.field(default_factory=ReductionSection)
-    patches: PatchesSection = dataclasses.field(default_factory=PatchesSection)
-    photometry: PhotometrySection = dataclasses.field(default_factory=PhotometrySection)
-    errors: ErrorSection = dataclasses.field(default_factory=ErrorSection)
-    fit: FitSection = dataclasses.field(default_factory=FitSection)
-    point_sources: PointSourceSection = dataclasses.field(default_factory=PointSourceSection)
-    perturb: PerturbSection = dataclasses.field(default_factory=PerturbSection)
-    variants: VariantSection = dataclasses.field(default_factory=VariantSection)
-    report: ReportSection = dataclasses.field(default_factory=ReportSection)
+    run: RunSection
+    catalog: CatalogSection
+    pointing: PointingSection
+    sed: SedSection
+    exposures: ExposureSection
+    scene: SceneSection
+    highres: HighresSection
+    detector: DetectorSection
+    reduction: ReductionSection
+    patches: PatchesSection
+    photometry: PhotometrySection
+    errors: ErrorSection
+    fit: FitSection
+    point_sources: PointSourceSection
+    perturb: PerturbSection
+    variants: VariantSection
+    report: ReportSection
 
     def __post_init__(self):
         self._check_exposures()

@@ -150,7 +150,7 @@ def read_setting(text):
 
 class Configuration:
     """
-    Base of a configuration: a frozen dataclass whose fields are sections (`Section`).
+    Base of a configuration: a frozen dataclass whose fields are sections (`Section`), by default as they are made.
 
     Attributes
     ----------
@@ -162,6 +162,12 @@ class Configuration:
 
     heading: typing.ClassVar[str]
     earlier: typing.ClassVar[dict] = {}
+
+    def __init_subclass__(cls):
+        for name, kind in inspect.get_annotations(cls).items():
+            if isinstance(kind, type) and not hasattr(cls, name):
+                setattr(cls, name, dataclasses.field(default_factory=kind))
+        dataclasses.dataclass(frozen=True)(cls)
 
     def check(self, good, name, wanted, got=None):
         """Refuse a key ``section.key`` that does not agree with others; its value came, if not ``got``."""

@@ -79,15 +79,14 @@ class PatchSection(Section):
     )
 
 
-@dataclasses.dataclass(frozen=True)
 class PatchConfig(Configuration):
     """Everything that a run in patches depends on."""
 
     heading: ClassVar = "# miricigale photometry in patches; a record of what was asked for"
 
-    run: RunSection = dataclasses.field(default_factory=RunSection)
-    files: FilesSection = dataclasses.field(default_factory=FilesSection)
-    patches: PatchSection = dataclasses.field(default_factory=PatchSection)
+    run: RunSection
+    files: FilesSection
+    patches: PatchSection
 
 
 @cached(maxsize=4)
