@@ -135,3 +135,11 @@ def test_supported_versions_of_python_are_tested():
     first, last = classified[0], classified[-1]
     for name in ("README.rst", "docs/install.rst", "docs/developers/contributing.rst"):
         assert f"Python {first} to {last}" in (ROOT / name).read_text(encoding="utf-8"), name
+
+
+def test_commands_that_run_everything_name_folders_by_their_paths():
+    # with --pyargs a bare name is that of an installed package, if there is one: gwcs installs its own "docs"
+    for name in ("README.rst", "docs/developers/contributing.rst"):
+        text = (ROOT / name).read_text(encoding="utf-8")
+        folders = re.findall(r"-n 2 --pyargs miricigale ([\w./ ]+\w)", text)
+        assert folders == ["./tests ./docs"], name
