@@ -271,7 +271,9 @@ class Copy:
 
     def __init__(self, place):
         self.root = Path(place) / "copy"
-        skipped = shutil.ignore_patterns(".git", ".venv", "_build", "*.log", "__pycache__", "build")
+        skipped = shutil.ignore_patterns(
+            ".git", ".tmp", ".venv", "_build", "*.log", "*.pyc", "build"
+        )
         shutil.copytree(ROOT, self.root, ignore=skipped)
         (self.root / "mutate_order.py").write_text(ORDER)
         self.kills = collections.defaultdict(collections.Counter)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
@@ -138,3 +138,25 @@ def test_calibration_finds_what_was_done_to_a_catalog(survey, tmp_path):
         table[:80],
         redshift="z_spec",
     )
+
+
+@pytest.mark.slow
+def test_errors_of_a_calibration_are_half_of_the_difference_of_its_halves(survey):
+    """Halves of the same sources have their own calibration; of other sources it is the mean, and the error."""
+    fitter, table = survey
+    fitter = fitter.replace(settings=GridSettings(interpolate=0))
+    halves = [table[:60], table[60:120]]
+
+    def calibrated(first, second):
+        catalog = vstack([halves[first], halves[second]])[np.arange(120).reshape(2, 60).T.ravel()]
+        catalog["id"] = np.arange(120)
+        return calibrate(fitter, catalog, redshift="z_spec", name="test")
+
+    both, first, second = calibrated(0, 1), calibrated(0, 0), calibrated(1, 1)
+    a, b = (one.priors["age"][1] for one in (first, second))
+    assert np.ptp(a - b) > 1e-3
+    assert_allclose(first.errors["age"], 0, atol=1e-12)
+    assert_allclose(both.priors["age"][1], (a + b) / 2, rtol=1e-9)
+    assert_allclose(both.errors["age"], np.abs(a - b) / 2, rtol=1e-9)
+    a, b = (one.bands["zero_point"] for one in (first, second))
+    assert_allclose(both.bands["zero_point_err"], np.abs(a - b) / 2, rtol=1e-9, atol=1e-12)

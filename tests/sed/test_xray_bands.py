@@ -1,5 +1,7 @@
 """X-ray bands of grids against closed forms and published luminosities."""
 
+from types import SimpleNamespace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from helpers.errors import refuses
 from helpers.grids import node_fitter, photometry_table
 from miricigale.fitting import BayesFitter
 from miricigale.sed import COSMOLOGY, SEDModel, with_xray_bands
-from miricigale.sed.xray_bands import xray_filter
+from miricigale.sed.xray_bands import disk_2500, xray_filter
 
 BANDS = {"soft": [0.5, 2] * u.keV, "hard": [2, 10] * u.keV}
 H_KEV = 4.135667696e-18  # h in keV s
@@ -72,6 +74,23 @@ def test_the_disk_at_2500_a_is_that_of_quasars(model, grid):
     nu = 299792458.0 / 0.25e-6
     # 30 deg is brighter than the mean over the sphere, 7/18 of that at 0 deg, by 1.58 / (7/6)
     assert np.all((nu * blue > 0.15) & (nu * blue < 0.5))
+
+
+def test_the_disk_at_30_deg_is_brighter_than_in_the_mean_by_its_law():
+    """L_lambda of a disk flat from 0.2 to 0.4 um that shines as cos i (1 + 2 cos i), by quadrature."""
+
+    def law(cosine):
+        return cosine * (1 + 2 * cosine)
+
+    wave = np.linspace(0.2, 0.4, 2001)
+    flat = SimpleNamespace(face_on=np.ones(wave.size))
+    agn = SimpleNamespace(torus_spectra=lambda wave, values: flat)
+    chain = SimpleNamespace(wave=wave, weights=np.gradient(wave))
+    chain.weights[[0, -1]] /= 2
+    brighter = law(np.cos(np.radians(30))) / quad(law, 0, 1)[0]
+    # a watt over 0.2 um
+    wanted = (5 * brighter * u.W / u.um).to(u.W / u.Hz, u.spectral_density(0.25 * u.um))
+    assert disk_2500(chain, agn, {}) == pytest.approx(wanted.value, rel=1e-9)
 
 
 def test_galaxies_shine_by_binaries_and_gas(model, grid):
