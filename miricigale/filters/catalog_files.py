@@ -7,6 +7,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from astropy.table import Column
 
 from miricigale.filters.catalog_map import TRANSLATE_SUFFIXES, CatalogMap
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
@@ -139,7 +140,7 @@ def catalog_messages(lost, pieces, treatment="taken as missing, by the number th
 
 def codes_of(table, bands):
     """
-    Numbers of a table that look like codes for a missing value (`miricigale.utils.missing_values`).
+    Numbers of a table that stand for no value (`miricigale.utils.missing_values`).
 
     Parameters
     ----------
@@ -169,7 +170,7 @@ def codes_of(table, bands):
             # the reader of these columns raises the error
             continue
         missing, no_error = without_codes(values, errors)
-        # zeros with zero errors, and what is beyond all measurements, are flagged object by object
+        # fits leave out, and flag, zeros with zero errors and what is beyond all measurements
         missing &= (values != 0) & (np.abs(values) < _FLAGGED)
         no_error &= np.abs(errors) < _FLAGGED
         code = np.where(missing, values, np.nan)
@@ -177,13 +178,35 @@ def codes_of(table, bands):
     return coded
 
 
-def warn_of_codes(pieces, argument):
-    """Warn of what `codes_of` found in pieces of a table, for fits that take the numbers as they are."""
-    for text in catalog_messages(
-        (), pieces, "look like numbers that stand for no value, and are fitted as they are"
-    ):
-        how = "NaN is a missing band; read_catalog_photometry, or --map, makes them so"
-        warn(f"{argument}: {text} ({how})", CatalogWarning)
+def without_codes_of(table, coded):
+    """
+    Table with missing fluxes and errors where `codes_of` found numbers for no value.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        As for `codes_of`; it stays as it is.
+    coded : dict of str to `~numpy.ndarray` of float, shape (n,)
+        What `codes_of` returned.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        Itself, if there are none; else a copy in which errors are NaN there, and fluxes that are such a number.
+    """
+    bands = [name for name, values in coded.items() if not np.isnan(values).all()]
+    if not bands:
+        return table
+    out = table.copy(copy_data=False)
+    for band in bands:
+        error = error_column(band)
+        flux = plain_floats(table[band], band, "photometry")
+        flux_err = plain_floats(table[error], error, "photometry")
+        flux_err[~np.isnan(coded[band])] = np.nan
+        flux[flux == coded[band]] = np.nan
+        for name, values in ((band, flux), (error, flux_err)):
+            out[name] = Column(values, unit=getattr(table[name], "unit", None))
+    return out
 
 
 class CountedRows:

@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters.band_names import find_filter, name_and_unit
-from miricigale.filters.catalog_files import catalog_messages
+from miricigale.filters.catalog_files import catalog_messages, codes_of, without_codes_of
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.filters.library import FILTERS
 from miricigale.utils.column_units import quantity_table, silent_units
@@ -60,8 +60,9 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     Returns
     -------
     table : `~astropy.table.Table`
-        Itself, if its columns have our names already; else a copy with fluxes by band, errors ``<band>_err``
-        and ``id`` (`miricigale.utils.ids.id_column`), which counts the rows from 1 where there is none.
+        Itself, if its columns have our names already and no number stands for no value; else a copy with fluxes
+        by band, errors ``<band>_err`` and ``id`` (`miricigale.utils.ids.id_column`), which counts the rows from 1
+        where there is none.
 
     Raises
     ------
@@ -75,8 +76,9 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     Warns
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
-        Of magnitudes such as 99 or -99, which stand for no value and become NaN; and if rows are counted though a
-        column looks like ids.
+        Of numbers that stand for no value and become NaN, by band: magnitudes such as 99 or -99, and fluxes such
+        as -99 whose error is not of its size (:doc:`/method/filters`); and if rows are counted though a column
+        looks like ids.
 
     Examples
     --------
@@ -101,7 +103,9 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
         and "id" in names
         and all(ours == name for ours, name in names.items())
     ):
-        return table
+        coded = codes_of(table, bands)
+        _warn_of_codes(coded, argument)
+        return without_codes_of(table, coded)
     back = {theirs: ours for ours, theirs in names.items()}
     with silent_units():
         out = quantity_table(table, copy=False)
@@ -111,14 +115,22 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     if "id" not in out.colnames:
         out["id"] = counted_ids(table, argument)
     catalog_map = CatalogMap(units=dict.fromkeys(magnitudes, u.ABmag) | stated_units)
-    converted = []
+    coded = {}
+    in_their_unit = []
     for name in bands:
         if name in magnitudes or {name, error_column(name)} & set(stated_units):
-            converted.append(name)
-    coded = {name: catalog_map.set_band(out, name, 1.0, argument) for name in converted}
+            coded[name] = catalog_map.set_band(out, name, 1.0, argument)
+        else:
+            in_their_unit.append(name)
+    of_their_unit = codes_of(out, in_their_unit)
+    _warn_of_codes(coded | of_their_unit, argument)
+    return without_codes_of(out, of_their_unit)
+
+
+def _warn_of_codes(coded, argument):
+    """Count the numbers that were taken as missing (as `codes_of` returns them) in a warning."""
     for text in catalog_messages((), [coded]):
         warn(f"{argument}: {text}", CatalogWarning)
-    return out
 
 
 def _stated_units(table, names, bands, units):

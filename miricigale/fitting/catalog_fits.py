@@ -5,7 +5,6 @@ import logging
 import numpy as np
 
 from miricigale.filters import as_photometry
-from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.fitting.data.likelihood import (
     FitFlags,
     PhotometryReader,
@@ -86,7 +85,6 @@ class CatalogFits(Interactive):
                 table[name] = np.full(len(table), np.nan) * FNU
                 table[error_column(name)] = np.full(len(table), np.nan) * FNU
         warn_of_duplicates(read_ids(table), "photometry")
-        warn_of_codes([codes_of(table, self._reader.fitted(table))], "photometry")
         self._warn_of_bands(table)
         return table
 

@@ -485,10 +485,10 @@ class BayesFitter(CatalogFits):
             If ``filters`` was not given and the photometry has bands (names of filters, or columns in a unit of
             flux density that have an error) that the grid lacks, or that no filter here belongs to. Bands that are
             not fitted are also in ``meta["fit"]["unused_bands"]`` of the results. A further warning counts, by
-            band, numbers that look like codes for a missing value, such as -99 or 99 with an error of 99: they are
-            missing in magnitudes and where ``unit`` is given, and fitted as they are in columns of fluxes that
-            have a unit. Another one names bands whose fluxes of S/N above 5, 30 at least, scatter about what the
-            other bands predict by more than 1.5 times their errors (`miricigale.fitting.results.pulls`).
+            band, numbers that stand for no value, such as -99, or 99 with an error of 99: they are missing bands,
+            whatever the unit and wherever it is given. Another one names bands whose fluxes of S/N above 5, 30 at
+            least, scatter about what the other bands predict by more than 1.5 times their errors
+            (`miricigale.fitting.results.pulls`).
 
         Raises
         ------

@@ -325,17 +325,43 @@ def coded(catalog):
     return table
 
 
-def test_numbers_that_look_like_codes_are_reported_before_the_fit(grid, catalog, tmp_path):
-    wanted = r": look like .* as they are: band1 2 of 6 \(-999, -99\); band2 1 of 6 \(99\)"
+def without_their_unit(table, bands):
+    """The same numbers, without units."""
+    plain = Table(table)
+    for band in bands:
+        for name in (band, f"{band}_err"):
+            plain[name] = table[name].value
+    return plain
+
+
+def test_codes_are_missing_bands_wherever_the_unit_is_given(grid, catalog, tmp_path):
+    """By the column, by ``unit``, in a file read by pieces: the fit is as with NaN, and a warning counts them."""
+    table = coded(catalog)
+    blank = table.copy()
+    for band, row in (("band1", 0), ("band1", 2), ("band2", 3)):
+        blank[f"{band}_err"][row] = np.nan
+        if row != 2:
+            blank[band][row] = np.nan
+    want = node_fitter(grid).fit(blank)
+    wanted = r": taken as missing, .*: band1 2 of 6 \(-999, -99\); band2 1 of 6 \(99\)"
     with pytest.warns(MiricigaleWarning, match=f"photometry{wanted}") as record:
-        node_fitter(grid).fit(coded(catalog))
+        by_column = node_fitter(grid).fit(table)
     assert [one.filename for one in record] == [__file__]
-    # those of a whole file are counted
+    with pytest.warns(MiricigaleWarning, match=f"photometry{wanted}"):
+        by_unit = node_fitter(grid).fit(without_their_unit(table, grid.filters), unit="uJy")
     path = tmp_path / "catalog.fits"
-    coded(catalog).write(path)
+    table.write(path)
     with pytest.warns(MiricigaleWarning, match=rf"catalog\.fits{wanted}") as record:
-        fit_file(node_fitter(grid), path, tmp_path / "out", chunk_rows=2)
+        of_file = fit_file(node_fitter(grid), path, tmp_path / "out", chunk_rows=2)
     assert len(record) == 1
+    assert table["band1"][0] == -99 * u.uJy
+    for results in (by_column, by_unit, of_file[:]):
+        assert_array_equal(results.flags, want.flags)
+        assert_array_equal(results.n_bands, want.n_bands)
+        assert_allclose(results.chi2, want.chi2, rtol=1e-12)
+        assert np.isnan(results.flux[[0, 3], [1, 2]]).all()
+        # the flux beside an error of -999 is one
+        assert np.isfinite(results.flux[2, 1])
 
 
 @pytest.mark.parametrize(

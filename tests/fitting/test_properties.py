@@ -14,10 +14,8 @@ from helpers.results import assert_same
 from miricigale.fitting import FitFlags, GridSettings
 from miricigale.fitting.posterior.quantities import DERIVED_LEVELS
 
-#: Units of 1e12 make fluxes that look like codes for missing values; a user is told so.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:photometry. look like numbers that stand for no value"
-)
+#: Units of 1e12 make fluxes beyond 1e15, which are taken as missing; a user is told so.
+pytestmark = pytest.mark.filterwarnings("ignore:photometry. taken as missing")
 
 N = 200
 SETTINGS = {

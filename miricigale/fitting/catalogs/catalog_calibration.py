@@ -394,7 +394,7 @@ def _take_rows(fitter, rows, options):
     """Return a function of the number of a piece: its table, with units, and the redshift options of `fit`."""
     redshift_options = {name: options.get(name) for name in ("redshift", "redshift_prior")}
     fluxes = set(flux_columns(fitter.bands))
-    return row_pieces(rows, redshift_options, options.get("flux_unit"), fluxes)
+    return row_pieces(rows, redshift_options, options.get("flux_unit"), fluxes, fitter.bands)
 
 
 def _bands_of_file(fitter, rows, name, options):

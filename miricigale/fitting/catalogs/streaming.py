@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from miricigale.filters.catalog_files import codes_of, warn_of_codes
+from miricigale.filters.catalog_files import catalog_messages, codes_of, without_codes_of
 from miricigale.filters.photometry_table import unit_of_fluxes
 from miricigale.fitting.catalogs.catalog_rows import give_units, open_catalog
 from miricigale.fitting.data.fitted_bands import bands_with_errors, warn_of_unfitted
@@ -117,8 +117,8 @@ def fit_file(
     Warns
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
-        What `BayesFitter.fit` warns of, once, of scatter by the first part. Numbers that look like codes for a
-        missing value are counted before anything is fitted, and with ``catalog_map`` what it takes as missing.
+        What `BayesFitter.fit` warns of, once, of scatter by the first part. Numbers that stand for no value are
+        counted in the whole file before anything is fitted.
 
     Raises
     ------
@@ -158,13 +158,14 @@ def fit_file(
     mapped = hasattr(rows, "map")
     if not mapped:
         pieces = (codes_of(rows.chunk(i), fitter.bands) for i in range(rows.n_chunks))
-        warn_of_codes(pieces, rows.path.name)
+        messages = list(catalog_messages((), pieces))
     else:
-        for text in rows.messages():
-            warn(f"{rows.path.name}: {text}", CatalogWarning)
+        messages = rows.messages()
+    for text in messages:
+        warn(f"{rows.path.name}: {text}", CatalogWarning)
     named = list(fitter.bands) + list(nucleus_columns(rows.colnames))
     fluxes = set(flux_columns(named))
-    take = row_pieces(rows, options, unit, fluxes)
+    take = row_pieces(rows, options, unit, fluxes, fitter.bands)
     kinds = set()
     for i in range(rows.n_chunks):
         with _noted(rows, i):
@@ -336,7 +337,7 @@ def _key(value):
     return value
 
 
-def row_pieces(rows, options, unit, fluxes):
+def row_pieces(rows, options, unit, fluxes, bands):
     """Return a function of the number of a piece: its table, and the arguments of `fit` for its rows."""
     redshift = options["redshift"]
     prior = options["redshift_prior"]
@@ -353,6 +354,9 @@ def row_pieces(rows, options, unit, fluxes):
 
     def take(i):
         table = rows.chunk(i)
+        if not hasattr(rows, "map"):
+            # a map has done so
+            table = without_codes_of(table, codes_of(table, bands))
         start, stop = rows.span(i)
         piece = slice(start, stop)
         give_units(table, fluxes, unit)

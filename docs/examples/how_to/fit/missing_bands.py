@@ -76,4 +76,4 @@ plt.show()
 
 # %%
 # ``BayesFitter()`` fits all bands that a catalog has. A band without a filter or an error is not fitted, with a
-# warning. In fluxes with a unit, replace codes such as -99 by NaN: :doc:`own_catalog`. See :doc:`/method/fitting`.
+# warning. Numbers such as -99 are missing bands too, and a warning counts them. See :doc:`/method/fitting`.
