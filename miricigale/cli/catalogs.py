@@ -24,8 +24,9 @@ def fit(args):
         is_parquet = args.path.suffix.lower() == ".parquet"
         table = args.output / ("table.parquet" if is_parquet else "table.fits")
         write_table(results, table, overwrite=True)
-        page = fit_page(results, **filled(args, fit_page))
-        page = page.write(args.output / "page.html", overwrite=True)
+        page_path = args.output / "page.html"
+        page = fit_page(results, **filled(args, fit_page), browser=page_path)
+        page = page.write(page_path, overwrite=True)
         if args.plots:
             from miricigale.fitting.results.object_plots import write_plots
 

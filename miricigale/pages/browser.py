@@ -2,18 +2,21 @@
 
 import json
 from importlib import resources
+from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 from markupsafe import Markup
 
 from miricigale.pages.rendering import render
+from miricigale.utils.files import replacing
 from miricigale.utils.parallel import chunks
 
 #: Sources whose details and pictures are in one file.
 CHUNK = 32
 
 
-def source_pages(save, folder, names, title, facts, order, shown, entry, sheet):
+def source_pages(save, folder, names, title, facts, order, shown, entry, sheet=None):
     """
     Write the page of sources, and the files that it loads.
 
@@ -28,15 +31,22 @@ def source_pages(save, folder, names, title, facts, order, shown, entry, sheet):
     title : str
         Of the page.
     facts : dict
-        What ``sources.js`` shows of all sources, plain values: ``table``, the columns of its table in the order of
-        the files, ``bands``, ``flags`` and so on.
+        What ``sources.js`` shows of all sources, plain values: ``table``, numbers and text by column in the order
+        of the files; ``columns`` of the list, from `list_column`; ``shows``, by name a label and the column that
+        is true of the sources (None for all); ``heading``, column, label and digits of what stands above the
+        details; ``flags``, meanings by kind; ``flag_columns``, column, kind and what the flag is of; ``bands``,
+        ``wave`` (um), ``sets`` of fits and ``notes``; and where there are any ``cutouts``, ``pdf_edges``,
+        ``parameters``, ``truths``.
     order : int `~numpy.ndarray`, shape (n,)
         Numbers of the sources in the order of the files, those with pictures first.
     shown : bool `~numpy.ndarray`, shape (n,)
         Which have pictures.
-    entry, sheet : callable
-        Details of a source, plain values, by its number; pictures of some, by their numbers: an image with a
-        strip for each (`PIL.Image.Image`), and where their stretches end.
+    entry : callable
+        Details of a source, plain values, by its number: ``flux`` and ``error`` by band, and where there are any
+        ``true``, ``upper``, ``bits`` (flags by kind and measured band), ``fits`` and ``parameters``.
+    sheet : callable, optional
+        Pictures of some, by their numbers: an image with a strip for each (`PIL.Image.Image`), and where their
+        stretches end.
     """
     for k, part in enumerate(chunks(len(order), CHUNK)):
         rows = order[part]
@@ -59,6 +69,87 @@ def source_pages(save, folder, names, title, facts, order, shown, entry, sheet):
         script=Markup(script.read_text("utf-8")),
     )
     _save_text(save, f"{folder}/{names[0]}.html", page)
+
+
+def list_column(key, label, title, *, group="", **options):
+    """
+    Describe a column of the list of sources.
+
+    Parameters
+    ----------
+    key : str
+        Of the numbers or text in the table.
+    label, title : str
+        What stands above it, and what it says under the pointer.
+    group : str, optional
+        What stands above neighbors with the same group.
+    **options
+        ``digits`` behind the point; ``text=True``; ``limit`` and ``off``, keys of the columns that say which are
+        limits and which are shown in red.
+
+    Returns
+    -------
+    column : dict
+    """
+    return {"key": key, "label": label, "title": title, "group": group, **options}
+
+
+def shown_unit(unit):
+    """Return the unit in which a parameter is shown: luminosities in that of the Sun."""
+    unit = u.Unit(unit)
+    if unit.is_equivalent(u.L_sun):
+        return u.L_sun
+    return unit
+
+
+def parameter_entries(units):
+    """Return what ``sources.js`` shows of parameters, from their units by name: list of dict."""
+    entries = []
+    for name, unit in units.items():
+        text = str(unit).replace("solMass", "M☉").replace("solLum", "L☉")
+        entries.append({"name": name, "unit": text})
+    return entries
+
+
+def cell_weights(pdf):
+    """Return weights of a posterior in thousandths: index of the first cell that is not empty, and the weights."""
+    weights = np.round(1000 * np.asarray(pdf)).astype(int)
+    filled = np.flatnonzero(weights)
+    if filled.size == 0:
+        return [0, []]
+    return [int(filled[0]), weights[filled[0] : filled[-1] + 1].tolist()]
+
+
+def image_note(layout, about):
+    """
+    Say what the pictures of a source show.
+
+    Parameters
+    ----------
+    layout : dict
+        Of `~miricigale.plotting.cutouts.Cutouts.describe`.
+    about : str
+        How they lie, and what their circle is about.
+    """
+    return (
+        f"{layout['box']} arcsec on a side, {about}; blue: other sources of the catalog; sand: no data. Mosaic, "
+        f"model and residual of a band have one stretch: asinh of the value over {layout['softening']:g} times "
+        f"the noise of a pixel (in residuals), between the limits beneath in {layout['unit']}, which are "
+        f"{layout['lowest']:g} times the noise and the brightest pixel of the model, or 10 times the noise if "
+        "that is more."
+    )
+
+
+def saver(folder):
+    """Return a function for `source_pages` that writes files into a folder, each whole or not at all."""
+
+    def save(name, write):
+        place = Path(folder) / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(place) as partial:
+            write(partial)
+
+    return save
 
 
 def _save_text(save, name, text):

@@ -66,7 +66,7 @@ def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=F
     folder : path-like
         Gets ``plan.html``, ``plan.toml``, ``comparison.ecsv``, ``areas.ecsv`` (with ``[survey] areas``),
         and ``bands-<n>.ecsv`` and ``sources-<n>.ecsv`` of each set of bands, in the order of the
-        configuration (0: the existing ones).
+        configuration (0: the existing ones); and ``plan-sources.html``, the sources one by one, with a folder.
     executor : `concurrent.futures.Executor`, optional
         Threads to fit with; the answer is the same.
     overwrite : bool, optional
@@ -100,6 +100,7 @@ def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=F
     paths += [folder / "comparison.ecsv", folder / "areas.ecsv"]
     for pattern in ("bands-[0-9]*.ecsv", "sources-[0-9]*.ecsv"):
         paths += sorted(folder.glob(pattern))
+    paths.append(folder / "plan-sources.html")
     # refused before the fits, which take minutes
     check_outputs(paths, "folder", overwrite=overwrite)
     planner = Planner(config, executor=executor)

@@ -5,7 +5,8 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 
-from miricigale.pages import Page, SectionWriter, number, sentence
+from miricigale.pages import Link, Page, SectionWriter, number, sentence
+from miricigale.planning.browser import MAX_SOURCES, write_browser
 from miricigale.planning.exposures import background_options
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, new_figure, plain_text
 from miricigale.utils.package_tables import declared
@@ -54,7 +55,10 @@ def write_page(path, planner, plans, comparison, areas=None, *, overwrite=False)
         by_name[plan.name] = plan
     shown = list(by_name.values())
     chosen = planner.common(plans)
-    page.section("fits")
+    browser = write_browser(path, f"Plan {config.plan.name}", planner, shown)
+    n_listed = min(len(planner.sources), MAX_SOURCES)
+    n_all = len(planner.sources)
+    page.section("fits", browser=Link("one by one", browser), n_listed=n_listed, n_all=n_all)
     fits = {plan.name: plan.sources[chosen] for plan in shown}
     first = chosen & (np.asarray(planner.sources.columns.get("sky", 0)) == 0)
     redshifts = {

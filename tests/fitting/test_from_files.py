@@ -13,6 +13,7 @@ from astropy.modeling.models import BlackBody
 from astropy.table import QTable, Table, vstack
 from numpy.testing import assert_allclose
 
+from helpers.browser import BROWSER, opened, read_sources
 from helpers.commands import command
 from helpers.errors import refuses
 from miricigale.cli import catalogs, main
@@ -317,6 +318,37 @@ def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_p
     written = write_plots(results, tmp_path / "plots", table["id"][:2])
     assert [unquote(path.stem) for path in written] == table["id"][:2].tolist()
     refuses("no object with the id 'x'", write_plots, results, tmp_path, ["x"], error=KeyError)
+    browser = tmp_path / "page.html"
+    page = fit_page(results, tmp_path / "cat.fits", browser=browser).to_html()
+    assert "of all objects can be looked at <a href='sources.html'>one by one</a>" in page
+    facts, entries = read_sources(tmp_path / "sources.html", tmp_path / "sources")
+    assert facts["table"]["id"] == table["id"].tolist()
+    fitted = results.to_table()
+    assert_allclose(facts["table"]["redshift"], table["z_spec"], rtol=6e-4)
+    assert_allclose(facts["table"]["z_1"], fitted["redshift_p50"], rtol=6e-4)
+    assert_allclose(facts["table"]["mass_1"], np.log10(fitted["stellar_mass_p50"].value), rtol=6e-4)
+    names = [parameter["name"] for parameter in facts["parameters"]]
+    for k, entry in enumerate(entries):
+        fit_of_page = entry["fits"]["fit"]
+        sfr = fit_of_page["moments"][names.index("sfr")]
+        assert_allclose(sfr[0], fitted["sfr_mean"][k].value, rtol=6e-4)
+        # in thousandths
+        start, weights = fit_of_page["pdf"]["redshift"]
+        pdf = results[k].pdf["redshift"][start : start + len(weights)]
+        assert_allclose(weights, 1000 * pdf, atol=0.5)
+        best = results[k].best_sed().fnu_at(facts["wave"] * u.um).value
+        ratio = 10 ** (np.array(fit_of_page["spectrum"]) / 1000) / best
+        assert_allclose(np.median(ratio), 1.0, rtol=0.01)
+    if BROWSER is not None:
+        document = opened(tmp_path / "sources.html", "?chi2=<1e9", tmp_path / "browser")
+        assert "5 of 5 sources" in document
+        assert document.count('class="truth"') == 1
+    monkeypatch.setattr("miricigale.fitting.catalogs.browser.MAX_OBJECTS", 2)
+    page = fit_page(results, tmp_path / "cat.fits", browser=browser).to_html()
+    assert "of one object in 3 can be looked at" in page
+    assert read_sources(tmp_path / "sources.html", tmp_path / "sources")[0]["table"]["id"] == (
+        table["id"][::3].tolist()
+    )
     monkeypatch.setattr("miricigale.fitting.catalogs.page._MAX_OBJECTS", 2)
     few = fit_page(results, tmp_path / "cat.fits").to_html()
     assert "numbers and figures are of one object in 3, 2 of them" in few

@@ -8,6 +8,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
+from helpers.browser import read_sources
 from helpers.cases import cases_of
 from helpers.commands import command
 from helpers.errors import refuses
@@ -264,6 +265,17 @@ def test_the_command_writes_a_page(tmp_path, capsys):
     assert set(table["plan"]) == {EXISTING, "all", "f770w"}
     assert len(QTable.read(folder / "sources-1.ecsv")) == 30
     assert load_plan(folder / "plan.toml").sample.n_sources == 30
+    # the sources one by one, with what each set finds
+    assert "30 of 30 simulated sources can be looked at <a href='plan-sources.html'>" in page
+    facts, entries = read_sources(folder / "plan-sources.html", folder / "plan-sources")
+    sources = QTable.read(folder / "sources-1.ecsv")
+    (number,) = [k for k, one in enumerate(facts["sets"]) if one["name"] == "all"]
+    assert facts["table"]["id"] == sources["id"].tolist()
+    assert np.allclose(facts["table"][f"frac_agn_{number}"], sources["frac_agn_mean"], rtol=6e-4)
+    found = np.array(facts["table"][f"found_{number}"])
+    assert np.array_equal(found, sources["selected"] & (sources["frac_agn"] >= 0.4))
+    assert len(entries) == 30
+    assert [band["name"] for band in facts["bands"] if band["miri"]] == BANDS
     # a second plan does not replace the first one, and never the file that it was made from
     page = (folder / "plan.html").read_bytes()
     arguments = ("plan", "--sources", "20", "-o", folder)

@@ -10,13 +10,14 @@ from miricigale.evaluation import photoz_metrics
 from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting import FitFlags
+from miricigale.fitting.catalogs.browser import browser_step, write_browser
 from miricigale.fitting.catalogs.catalog_rows import open_catalog
 from miricigale.fitting.catalogs.classes import classes_of, classes_section
 from miricigale.fitting.catalogs.page_numbers import fit_numbers, known_redshifts
 from miricigale.fitting.data.likelihood import unused_bands
 from miricigale.fitting.results.drawing import fitted_curves
 from miricigale.fitting.results.object_plots import draw_objects
-from miricigale.pages import Page, SectionWriter
+from miricigale.pages import Link, Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure, plain_text
 from miricigale.plotting.comparison import plot_redshifts
 from miricigale.utils.named_values import convert_values, without
@@ -42,7 +43,7 @@ _POOR_CHI2 = 10.0
 _NOTICE_SHARE = 0.1
 
 
-def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
+def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None, browser=None):
     """
     Make the page of a fitted catalog.
 
@@ -57,6 +58,9 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
         As for the fit.
     z_spec : str, optional
         Column of known redshifts to compare with; by default the first of `KNOWN_REDSHIFTS` that is there.
+    browser : path-like, optional
+        Where the page will be written: a page that shows the objects one by one is written beside it, as
+        ``sources.html`` with a folder ``sources``, and linked.
 
     Returns
     -------
@@ -105,11 +109,19 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     facts = {"n": len(numbers), "n_all": len(all_numbers), "others": non_galaxies}
     page.section("summary", text, **facts)
     _summary(page, numbers)
+    curves = fitted_curves(next(iter(results.parts())))
+    if browser is not None and len(all_numbers):
+        title = f"Fits of {Path(path).name}"
+        name = write_browser(browser, title, results, all_numbers, curves, step=step)
+        every = step * browser_step(len(all_numbers))
+        shown = "all objects"
+        if every > 1:
+            shown = f"one object in {every}"
+        page.text("browser", browser=Link("one by one", name), shown=shown)
     if columns is not None:
         classes_section(page, columns, list(classes), all_numbers["ids"])
     _redshifts(page, with_redshift, text)
     _calibration(page, measured_calibration(results))
-    curves = fitted_curves(next(iter(results.parts())))
     _goodness(page, numbers, curves)
     _physics(page, numbers)
     _examples(page, results, all_numbers, step, curves)

@@ -6,10 +6,9 @@ import numpy as np
 
 from miricigale.filters import Filter
 from miricigale.instrument.sky_axes import grid_angle
-from miricigale.pages.browser import rounded, source_pages
+from miricigale.pages.browser import image_note, list_column, rounded, saver, source_pages
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.plotting.cutouts import Cutouts
-from miricigale.utils.files import replacing
 from miricigale.utils.units import ab_magnitude
 
 #: Largest number of sources with pictures: those of the highest signal-to-noise.
@@ -52,10 +51,16 @@ def write_browser(path, title, bands, highres, confidence, detected):
     order = np.lexsort((-best, ~imaged))
     shown = np.zeros(len(first), bool)
     shown[order[:_PICTURES]] = imaged[order[:_PICTURES]]
-    columns = {"id": first.id, "ra": first.sky.ra.deg, "dec": first.sky.dec.deg}
+    table = {"id": first.id, "ra": first.sky.ra.deg, "dec": first.sky.dec.deg}
+    limited = (
+        f"magnitude, or its limit ({confidence:.3g} confidence where below {detected:g} sigma)"
+    )
+    columns = {"AB": [], "χ²": [], "S/N": []}
+    flag_columns = []
     limits = {}
     bands_of_page = []
     waves = []
+    has_magnitude = np.zeros(len(first), bool)
     for band, result in results.items():
         limits[band] = result.upper_limit(confidence)
         wave = Filter.from_name(band).pivot.value
@@ -66,25 +71,55 @@ def write_browser(path, title, bands, highres, confidence, detected):
         )
         # magnitudes of detections, limits of all others
         is_limit = ~(result.snr > detected)
+        has_magnitude |= ~is_limit
         mag = np.where(is_limit, ab_magnitude(limits[band]), ab_magnitude(result.flux))
-        columns |= {f"mag_{band}": mag, f"limit_{band}": is_limit, f"sn_{band}": result.snr}
-        columns |= {f"chi2_{band}": result.chi2, f"flags_{band}": result.flags}
+        table |= {f"mag_{band}": mag, f"limit_{band}": is_limit, f"sn_{band}": result.snr}
+        table |= {f"chi2_{band}": result.chi2, f"flags_{band}": result.flags}
+        of_limit = {"digits": 2, "limit": f"limit_{band}"}
+        columns["AB"].append(list_column(f"mag_{band}", label, limited, group="AB", **of_limit))
+        title = "template-weighted mean of (residual / sigma)²"
+        columns["χ²"].append(list_column(f"chi2_{band}", label, title, group="χ²", digits=2))
+        title = "measured flux over its error"
+        columns["S/N"].append(list_column(f"sn_{band}", label, title, group="S/N", digits=1))
+        flag_columns.append([f"flags_{band}", "photometry", label])
+    table["with_magnitude"] = has_magnitude
     # the columns in the order of the page
-    table = {}
-    for key, values in columns.items():
+    for key, values in table.items():
         digits = 9 if key in ("ra", "dec") else 4
-        table[key] = rounded(values[order], digits)
+        table[key] = rounded(np.asarray(values)[order], digits)
+    layout = pictures.describe()
+    flags_column = list_column("flags", "in words", "flags of all bands", group="flags", text=True)
     facts = {
         "turn": float(grid_angle(highres.wcs, highres.shape).to_value("deg")),
         "report": path.name,
-        "limits": f"{confidence:.3g} confidence where below {detected:g} sigma",
         "detected": detected,
         "prior": str(highres.meta.get("filter", "")),
-        "cutouts": pictures.describe(),
+        "cutouts": layout,
         "flags": {"photometry": ForcedFlags.meanings()},
+        "flag_columns": flag_columns,
         "bands": bands_of_page,
+        "sets": [],
         "wave": rounded([0.7 * min(waves), 1.4 * max(waves)]),
         "table": table,
+        "columns": [
+            list_column("id", "id", "id of the catalog"),
+            *columns["AB"],
+            *columns["χ²"],
+            *columns["S/N"],
+            flags_column,
+        ],
+        "shows": {
+            "all": ["all of the catalog", None],
+            "detected": ["with a magnitude in any band", "with_magnitude"],
+        },
+        "heading": [["ra", "RA", 6], ["dec", "Dec", 6]],
+        "notes": {
+            "pictured": f"{shown.sum()} sources have pictures, those of the highest signal-to-noise.",
+            "images": image_note(
+                layout, "along the pixels of each image; circle: 1 arcsec about the position"
+            ),
+            "spectrum": f"Arrows: upper limits, {confidence:.3g} confidence where below {detected:g} sigma.",
+        },
     }
 
     def entry(row):
@@ -96,16 +131,19 @@ def write_browser(path, title, bands, highres, confidence, detected):
             values["upper"].append(limits[band].value[row])
         for key, numbers in values.items():
             values[key] = rounded(numbers)
+        values["bits"] = {"photometry": values.pop("flags")}
         return values | {"imaged": bool(imaged[row])}
-
-    def save(file, write):
-        place = path.parent / file
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(place) as partial:
-            write(partial)
 
     names = (name, name)
     source_pages(
-        save, ".", names, title, facts, order, shown, entry, lambda k: pictures.sheet(first.sky[k])
+        saver(path.parent),
+        ".",
+        names,
+        title,
+        facts,
+        order,
+        shown,
+        entry,
+        lambda k: pictures.sheet(first.sky[k]),
     )
     return f"{name}.html"

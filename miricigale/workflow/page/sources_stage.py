@@ -7,7 +7,15 @@ from matplotlib.colors import to_hex
 from miricigale import fitting, photometry, sed
 from miricigale.evaluation import OUTLIER, AssociationFlags
 from miricigale.filters import Filter
-from miricigale.pages.browser import rounded, source_pages
+from miricigale.pages.browser import (
+    cell_weights,
+    image_note,
+    list_column,
+    parameter_entries,
+    rounded,
+    shown_unit,
+    source_pages,
+)
 from miricigale.plotting.cutouts import Cutouts
 from miricigale.sed.spectrum import cell_means
 from miricigale.utils.tables import error_column
@@ -29,6 +37,8 @@ N_WAVE = 240
 DRAWN = ("redshift", "frac_agn")
 #: What the table of sources has of each: AGN are selected by the median.
 _VALUES = {"redshift": "mean", "frac_agn": "p50"}
+#: Dashes of the lines of sets of bands.
+_DASHES = {"none": "5 3", "blue": "1.5 2", "red": "8 2 1.5 2"}
 #: The flags that the page explains, by what it calls them.
 FLAGS = {
     "selection": SampleFlags,
@@ -42,7 +52,7 @@ FLAGS = {
 @stage(
     "sources",
     "source browser",
-    version=2,
+    version=3,
     needs=("truth", "mosaics", "highres", "photometry", "matches", "fits"),
     sections=("run.name", "catalog") + KERNEL + ("photometry", "fit", "report"),
     resources=sed_resources,
@@ -71,15 +81,25 @@ def make_sources(context, name):
     shown = tables.first_of(imaged, config.report.pictures)
     # those of a file are near to each other in the page, and those without pictures come last
     order = np.argsort(~shown, kind="stable")
+    layout = cutouts.describe()
     facts = {
-        "truth": name,
+        "own": name,
         "truths": context.plan,
-        "outlier": OUTLIER,
+        "line": "truth",
         "prior": band_label(tables.prior),
-        "cutouts": cutouts.describe(),
+        "cutouts": layout,
         "flags": {kind: flags.meanings() for kind, flags in FLAGS.items()},
         **tables.describe(),
         "table": tables.columns(order),
+        "notes": {
+            "pictured": f"{shown.sum()} sources have pictures, those that were fitted first, then the brightest "
+            "([report] pictures).",
+            "images": image_note(
+                layout, "north up, east left; circle: 1 arcsec about the true position"
+            ),
+            "spectrum": f"Arrows: three times the error, where the flux is below its error. Models are means over "
+            f"{N_WAVE} cells of wavelength. Existing bands have mock fluxes for fitted sources only.",
+        },
     }
     source_pages(
         context.save,
@@ -119,7 +139,7 @@ class _Sources(StudyTables):
         parameters = []
         for parameter in fits.parameters:
             if parameter in truth.colnames:
-                unit = fits.unit(parameter)
+                unit = shown_unit(fits.unit(parameter))
                 self.units[parameter] = unit
                 # columns without a unit are in that of the parameter
                 parameters.append(u.Quantity(truth[parameter], unit, dtype=float).value)
@@ -179,6 +199,18 @@ class _Sources(StudyTables):
             digits[f"sn_{band}"] = 3
         for key in ("n_detected", "selection", "association"):
             columns[key] = matched[key]
+        selection = np.asarray(matched["selection"])
+        in_field = (selection & int(SampleFlags.OUTSIDE_FIELD)) == 0
+        columns |= {"in_field": in_field, "sample": selection == 0}
+        columns["left"] = in_field & (selection != 0)
+        z = np.asarray(truth["redshift"], float)
+        for unit in self.compared:
+            with np.errstate(invalid="ignore"):
+                columns[f"outlier_{unit}"] = (
+                    abs(columns[f"redshift_{unit}"] - z) / (1 + z) > OUTLIER
+                )
+        of_sets = [columns[f"outlier_{unit}"] for unit in self.compared]
+        columns["outlier"] = np.any(of_sets, axis=0)
         columns["condition"] = any_condition(matched, self.miri)
         for unit, fits in self.fits.items():
             columns[f"fit_{unit}"] = np.nan_to_num(self.of_sources(fits["flags"])).astype(int)
@@ -192,7 +224,8 @@ class _Sources(StudyTables):
         edges = {}
         for unit, results in self.results.items():
             color = to_hex(SET_COLORS[unit])
-            sets.append({"name": unit, "label": SET_LABELS[unit], "color": color})
+            dash = _DASHES.get(unit)
+            sets.append({"name": unit, "label": SET_LABELS[unit], "color": color, "dash": dash})
             edges[unit] = {}
             for key in DRAWN:
                 edges[unit][key] = rounded(results.first.distribution(key)[0].value)
@@ -201,14 +234,63 @@ class _Sources(StudyTables):
             band = {"name": name, "label": band_label(name), "wave": wave}
             band["miri"] = name in self.miri
             bands.append(band)
+        shows = {
+            "field": ["in the field", "in_field"],
+            "all": ["all of the catalog", None],
+            "sample": ["the sample (fitted)", "sample"],
+            "left": ["in the field, not fitted", "left"],
+        }
+        for unit in self.compared:
+            shows[f"outliers_{unit}"] = [f"outliers in z {SET_LABELS[unit]}", f"outlier_{unit}"]
+        shows["outliers"] = ["outliers in z of either", "outlier"]
+        flag_columns = [[key, key, ""] for key in ("selection", "condition", "association")]
+        heading = [["ra", "RA", 6], ["dec", "Dec", 6], ["mag", band_label(self.prior), 2]]
+        heading += [["redshift", "true z", 4], ["frac_agn", "true fracAGN", 3]]
+        for unit in self.fits:
+            flag_columns.append([f"fit_{unit}", "fit", f"fit {SET_LABELS[unit]}"])
         return {
             "sets": sets,
-            "compared": self.compared,
+            "columns": self._list_columns(),
+            "shows": shows,
+            "flag_columns": flag_columns,
+            "heading": heading,
             "bands": bands,
             "wave": rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
             "pdf_edges": edges,
-            "parameters": [{"name": key, "unit": str(unit)} for key, unit in self.units.items()],
+            "parameters": parameter_entries(self.units),
         }
+
+    def _list_columns(self):
+        """Describe the columns of the list of sources."""
+        prior = band_label(self.prior)
+        title = "true AB magnitude in the band of the prior"
+        columns = [list_column("id", "id", "id of the catalog")]
+        columns.append(list_column("mag", prior, title, digits=2))
+        for key, group, digits, value in (
+            ("redshift", "redshift", 3, "mean"),
+            ("frac_agn", "fracAGN", 2, "median"),
+        ):
+            columns.append(list_column(key, "true", "injected", group=group, digits=digits))
+            for unit in self.compared:
+                options = {"group": group, "digits": digits}
+                if key == "redshift":
+                    options["off"] = f"outlier_{unit}"
+                label = SET_LABELS[unit]
+                title = f"posterior {value}, {label}"
+                columns.append(list_column(f"{key}_{unit}", label, title, **options))
+        title = "measured flux over the error of the error function"
+        for band in self.miri:
+            key = f"sn_{band}"
+            columns.append(list_column(key, band_label(band), title, group="S/N", digits=1))
+        columns.append(list_column("n_detected", "bands", "MIRI bands above 5 sigma", group=" "))
+        for unit in self.compared:
+            options = {"group": "reduced χ²", "digits": 2}
+            columns.append(
+                list_column(f"chi2_{unit}", SET_LABELS[unit], "of the best model", **options)
+            )
+        title = "why it is not fitted, conditions, flags of the fits"
+        columns.append(list_column("flags", "in words", title, group="flags", text=True))
+        return columns
 
     def entry(self, row):
         """Return what belongs to the source in a row of the truth."""
@@ -217,8 +299,10 @@ class _Sources(StudyTables):
             "true": rounded(self.true[row]),
             "flux": rounded(self.flux[row]),
             "error": rounded(self.error[row], 3),
-            "flags": [int(self.matched[f"{band}_flags"][row]) for band in self.miri],
-            "conditions": [int(self.matched[f"{band}_condition"][row]) for band in self.miri],
+            "bits": {
+                "condition": [int(self.matched[f"{band}_condition"][row]) for band in self.miri],
+                "photometry": [int(self.matched[f"{band}_flags"][row]) for band in self.miri],
+            },
             "parameters": rounded(self.parameters[row]),
         }
         if self.sampled[row]:
@@ -238,7 +322,7 @@ class _Sources(StudyTables):
             "chi2": rounded(result.chi2),
             "n_bands": int(result.n_bands),
             "moments": moments,
-            "pdf": {name: _weights(result.pdf[name]) for name in DRAWN},
+            "pdf": {name: cell_weights(result.pdf[name]) for name in DRAWN},
         }
         if unit in self.compared:
             best = result.best_sed(self.model)
@@ -246,12 +330,3 @@ class _Sources(StudyTables):
             # thousandths of log10
             fit["spectrum"] = [round(1000 * np.log10(x)) if x > 0 else None for x in means]
         return fit
-
-
-def _weights(pdf):
-    """Return weights of a posterior in thousandths: index of the first cell that is not empty, and the weights."""
-    weights = np.round(1000 * pdf).astype(int)
-    filled = np.flatnonzero(weights)
-    if filled.size == 0:
-        return [0, []]
-    return [int(filled[0]), weights[filled[0] : filled[-1] + 1].tolist()]

@@ -1,0 +1,188 @@
+"""The fits of a catalog one by one: fluxes with the best model, posteriors, parameters and flags."""
+
+from pathlib import Path
+
+import numpy as np
+
+from miricigale.fitting.data.likelihood import FitFlags
+from miricigale.pages.browser import (
+    cell_weights,
+    list_column,
+    parameter_entries,
+    rounded,
+    saver,
+    shown_unit,
+    source_pages,
+)
+from miricigale.plotting.axes import MEASURED
+from miricigale.sed.spectrum import cell_means
+from miricigale.utils.named_values import places
+from miricigale.utils.units import FNU, WAVE
+
+#: Largest number of objects of the page, and of those whose best model is drawn.
+MAX_OBJECTS = 5000
+MAX_MODELS = 1000
+#: Parameters whose posteriors are drawn.
+_DRAWN = ("redshift", "frac_agn")
+#: Cells of the spectra, evenly spaced in the logarithm of wavelength.
+_N_WAVE = 240
+#: Reduced chi2 of a poor fit.
+_POOR_CHI2 = 10.0
+
+
+def write_browser(path, title, results, numbers, curves, *, step=1):
+    """
+    Write the page of single objects of a fitted catalog.
+
+    Parameters
+    ----------
+    path : path-like
+        Page of the catalog; this one is ``sources.html`` beside it, with a folder ``sources``.
+    title : str
+        Of the page.
+    results : `~miricigale.fitting.FitResultsFiles`
+        The fits.
+    numbers : `~astropy.table.Table`
+        Of `~miricigale.fitting.catalogs.page_numbers.fit_numbers`: of every ``step``-th object.
+    curves : `~miricigale.filters.FilterSet`
+        Bands of the results.
+    step : int, optional
+        Objects of the catalog for each of ``numbers``.
+
+    Returns
+    -------
+    name : str
+        Of the file.
+    """
+    path = Path(path)
+    chosen = np.arange(0, len(numbers), browser_step(len(numbers)))
+    objects = _Objects(results[step * chosen], numbers[chosen], curves)
+    facts = objects.describe() | {"report": path.name}
+
+    names = ("sources", "sources")
+    shown = np.zeros(len(chosen), bool)
+    source_pages(
+        saver(path.parent), ".", names, title, facts, np.arange(len(chosen)), shown, objects.entry
+    )
+    return "sources.html"
+
+
+def browser_step(n):
+    """Return the step between objects of the page, of ``n``."""
+    return max(1, -(-n // MAX_OBJECTS))
+
+
+class _Objects:
+    """What the page has of fitted objects."""
+
+    def __init__(self, fits, numbers, curves):
+        self.fits = fits
+        self.numbers = numbers
+        pivots = {curve.name: float(curve.pivot.value) for curve in curves}
+        self.names = sorted(fits.fitted_filters, key=pivots.get)
+        self.bands = places(self.names, fits.filters)
+        self.waves = [pivots[name] for name in self.names]
+        self.edges = np.geomspace(0.7 * min(self.waves), 1.4 * max(self.waves), _N_WAVE + 1)
+        self.units = {name: shown_unit(fits.unit(name)) for name in fits.parameters}
+        self.drawn = [name for name in _DRAWN if name in fits.pdf]
+
+    def describe(self):
+        """Return what all objects have in common, and the list of them."""
+        numbers = self.numbers
+        fits = self.fits
+        table = {
+            "id": np.asarray(fits.ids),
+            "chi2": numbers["chi2"],
+            "n_bands": numbers["n_bands"],
+            "fit": numbers["flags"],
+        }
+        table["fitted"] = numbers["good"]
+        table["poor"] = numbers["chi2"] > _POOR_CHI2
+        columns = [list_column("id", "id", "id of the catalog")]
+        groups = (
+            ("z", "redshift", "redshift", 3),
+            ("frac", "fracAGN", "AGN fraction", 2),
+            ("mass", "log M", "log of the stellar mass in solar masses", 2),
+        )
+        for key, label, meaning, digits in groups:
+            percentiles = np.asarray(numbers[key], float)
+            if not np.isfinite(percentiles).any():
+                continue
+            if key == "mass":
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    percentiles = np.log10(percentiles)
+            for k, level in enumerate(("16 %", "50 %", "84 %")):
+                table[f"{key}_{k}"] = percentiles[:, k]
+                title = f"{meaning}, percentile of the posterior"
+                options = {"group": label, "digits": digits}
+                columns.append(list_column(f"{key}_{k}", level, title, **options))
+        line = None
+        if np.isfinite(numbers["z_known"]).any():
+            # the posterior of the redshift has a line there
+            table["redshift"] = np.asarray(numbers["z_known"])
+            line = "known redshift"
+            title = f"column {numbers.meta['known']} of the catalog"
+            columns.append(list_column("redshift", "known z", title, digits=3))
+        title = "reduced chi2 of the best model"
+        columns.append(list_column("chi2", "χ²", title, digits=2))
+        columns.append(list_column("n_bands", "bands", "bands that were fitted"))
+        columns.append(list_column("flags", "flags", "flags of the fit", text=True))
+        edges = {name: rounded(fits.distribution(name)[0].value) for name in self.drawn}
+        bands = []
+        for name, wave in zip(self.names, rounded(self.waves), strict=True):
+            label = name.rpartition(".")[2].upper()
+            is_miri = name.startswith("miri.")
+            bands.append({"name": name, "label": label, "wave": wave, "miri": is_miri})
+        spectrum = (
+            "Arrows: upper limits, and three times the error where the flux is below its error."
+        )
+        if fits.model is not None and len(fits) > MAX_MODELS:
+            spectrum += f" The best model is drawn of the first {MAX_MODELS} objects."
+        return {
+            "table": {key: rounded(values) for key, values in table.items()},
+            "columns": columns,
+            "shows": {
+                "all": ["all objects", None],
+                "fitted": ["fitted", "fitted"],
+                "poor": [f"reduced χ² above {_POOR_CHI2:g}", "poor"],
+            },
+            "heading": [["chi2", "reduced χ²", 2], ["n_bands", "bands", 0]],
+            "flags": {"fit": FitFlags.meanings()},
+            "flag_columns": [["fit", "fit", ""]],
+            "bands": bands,
+            "sets": [{"name": "fit", "label": "fit", "color": MEASURED}],
+            "wave": rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
+            "pdf_edges": {"fit": edges},
+            "parameters": parameter_entries(self.units),
+            "line": line,
+            "notes": {"spectrum": spectrum},
+        }
+
+    def entry(self, row):
+        """Return the details of an object."""
+        result = self.fits[row]
+        flux = np.asarray(result.flux)[self.bands]
+        error = np.asarray(result.flux_err)[self.bands]
+        limit = np.asarray(result.limit)[self.bands]
+        entry = {"flux": rounded(np.where(limit, np.nan, flux)), "error": rounded(error, 3)}
+        if limit.any():
+            entry["upper"] = rounded(np.where(limit, flux, 3.0 * error))
+        if result.fitted:
+            entry["fits"] = {"fit": self._fit(result, row)}
+        return entry
+
+    def _fit(self, result, row):
+        """Return moments, posteriors and the spectrum of the best model of an object."""
+        moments = []
+        for name, unit in self.units.items():
+            mean = rounded(result.mean(name).to_value(unit))
+            moments.append([mean, rounded(result.std(name).to_value(unit))])
+        pdf = {name: cell_weights(result.pdf[name]) for name in self.drawn}
+        fit = {"moments": moments, "pdf": pdf}
+        if result.model is not None and row < MAX_MODELS:
+            best = result.best_sed()
+            wave = best.wave.to_value(WAVE)
+            means = cell_means(wave, best.fnu.to_value(FNU), np.clip(self.edges, wave[0], wave[-1]))
+            # thousandths of log10
+            fit["spectrum"] = [round(1000 * np.log10(x)) if x > 0 else None for x in means]
+        return fit
