@@ -6,7 +6,7 @@ from astropy.stats import mad_std
 from astropy.wcs.utils import proj_plane_pixel_scales
 from PIL import Image
 
-from miricigale.plotting.images import filled
+from miricigale.plotting.images import asinh_places, filled
 from miricigale.utils.parallel import chunks
 from miricigale.utils.values import value_class
 
@@ -89,9 +89,7 @@ class _Panels:
         brightest = np.nan_to_num(squares[:, len(self.planes) // 2], nan=-np.inf).max(axis=(1, 2))
         tops = np.maximum(HIGHEST * self.sigma, brightest)
         soft = SOFTENING * self.sigma
-        low = np.arcsinh(LOWEST / SOFTENING)
-        high = np.arcsinh(tops / soft)[:, None, None, None]
-        level = (np.arcsinh(squares / soft) - low) / (high - low)
+        level = asinh_places(squares, LOWEST * self.sigma, tops[:, None, None, None], soft)
         shades = np.clip(np.nan_to_num(level) * N_GRAY, 0, N_GRAY - 1).astype(np.uint8)
         return np.where(np.isfinite(squares), shades, np.uint8(N_GRAY)), tops
 

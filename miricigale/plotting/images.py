@@ -42,6 +42,37 @@ def _limits(image):
     return middle - 2 * sigma, max(high, middle + 8 * sigma)
 
 
+def asinh_places(values, low, high, softening):
+    """
+    Places of values between two limits on the one stretch of all images: asinh of the value over ``softening``.
+
+    It is linear about 0, where the noise is, and logarithmic for what is bright. The stretch of
+    `astropy.visualization.AsinhStretch` is linear about the lower limit instead, which is no value of the sky.
+
+    Parameters
+    ----------
+    values : array_like
+        Values of pixels.
+    low, high, softening : float or array_like
+        Limits, and the value at which the stretch turns over; they broadcast against the values.
+
+    Returns
+    -------
+    places : `~numpy.ndarray`
+        0 at the lower limit, 1 at the upper one.
+    """
+    start = np.arcsinh(np.divide(low, softening))
+    stop = np.arcsinh(np.divide(high, softening))
+    return (np.arcsinh(np.divide(values, softening)) - start) / (stop - start)
+
+
+def asinh_norm(low, high, softening):
+    """Return the stretch of `asinh_places` for matplotlib (`~matplotlib.colors.AsinhNorm`)."""
+    from matplotlib.colors import AsinhNorm
+
+    return AsinhNorm(softening, vmin=low, vmax=high)
+
+
 def _extent(shape, pixel_scale, center):
     """Edges in arcsec, zero in the middle of the image or at a pixel."""
     ny, nx = shape
@@ -133,7 +164,7 @@ def plot_image(
     -------
     ax : `~matplotlib.axes.Axes`
     """
-    from matplotlib.colors import AsinhNorm, Normalize
+    from matplotlib.colors import Normalize
 
     check_choice(stretch, "stretch", ("asinh", "linear"))
     ax = resolve_axes(ax)
@@ -143,7 +174,7 @@ def plot_image(
     else:
         low, high = limits
     if stretch == "asinh":
-        norm = AsinhNorm(softening or 2 * _robust(image)[1], vmin=low, vmax=high)
+        norm = asinh_norm(low, high, softening or 2 * _robust(image)[1])
     else:
         norm = Normalize(low, high)
     drawn = _draw(image, ax, pixel_scale, title, center, norm=norm, cmap=cmap)

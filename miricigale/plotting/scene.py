@@ -3,7 +3,7 @@
 import numpy as np
 
 from miricigale.plotting.axes import resolve_axes
-from miricigale.plotting.images import add_colorbar
+from miricigale.plotting.images import add_colorbar, asinh_norm
 
 
 def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
@@ -27,8 +27,6 @@ def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
     -------
     ax : `~matplotlib.axes.Axes`
     """
-    from matplotlib.colors import AsinhNorm
-
     ax = resolve_axes(ax)
     low, middle, high = np.nanpercentile(image, [2, 50, 99.9])
     width = max(middle - low, 1e-3 * (high - low), np.finfo(float).tiny)
@@ -41,7 +39,7 @@ def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
             high = high - middle
             if label:
                 label = f"{label}, minus {middle:.3g}"
-        options["norm"] = AsinhNorm(width, vmin=low, vmax=max(high, width))
+        options["norm"] = asinh_norm(low, max(high, width), width)
     drawn = ax.imshow(image, **{**options, **kwargs})
     ax.set(xlabel="x (pixel)", ylabel="y (pixel)")
     add_colorbar(drawn, label)

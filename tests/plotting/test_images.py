@@ -9,6 +9,8 @@ from helpers.errors import refuses
 from helpers.figures import line_data
 from miricigale.plotting.images import (
     add_colorbar,
+    asinh_norm,
+    asinh_places,
     color_image,
     mark_sky,
     plot_color,
@@ -171,3 +173,16 @@ def test_touching_segments_have_a_border_between_them(ax):
     lines = {tuple(map(tuple, line)) for line in ax.collections[0].get_segments()}
     assert len(lines) == 4 + 8 + 2
     assert ((2.5, 0.5), (2.5, 1.5)) in lines
+
+
+def test_all_images_have_one_stretch():
+    """Matplotlib has the same; that of astropy is linear about the lower limit, not about 0."""
+    values = np.linspace(-3.0, 40.0, 50)
+    places = asinh_places(values, -3.0, 40.0, 2.0)
+    assert_allclose(asinh_norm(-3.0, 40.0, 2.0)(values).filled(), places, atol=1e-12)
+    assert_allclose(places[[0, -1]], [0.0, 1.0], atol=1e-12)
+    # between these limits symmetric about 0
+    assert_allclose(
+        asinh_places([-1.0, 0.0, 1.0], -3.0, 3.0, 2.0),
+        0.5 + np.array([-1, 0, 1]) * (0.5 * np.arcsinh(0.5) / np.arcsinh(1.5)),
+    )
