@@ -11,7 +11,7 @@ def filters(args):
 
     table = filter_table(args.pattern)
     if len(table) == 0:
-        print(f"no filter has {args.pattern!r} in its name", file=sys.stderr)
+        print(f"no filter has {args.pattern!r} in its name, or at this wavelength", file=sys.stderr)
         return 1
     table.pprint_all()
     return 0

@@ -228,7 +228,7 @@ class Filter(Frozen, Interactive):
         Parameters
         ----------
         text : str or `~astropy.units.Quantity`
-            Part of a name, such as ``"miri"``, or a wavelength, such as ``"1.6 um"``.
+            Part of a name, such as ``"miri"``, or a wavelength, such as ``"1.6 um"`` or ``"16000 A"``.
 
         Returns
         -------
@@ -254,7 +254,10 @@ class Filter(Frozen, Interactive):
             is_wave = not isinstance(text, str) or re.match(r"\s*[\d.]+\s*[A-Za-zµ]", text)
             wave = None
             if is_wave:
-                wave = u.Quantity(text)
+                # an A alone is no ampere here
+                wave = u.Quantity(
+                    re.sub(r"([\d.]\s*)A$", r"\1AA", text) if isinstance(text, str) else text
+                )
         except (TypeError, ValueError):
             wave = None
         if wave is None:
@@ -270,12 +273,12 @@ class Filter(Frozen, Interactive):
     @classmethod
     def from_svo(cls, path, *, name=None):
         """
-        Make a filter of a file of the SVO Filter Profile Service (a VOTable); nothing is downloaded.
+        Make a filter of a file of the SVO Filter Profile Service; nothing is downloaded.
 
         Parameters
         ----------
         path : path-like
-            The file, as the service gives it.
+            The file, as the service gives it: a VOTable, or its ASCII table, whose wavelengths are in Angstrom.
         name : str, optional
             As for `read`, which does the same.
 
@@ -292,7 +295,12 @@ class Filter(Frozen, Interactive):
             # the service has most curves of the library under its own names
             problem = "is no file; nothing is downloaded: save the VOTable of http://svo2.cab.inta-csic.es/theory/fps"
             raise data_error(path, f"{problem}, or take Filter({str(path)!r}) of the library")
-        return cls.read(path, name=name)
+        unit = None
+        with Path(path).open("rb") as file:
+            if not file.read(256).lstrip().startswith(b"<"):
+                # the ASCII table does not say so
+                unit = u.AA
+        return cls.read(path, name=name, unit=unit)
 
     @property
     def min_wavelength(self):

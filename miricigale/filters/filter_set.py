@@ -202,12 +202,12 @@ class FilterSet(Interactive):
 
 def filter_table(pattern=""):
     """
-    The filters whose name holds a text.
+    The filters whose name holds a text, or that see a wavelength.
 
     Parameters
     ----------
-    pattern : str, optional
-        Part of the name; all if empty.
+    pattern : str or `~astropy.units.Quantity`, optional
+        Part of the name or a wavelength, as for `Filter.search`; all if empty.
 
     Returns
     -------
@@ -228,11 +228,7 @@ def filter_table(pattern=""):
     wfc3.f140w 1.392 0.384
     wfc3.f160w 1.537 0.268
     """
-    filters = []
-    for name in Filter.names():
-        if pattern.lower() in name:
-            filters.append(Filter.from_name(name))
-    return _table(filters)
+    return _table([Filter.from_name(name) for name in Filter.search(pattern)])
 
 
 def _table(filters):

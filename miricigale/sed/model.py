@@ -417,7 +417,7 @@ class SEDModel(Interactive):
         ValueError
             If a value is outside its bounds, or the galaxy older than the universe.
         """
-        parameters = tables.by_our_names(parameters)
+        parameters = tables.by_our_names(parameters, self._parameters, short=True)
         for name, value in parameters.items():
             if name not in self._parameters:
                 raise unknown_name("parameter", name, self._parameters)
@@ -445,7 +445,8 @@ class SEDModel(Interactive):
         Parameters
         ----------
         **parameters
-            Any of `parameters`, as quantities or numbers in their units.
+            Any of `parameters`, as quantities or numbers in their units; or parameters of CIGALE, such as
+            ``tau_main`` or ``sfh.tau_main``, whose numbers are in CIGALE's units (Myr).
 
         Returns
         -------
@@ -526,7 +527,8 @@ class SEDModel(Interactive):
                 # bands alone may stand first
                 filters, table = table, None
             check_that(table is None, "table", "left out beside parameters by name", "both")
-            for name in tables.by_our_names(parameters):
+            parameters = tables.by_our_names(parameters, self._parameters, short=True)
+            for name in parameters:
                 if name not in self._parameters:
                     raise unknown_name("parameter", name, self._parameters)
             table = tables.parameter_table(parameters)

@@ -1,6 +1,7 @@
 """Models evaluated: one as spectra, rows of parameters as band fluxes, both with derived quantities."""
 
 import difflib
+from collections import Counter
 
 import astropy.units as u
 import numpy as np
@@ -16,6 +17,7 @@ from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn
 from miricigale.utils.named_values import convert_values, rows_of
 from miricigale.utils.options import check_that
+from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
 
@@ -81,14 +83,19 @@ def _columns(model, table):
     return out
 
 
-def by_our_names(values):
+def by_our_names(values, known=(), *, short=False):
     """
     Values of parameters by our names, with the mass for its logarithm.
 
     Parameters
     ----------
     values : dict or `~astropy.table.Table`
-        By parameter. A usual name of elsewhere, such as ``z``, counts where ours is not there.
+        By parameter. A usual name of elsewhere, such as ``z``, counts where ours is not there, and one of CIGALE
+        (``sfh.tau_main``), whose numbers without a unit are in CIGALE's.
+    known : iterable of str, optional
+        Our names of the parameters that there are.
+    short : bool, optional
+        Whether CIGALE's names count without their module too (``tau_main``).
 
     Raises
     ------
@@ -96,13 +103,46 @@ def by_our_names(values):
         See `plain_mass`.
     """
     names = values.colnames if isinstance(values, Table) else list(values)
-    others = {theirs: ours for theirs, ours in _OTHER_NAMES.items() if theirs in names}
+    others = {theirs: (ours, "") for theirs, ours in _OTHER_NAMES.items()}
+    for theirs, meaning in _cigale_parameters(tuple(known), short=short).items():
+        if theirs not in known:
+            others.setdefault(theirs, meaning)
     out = values.copy()
-    for theirs, ours in others.items():
-        if ours not in names:
-            out[ours] = out[theirs]
-            del out[theirs]
+    for theirs in [name for name in names if name in others]:
+        ours, unit = others[theirs]
+        if ours in names:
+            continue
+        value = out[theirs]
+        if unit and getattr(value, "unit", None) is None:
+            value = u.Quantity(value, unit)
+        out[ours] = value
+        del out[theirs]
     return plain_mass(out)
+
+
+@cached
+def _cigale_parameters(known, *, short):
+    """Find our name and CIGALE's unit of CIGALE's parameters that are among ours: dict by CIGALE's name."""
+    tables = declared("miricigale.cigale", "names.toml")
+    meanings = {}
+    for ours, (theirs, unit) in tables["quantities"].items():
+        if ours not in known:
+            continue
+        names = [theirs]
+        for of_module in tables["modules"].values():
+            if ours in of_module:
+                names.append(of_module[ours])
+        meanings |= dict.fromkeys(names, (ours, unit))
+    if not short:
+        return meanings
+    counts = Counter(name.partition(".")[2] for name in meanings)
+    without_module = {}
+    for name, meaning in meanings.items():
+        bare = name.partition(".")[2]
+        # such as the temperature of both kinds of dust
+        if counts[bare] == 1:
+            without_module[bare] = meaning
+    return meanings | without_module
 
 
 def parameter_table(parameters):
@@ -341,7 +381,7 @@ class _Blocks:
 
 def flux_table(model, table, filters):
     """Fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
-    table = by_our_names(quantity_table(as_table(table, "table"), copy=False))
+    table = by_our_names(quantity_table(as_table(table, "table"), copy=False), model.parameters)
     _warn_of_slips(model, table.colnames)
     n = len(table)
     names = model.derived_columns()

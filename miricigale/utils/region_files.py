@@ -15,15 +15,15 @@ from miricigale.utils.units import ANGLE, positive
 COLORS = {"good": "green", "flagged": "orange", "missing": "red"}
 
 
-def region_table(path):
+def region_table(source):
     """
-    Positions of a file of regions.
+    Positions of regions.
 
     Parameters
     ----------
-    path : path-like
-        Regions of DS9 on the sky: points, circles, ellipses, boxes and annuli; regions that are taken off others
-        (with a minus) are no sources.
+    source : path-like or `~regions.Regions`
+        Regions of DS9 on the sky, of a file or as they are: points, circles, ellipses, boxes and annuli; regions
+        that are taken off others (with a minus) are no sources.
 
     Returns
     -------
@@ -39,19 +39,27 @@ def region_table(path):
         If a region has no center on the sky, or there is none.
     """
     regions = require("regions", extra="regions")
-    centers, texts, radii = [], [], []
-    for k, one in enumerate(regions.Regions.read(path, format="ds9"), 1):
-        if not one.meta.get("include", True):
+    label = source
+    if isinstance(source, regions.Regions):
+        label = "the list of regions"
+    else:
+        source = regions.Regions.read(source, format="ds9")
+    centers = []
+    texts = []
+    radii = []
+    for k, region in enumerate(source, 1):
+        if not region.meta.get("include", True):
             continue
-        center = getattr(one, "center", None)
+        center = getattr(region, "center", None)
         if not isinstance(center, SkyCoord):
-            kind = type(one).__name__
-            raise data_error(path, f"has a region (number {k}, {kind}) without a center on the sky")
+            kind = type(region).__name__
+            problem = f"has a region (number {k}, {kind}) without a center on the sky"
+            raise data_error(label, problem)
         centers.append(center.icrs)
-        texts.append(str(one.meta.get("text", "")))
-        radii.append(getattr(one, "radius", np.nan * u.arcsec).to_value(ANGLE))
+        texts.append(str(region.meta.get("text", "")))
+        radii.append(getattr(region, "radius", np.nan * u.arcsec).to_value(ANGLE))
     if not centers:
-        raise data_error(path, "has no regions")
+        raise data_error(label, "has no regions")
     ids = np.array(texts)
     if "" in texts or len(set(texts)) < len(texts):
         ids = np.arange(1, len(texts) + 1)
@@ -61,20 +69,25 @@ def region_table(path):
     return QTable({"id": ids, "ra": sky.ra, "dec": sky.dec, "radius": radii * ANGLE})
 
 
-def write_circles(table, path, *, radius, overwrite=False):
+def is_regions(data):
+    """Whether something is a list of regions of the package regions, which is not loaded for it."""
+    return type(data).__name__ == "Regions" and type(data).__module__.startswith("regions.")
+
+
+def circles(table, radius):
     """
-    Write circles about positions.
+    Make circles about positions.
 
     Parameters
     ----------
     table : `~astropy.table.Table`
         ``id``, ``sky``, and ``kind``, one of `COLORS`; rows whose position is not finite have no circle.
-    path : path-like
-        The file.
     radius : `~astropy.units.Quantity`
         Of the circles.
-    overwrite : bool, optional
-        Whether an existing file is replaced.
+
+    Returns
+    -------
+    regions : `~regions.Regions`
 
     Raises
     ------
@@ -84,12 +97,18 @@ def write_circles(table, path, *, radius, overwrite=False):
     regions = require("regions", extra="regions")
     radius = positive(radius, ANGLE, "radius") * ANGLE
     angles = sky_as_angles(table)
-    circles = []
+    out = []
     for row in angles:
         if np.isfinite(row["ra"].value) and np.isfinite(row["dec"].value):
             center = SkyCoord(row["ra"], row["dec"])
             visual = {"color": COLORS[row["kind"]]}
             meta = {"text": str(row["id"])}
-            circles.append(regions.CircleSkyRegion(center, radius, meta=meta, visual=visual))
+            out.append(regions.CircleSkyRegion(center, radius, meta=meta, visual=visual))
+    return regions.Regions(out)
+
+
+def write_circles(table, path, *, radius, overwrite=False):
+    """Write `circles` to a file, which ``overwrite`` replaces."""
+    found = circles(table, radius)
     with replacing(path, overwrite=overwrite) as partial:
-        regions.Regions(circles).write(partial, format="ds9", overwrite=True)
+        found.write(partial, format="ds9", overwrite=True)

@@ -62,8 +62,9 @@ def as_table(data, argument):
 
     Parameters
     ----------
-    data : `~astropy.table.Table`, row of one, dict, structured array, `pandas.DataFrame` or path-like
-        Columns by name; numbers in a dict are those of every row. Of a DataFrame missing values are masked (NaN in
+    data : `~astropy.table.Table`, row of one, dict, structured array, `pandas.DataFrame`, path-like or regions
+        Columns by name; numbers in a dict are those of every row. Regions are positions
+        (`miricigale.utils.region_files.region_table`). Of a DataFrame missing values are masked (NaN in
         floats), and an index that is not the count of the rows is a column (`miricigale.utils.frames`).
     argument : str
         The argument's name, for the message.
@@ -82,6 +83,8 @@ def as_table(data, argument):
     """
     from astropy.table import QTable, Row
 
+    from miricigale.utils.region_files import is_regions, region_table
+
     if isinstance(data, Table):
         return data
     if isinstance(data, Row):
@@ -90,6 +93,8 @@ def as_table(data, argument):
         from miricigale.utils.table_files import read_table
 
         return read_table(data, wanted="a table")
+    if is_regions(data):
+        return region_table(data)
     if is_frame(data):
         data = frame_columns(data, argument)
     try:

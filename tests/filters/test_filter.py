@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 from helpers.cases import cases_of
 from helpers.errors import refuses
-from miricigale.filters import Filter, FilterSet, find_filter
+from miricigale.filters import Filter, FilterSet, filter_table, find_filter
 from miricigale.utils.exceptions import DataError
 
 PIVOTS = cases_of(__file__, "pivots")
@@ -253,7 +253,8 @@ def test_filters_are_searched_by_wavelength_and_name():
         assert band(1.6 * u.um) >= 0.5 * band.throughput.max()
     pivots = [abs(Filter(name).pivot.to_value(u.um) - 1.6) for name in names]
     assert pivots == sorted(pivots)
-    assert Filter.search(16000 * u.AA) == names
+    assert Filter.search(16000 * u.AA) == Filter.search("16000 A") == names
+    assert filter_table("1.6 um")["name"].tolist() == list(names)
     assert Filter.search("f770w") == ("miri.f770w",)
     assert Filter.search("nothing") == ()
     with pytest.raises(u.UnitsError, match="'text' must be convertible to um"):
@@ -266,5 +267,10 @@ def test_a_file_of_the_svo_is_a_filter(tmp_path):
     assert Filter.from_svo(tmp_path / "a.vot", name="mine").pivot.to_value(u.um) == pytest.approx(
         band.pivot.value
     )
+    # its ASCII tables do not say that wavelengths are in Angstrom
+    rows = np.c_[band.wave.to_value(u.AA), band.throughput]
+    np.savetxt(tmp_path / "JWST_MIRI.F770W.dat", rows)
+    of_text = Filter.from_svo(tmp_path / "JWST_MIRI.F770W.dat")
+    assert of_text.pivot.to_value(u.um) == pytest.approx(band.pivot.value)
     with pytest.raises(DataError, match=r"is no file; nothing is downloaded"):
         Filter.from_svo("JWST/MIRI.F770W")

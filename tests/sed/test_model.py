@@ -212,6 +212,25 @@ def test_logarithms_of_masses_by_name_and_unit(model, filters):
     refuses("'log_mass' must be in dex", model.evaluate, log_mass=10 * u.Msun, error=u.UnitsError)
 
 
+def test_parameters_have_their_names_of_cigale_too(model, filters):
+    """Numbers without a unit are in CIGALE's, ages in Myr; columns of a table need the name with its module."""
+    wanted = model.evaluate(redshift=1.0, tau=2.0, age=3.0, frac_agn=0.2)
+    names = {"sfh.tau_main": 2000.0, "sfh.age_main": 3.0 * u.Gyr, "agn.fracAGN": 0.2}
+    for parameters in (names, {"tau_main": 2000.0, "age_main": 3000.0, "fracAGN": 0.2}):
+        assert model.evaluate(redshift=1.0, **parameters).parameters == wanted.parameters
+    refuses("no parameter 'E_BV_lines'", model.evaluate, E_BV_lines=0.3, error=KeyError)
+    rows = {"redshift": [1.0, 1.0], "tau": [1.0, 2.0]}
+    flux = model.fluxes(rows, filters)
+    theirs = {"redshift": [1.0, 1.0], "sfh.tau_main": [1000.0, 2000.0]}
+    by_keyword = model.fluxes(filters, redshift=[1.0, 1.0], tau_main=[1000.0, 2000.0])
+    for name in filters.names:
+        assert_allclose(model.fluxes(theirs, filters)[name].value, flux[name].value)
+        assert_allclose(by_keyword[name].value, flux[name].value)
+    # a magnitude in the band i is no inclination
+    rows["i"] = [22.0, 23.0]
+    assert_allclose(model.fluxes(rows, filters)[filters.names[0]], flux[filters.names[0]])
+
+
 def test_from_dict():
     parts = [{"name": "delayed", "tau": 0.3}, {"name": "bc03"}, {"name": "calzetti"}]
     model = SEDModel.from_dict({"components": [*parts, {"name": "dl07", "q_pah": 1.12}]})

@@ -19,7 +19,7 @@ from miricigale.photometry.detection.prior_catalog import read_catalog
 from miricigale.scene import check_catalog
 from miricigale.utils.exceptions import CatalogWarning
 from miricigale.utils.ids import counted_ids, id_column, ids_of_text, warn_of_duplicates
-from miricigale.utils.region_files import write_circles
+from miricigale.utils.region_files import circles, write_circles
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import as_table, read_ids, unique_ids
@@ -353,7 +353,9 @@ def test_regions_without_their_package_are_refused_in_a_sentence(tmp_path, monke
 
 
 def test_regions_are_positions(tmp_path):
-    pytest.importorskip("regions", reason="needs regions: pip install miricigale[regions]")
+    regions = pytest.importorskip(
+        "regions", reason="needs regions: pip install miricigale[regions]"
+    )
     path = tmp_path / "a.reg"
     path.write_text(REGIONS)
     table = read_table(path, wanted="a table")
@@ -370,6 +372,13 @@ def test_regions_are_positions(tmp_path):
     assert back["id"].tolist() == [3, 5]
     np.testing.assert_allclose(back["dec"].value, [-27.8, 0.0], atol=1e-8)
     assert "color=red" in path.read_text()
+    # as they are, not of a file
+    made = circles(written, 0.4 * u.arcsec)
+    assert as_table(made, "catalog")["id"].tolist() == [3, 5]
+    pixels = regions.Regions([regions.PointPixelRegion(regions.PixCoord(3, 4))])
+    refuses(
+        "the list of regions has a region .number 1", as_table, pixels, "catalog", error=OSError
+    )
     refuses("already exists", write_circles, written, path, radius=1 * u.arcsec, error=OSError)
 
 

@@ -29,7 +29,7 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed
-from miricigale.utils.region_files import write_circles
+from miricigale.utils.region_files import circles, write_circles
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, FNU, check_count, is_number, positive
 from miricigale.utils.values import value_class
@@ -440,10 +440,17 @@ class ForcedPhotometryResult(Tabular):
         ImportError
             If the package regions is not installed (``pip install miricigale[regions]``).
         """
+        write_circles(self._kinds(), path, radius=radius, overwrite=overwrite)
+
+    def to_regions(self, *, radius=0.5 * u.arcsec):
+        """Return the circles of `write_regions` as a list of the package regions (`~regions.Regions`)."""
+        return circles(self._kinds(), radius)
+
+    def _kinds(self):
+        """Tabulate ids, positions and what kind of circle each source has."""
         kind = np.where(self.flags == 0, "good", "flagged")
         kind[~np.isfinite(self.flux.value)] = "missing"
-        table = QTable({"id": self.id, "sky": self.sky, "kind": kind})
-        write_circles(table, path, radius=radius, overwrite=overwrite)
+        return QTable({"id": self.id, "sky": self.sky, "kind": kind})
 
     def match_to_catalog(self, catalog, radius=0.5 * u.arcsec):
         """
