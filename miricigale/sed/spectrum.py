@@ -6,6 +6,7 @@ from dataclasses import field
 
 import astropy.units as u
 import numpy as np
+from astropy.constants import c
 from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
 
@@ -289,6 +290,8 @@ class SED(Frozen, Interactive):
             raise argument_error("wave", span, wave)
         return np.interp(x, self.wave.value, self.fnu.value) * FNU
 
+    __call__ = fnu_at
+
     def redshifted(self, redshift, *, cosmology=COSMOLOGY):
         """
         The same source at another redshift.
@@ -340,32 +343,62 @@ class SED(Frozen, Interactive):
         flux = self.fluxes(bands)
         return np.where(flux.value > 0, flux.value, np.nan) * flux.unit << u.ABmag
 
-    def luminosity(self, *, cosmology=COSMOLOGY):
+    def luminosity(self, low=None, high=None, *, cosmology=COSMOLOGY):
         """
-        Luminosity nu L_nu at the source, at `rest_wavelength`.
+        Luminosity nu L_nu at the source, at `rest_wavelength`, or that between two rest wavelengths.
 
-        It is 4 pi times the luminosity distance (10 pc at redshift 0) squared times nu F_nu, which is the same at
-        the wavelengths of source and observer.
+        nu L_nu is 4 pi times the luminosity distance (10 pc at redshift 0) squared times nu F_nu, which is the
+        same at the wavelengths of source and observer. Between two wavelengths L_nu is integrated over frequency,
+        F_nu being joined by straight lines.
 
         Parameters
         ----------
+        low, high : `~astropy.units.Quantity`, optional
+            Rest wavelengths to integrate between, such as 8 and 1000 um.
         cosmology : `~astropy.cosmology.Cosmology`, optional
             The cosmology.
 
         Returns
         -------
-        luminosity : `~astropy.units.Quantity`, shape (n,)
+        luminosity : `~astropy.units.Quantity`, shape (n,) or ()
             In solar luminosities.
+
+        Raises
+        ------
+        ValueError
+            If only one of ``low`` and ``high`` is given, they are not in order, or not within the spectrum.
 
         Examples
         --------
         >>> from miricigale import SEDModel
+        >>> import astropy.units as u
         >>> sed = SEDModel.yang2021(libraries="bundled")(redshift=1.0, mass=1e10)
         >>> sed.luminosity().unit
         Unit("solLum")
+        >>> sed.luminosity(8 * u.um, 1000 * u.um) < sed.luminosity(3 * u.um, 1000 * u.um)
+        np.True_
         """
         far = distance(self.redshift, cosmology) * u.m
+        if low is not None or high is not None:
+            return (4 * np.pi * far**2 * self._integral(low, high)).to(u.Lsun)
         return (4 * np.pi * far**2 * self.frequency * self.fnu).to(u.Lsun)
+
+    def _integral(self, low, high):
+        """Integrate F_nu over the frequencies between two rest wavelengths."""
+        check_that(low is not None and high is not None, "high", "given with 'low'", high)
+        first = to_array(low, WAVE, "low") * (1.0 + self.redshift)
+        last = to_array(high, WAVE, "high") * (1.0 + self.redshift)
+        wave = self.wave.value
+        is_inside = wave[0] <= first < last <= wave[-1]
+        span = f"{self.rest_wavelength[0]:.4g} and {self.rest_wavelength[-1]:.4g}"
+        check_that(is_inside, "low, high", f"in order, and within {span}", f"{low}, {high}")
+        x = np.concatenate([[first], wave[(wave > first) & (wave < last)], [last]])
+        y = np.interp(x, wave, self.fnu.value)
+        slope = np.diff(y) / np.diff(x)
+        # of (a + b x) / x^2
+        constant = y[:-1] - slope * x[:-1]
+        parts = constant * (1 / x[:-1] - 1 / x[1:]) + slope * np.log(x[1:] / x[:-1])
+        return np.sum(parts) * FNU * c / WAVE
 
     def to_table(self):
         """The spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""

@@ -24,9 +24,31 @@ def _frozen(array, copy):
 
 
 class _ByName(dict):
-    """Arrays by name, which a call gives too: ``results.pdf("redshift")``."""
+    """
+    Arrays by name, which a call gives too: ``results.pdf("redshift")``.
 
-    __call__ = dict.__getitem__
+    ``other_name`` is a function of a name and those that there are, which returns the one that is meant.
+    """
+
+    def __init__(self, values, other_name):
+        super().__init__(values)
+        self.other_name = other_name
+
+    def __missing__(self, name):
+        ours = self.other_name(name, self)
+        if ours in self:
+            return self[ours]
+        if isinstance(name, str):
+            raise unknown_name("parameter", name, self)
+        raise KeyError(name)
+
+    def __call__(self, name):
+        return self[name]
+
+
+def _same_name(name, known):
+    """Return the name, where there are no others."""
+    return name
 
 
 class ObjectRows(Interactive):
@@ -43,6 +65,8 @@ class ObjectRows(Interactive):
 
     ``results["redshift_p50"]`` is a column of the table, ``results["some id"]`` also an object whose id is text.
     """
+
+    _other_name = staticmethod(_same_name)
 
     def __post_init__(self):
         self._freeze(copy=True)
@@ -65,7 +89,7 @@ class ObjectRows(Interactive):
         mapped = {}
         for name, value in self._per_object():
             if isinstance(value, dict):
-                mapped[name] = _ByName(convert_values(function, value))
+                mapped[name] = _ByName(convert_values(function, value), self._other_name)
             else:
                 if value is None:
                     mapped[name] = None

@@ -47,6 +47,10 @@ def test_quantities_are_found_by_the_names_of_cigale(results):
     assert_array_equal(results.std("agn.fracAGN"), results.std("frac_agn"))
     assert results.unit("sfh.integrated") == u.Msun
     assert_array_equal(results.cdf("z")[1], results.cdf("redshift")[1])
+    assert_array_equal(results.pdf("z"), results.pdf["redshift"])
+    assert_array_equal(results.best("agn.fracAGN"), results.best["frac_agn"])
+    assert "z" not in results.pdf
+    refuses("no parameter 'redshft'; .*redshift", results.pdf, "redshft", error=KeyError)
     refuses("no parameter 'stellar.mstar'", results.mean, "stellar.mstar", error=KeyError)
 
 

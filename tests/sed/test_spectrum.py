@@ -3,6 +3,7 @@ import operator
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.constants import c
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.tests.helper import assert_quantity_allclose
@@ -161,11 +162,22 @@ def test_luminosities_are_those_of_the_closed_form(flat):
     # whatever the redshift at which it is seen
     for redshift in (0.0, 3.0):
         assert_quantity_allclose(sed.redshifted(redshift).luminosity(), sed.luminosity(), rtol=1e-9)
+    # between two wavelengths of the source, of a flat spectrum in closed form
+    low = sed.rest_wavelength[0] * 1.5
+    high = sed.rest_wavelength[-1] / 1.5
+    span = c / low - c / high
+    closed = 4 * np.pi * far**2 * sed.fnu[0] * span / (1 + sed.redshift)
+    assert_quantity_allclose(sed.luminosity(low, high), closed.to(u.Lsun), rtol=1e-9)
+    assert_quantity_allclose(sed(2 * u.um), sed.fnu_at(2 * u.um))
+    refuses("'high' must be given with 'low', got None", sed.luminosity, low)
+    refuses("'low, high' must be in order, and within", sed.luminosity, high, low)
     model = SEDModel.yang2021(libraries="bundled", agn=False)(redshift=2.0, mass=1e10, ebv=0.3)
     dust = model.components["dust"]
     # integral of nu L_nu over ln nu, the same for source and observer
     total = -np.trapezoid(dust.luminosity(), np.log(dust.frequency.value))
     assert_quantity_allclose(total, model.derived["dust_luminosity"].to(u.Lsun), rtol=0.01)
+    ends = dust.rest_wavelength[[0, -1]] * [1 + 1e-9, 1 - 1e-9]
+    assert_quantity_allclose(dust.luminosity(*ends), total, rtol=0.01)
 
 
 def test_magnitudes_of_several_bands_are_those_of_each(flat):

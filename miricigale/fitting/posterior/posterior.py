@@ -276,6 +276,7 @@ class FitRows(ObjectRows):
 
     #: Where the formats of files are registered.
     io_module = "miricigale.fitting.results.io"
+    _other_name = staticmethod(other_name)
 
     def with_model(self, model):
         """Return a copy that knows the `~miricigale.sed.SEDModel`, for other bands and for spectra."""
