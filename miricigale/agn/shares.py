@@ -9,8 +9,14 @@ from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import check_count
 from miricigale.utils.values import value_class
 
-#: Pseudo-objects of the Dirichlet prior of the shares, in each bin of redshift and for the classes.
-CONCENTRATION = 1.0
+#: Pseudo-objects with and without an AGN in each bin of redshift: Jeffreys's prior of a share.
+_JEFFREYS = 0.5
+#: Pseudo-AGN of each bin of redshift that have the fractions common to all redshifts.
+COMMON_AGN = 5.0
+#: Pseudo-AGN in each bin of the fraction common to all redshifts: a flat prior.
+_FLAT = 1.0
+#: Pseudo-objects of the Dirichlet prior of the classes.
+_CLASS_OBJECTS = 1.0
 #: Draws that are left out at the beginning, over those that are kept.
 _BURN_IN = 0.2
 #: Ln of the largest ratio of evidences.
@@ -70,8 +76,12 @@ def draw_shares(table, prior, *, others=None, n_draws=1000, seed=None):
 
     with the shares s of the classes and their evidences Z, those of galaxies being s_0 and Z_0. Priors of all
     else, and that within a bin, are those of the fits. Draws are made by data augmentation: each object gets a
-    class and bin by the shares, and these are drawn by the numbers of objects, with a Dirichlet prior of one
-    pseudo-object for each z, and for the classes.
+    class and bin by the shares, and these are drawn by the numbers of objects.
+
+    How many AGN there are and which fractions they have are drawn apart, so that bins of the fraction add no AGN.
+    The share of AGN in a bin of redshift has Jeffreys's prior, half a pseudo-object with and without an AGN. The
+    fractions of these AGN have a Dirichlet prior about those of all redshifts with the weight of five objects, and
+    those of all redshifts a flat one. Classes have a Dirichlet prior of one pseudo-object.
 
     Parameters
     ----------
@@ -100,7 +110,8 @@ def draw_shares(table, prior, *, others=None, n_draws=1000, seed=None):
 
     References
     ----------
-    Hogg, Myers & Bovy 2010, ApJ 725, 2166. Diebolt & Robert 1994, JRSS B 56, 363 (draws of mixtures).
+    Hogg, Myers & Bovy 2010, ApJ 725, 2166. Diebolt & Robert 1994, JRSS B 56, 363 (draws of mixtures). Teh et al.
+    2006, JASA 101, 1566 (draws of shares common to several groups).
 
     Examples
     --------
@@ -125,8 +136,9 @@ def draw_shares(table, prior, *, others=None, n_draws=1000, seed=None):
     divided = np.divide(
         table.sum(axis=3), prior, out=np.zeros((n, n_z, n_frac)), where=prior > 0
     ).reshape(n, -1)
-    pseudo = np.where(prior > 0, CONCENTRATION / np.count_nonzero(prior > 0), 0.0)
-    shares = np.tile(prior, (n_z, 1))
+    allowed = prior > 0
+    shares = np.tile(allowed / allowed.sum(), (n_z, 1))
+    common = _dirichlet(rng, np.where(allowed[1:], _FLAT, 0.0))
     class_shares = np.full(1 + ratio.shape[1], 1.0 / (1 + ratio.shape[1]))
     kept_shares = np.empty((n_draws, n_z, n_frac))
     counts = {}
@@ -143,9 +155,10 @@ def draw_shares(table, prior, *, others=None, n_draws=1000, seed=None):
         component = np.minimum(component, weight.shape[1] - 1)
         number = np.bincount(component, minlength=weight.shape[1])
         of_bins = number[: n_z * n_frac].reshape(n_z, n_frac)
-        shares = _dirichlet(rng, of_bins + pseudo)
+        common = _draw_common(rng, of_bins[:, 1:], common, allowed[1:])
+        shares = _draw_by_redshift(rng, of_bins, common, allowed)
         of_classes = np.concatenate([[of_bins.sum()], number[n_z * n_frac :]])
-        class_shares = _dirichlet(rng, (of_classes + CONCENTRATION / of_classes.size)[None])[0]
+        class_shares = _dirichlet(rng, of_classes + _CLASS_OBJECTS / of_classes.size)
         if turn < 0:
             continue
         kept_shares[turn] = shares
@@ -177,11 +190,37 @@ def _other_classes(posteriors, n):
 
 
 def _dirichlet(rng, numbers):
-    """Draw rows of shares; a bin without any pseudo-object has none."""
+    """Draw shares that sum to 1 along the last axis; a bin without any pseudo-object has none."""
     drawn = np.where(numbers > 0, rng.standard_gamma(np.maximum(numbers, 1e-300)), 0.0)
     # of tiny numbers all may be 0
     drawn = np.maximum(drawn, np.where(numbers > 0, 1e-300, 0.0))
-    return drawn / drawn.sum(axis=1, keepdims=True)
+    total = drawn.sum(axis=-1, keepdims=True)
+    return np.divide(drawn, total, out=drawn, where=total > 0)
+
+
+def _draw_common(rng, numbers, common, allowed):
+    """
+    Draw the shares of AGN fractions common to all redshifts.
+
+    Of the AGN of a bin, ``numbers`` (n_z, n_agn), only so many count as are new in the sequence in which one after
+    the other is like an earlier one of its redshift, or is drawn from the common shares (Antoniak 1974).
+    """
+    weight = COMMON_AGN * common
+    earlier = np.arange(numbers.max(initial=0))
+    probability = np.ones((common.size, earlier.size))
+    np.divide(weight[:, None], weight[:, None] + earlier, out=probability, where=earlier > 0)
+    is_new = rng.random(numbers.shape + earlier.shape) < probability
+    n_new = np.sum(is_new & (earlier < numbers[..., None]), axis=(0, 2))
+    return _dirichlet(rng, np.where(allowed, n_new + _FLAT, 0.0))
+
+
+def _draw_by_redshift(rng, numbers, common, allowed):
+    """Draw the shares of each bin of redshift by its objects, (n_z, n_frac): of AGN, and of their fractions."""
+    n_agn = numbers[:, 1:].sum(axis=1)
+    pseudo = np.where([np.any(allowed[1:]), allowed[0]], _JEFFREYS, 0.0)
+    of_agn = _dirichlet(rng, np.stack([n_agn, numbers[:, 0]], axis=1) + pseudo)
+    fractions = _dirichlet(rng, numbers[:, 1:] + COMMON_AGN * common)
+    return np.concatenate([of_agn[:, 1:], of_agn[:, :1] * fractions], axis=1)
 
 
 def _draw_places(part, uniform):

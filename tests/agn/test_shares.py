@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from helpers.errors import refuses
-from miricigale.agn import draw_shares
+from miricigale.agn import draw_shares, shares
 from miricigale.fitting import AGNBins
 from miricigale.fitting.posterior.priors import GridAxis
 
@@ -18,7 +19,7 @@ def two_normals(n, share, rng, prior):
 
 
 def exact_share(table, prior):
-    """Posterior mean and deviation of the share on a fine grid, with the Dirichlet prior of one pseudo-object."""
+    """Posterior mean and deviation of the share on a fine grid, with Jeffreys's prior."""
     share = (np.arange(4000) + 0.5) / 4000
     likelihood = table[:, 0, :, 0] / prior
     log = np.log(likelihood[:, :1] * (1.0 - share) + likelihood[:, 1:] * share).sum(axis=0)
@@ -39,13 +40,12 @@ def test_draws_are_those_of_the_posterior_of_the_share(prior):
 
 
 def test_the_prior_of_the_fits_is_divided_out():
-    rng = [np.random.default_rng(6) for _ in range(2)]
-    shares = []
-    for prior, one in zip(((0.9, 0.1), (0.2, 0.8)), rng, strict=True):
-        table = two_normals(200, 0.3, one, prior)
-        shares.append(draw_shares(table, prior, n_draws=100, seed=2).shares)
+    drawn = []
+    for prior in ((0.9, 0.1), (0.2, 0.8)):
+        table = two_normals(200, 0.3, np.random.default_rng(6), prior)
+        drawn.append(draw_shares(table, prior, n_draws=100, seed=2).shares)
     # the same data and likelihoods
-    np.testing.assert_allclose(*shares, atol=1e-9)
+    np.testing.assert_allclose(*drawn, atol=1e-9)
 
 
 def test_intervals_hold_the_truth():
@@ -75,6 +75,52 @@ def test_sure_objects_are_counted_in_their_bins():
     draws = draw_shares(table, [0.5, 0.5], n_draws=20, seed=1)
     assert np.all(draws.counts["galaxy"] == table.sum(axis=0))
     np.testing.assert_allclose(draws.probability["galaxy"], table, atol=1e-12)
+
+
+def test_sure_objects_have_the_errors_of_a_counted_share():
+    """Of 5 of 40 objects that are surely AGN, Jeffreys's interval."""
+    table = np.zeros((40, 1, 4, 1))
+    table[:35, 0, 0, 0] = table[35:38, 0, 1, 0] = table[38:, 0, 3, 0] = 1.0
+    draws = draw_shares(table, [0.7, 0.1, 0.1, 0.1], n_draws=2500, seed=1)
+    assert np.all(draws.counts["galaxy"] == table.sum(axis=0))
+    share = draws.shares[:, 0, 1:].sum(axis=1)
+    levels = np.array([0.16, 0.5, 0.84])
+    expected = stats.beta(5.5, 35.5).ppf(levels)
+    np.testing.assert_allclose(np.quantile(share, levels), expected, atol=0.003)
+
+
+@pytest.mark.parametrize("n_fractions", [1, 12])
+def test_bins_of_the_fraction_add_no_agn(n_fractions):
+    """Data that do not tell fractions apart give the share of AGN of a single bin."""
+    prior = np.array([0.9, 0.1])
+    table = two_normals(60, 0.1, np.random.default_rng(11), prior)
+    mean, std = exact_share(table, prior)
+    split = np.repeat(table[:, :, 1:], n_fractions, axis=2) / n_fractions
+    split = np.concatenate([table[:, :, :1], split], axis=2)
+    own_prior = np.concatenate([prior[:1], np.full(n_fractions, prior[1] / n_fractions)])
+    share = draw_shares(split, own_prior, n_draws=2000, seed=1).shares[:, 0, 1:].sum(axis=1)
+    assert share.mean() == pytest.approx(mean, abs=0.15 * std)
+    assert share.std() == pytest.approx(std, rel=0.15)
+
+
+def test_fractions_of_a_redshift_are_drawn_to_those_of_all():
+    """Against an integral over the common fraction, of two redshifts with 6 and 1 AGN."""
+    numbers = np.array([[5, 1], [0, 1]])
+    objects = np.repeat(np.arange(4), numbers.ravel())
+    table = np.zeros((objects.size, 2, 3, 1))
+    table[np.arange(objects.size), objects // 2, 1 + objects % 2, 0] = 1.0
+    draws = draw_shares(table, [0.8, 0.1, 0.1], n_draws=3000, seed=1).shares
+    drawn = draws[:, :, 1] / draws[:, :, 1:].sum(axis=2)
+    common = (np.arange(2000) + 0.5) / 2000
+    first = shares.COMMON_AGN * common
+    second = shares.COMMON_AGN * (1.0 - common)
+    weight = np.ones(common.size)
+    for n_first, n_second in numbers:
+        weight *= stats.betabinom(n_first + n_second, first, second).pmf(n_first)
+    weight /= weight.sum()
+    for z, (n_first, n_second) in enumerate(numbers):
+        mean = (first + n_first) / (shares.COMMON_AGN + n_first + n_second)
+        assert drawn[:, z].mean() == pytest.approx(weight @ mean, abs=0.02)
 
 
 def test_classes_share_the_objects_by_their_evidence():
