@@ -190,6 +190,14 @@ def test_spectra_of_other_packages():
     refuses("wavelengths with a unit", band.synthetic_flux, (wave.value, flam), error=u.UnitsError)
 
 
+def test_points_of_synphot_are_joined_in_their_flux_density():
+    """A flat source in two points is flat; synphot joins points in photons, and has 0.3 mag more."""
+    from synphot import Empirical1D, SourceSpectrum
+
+    ends = SourceSpectrum(Empirical1D, points=[4, 12] * u.um, lookup_table=[3, 3] * u.uJy)
+    assert_quantity_allclose(Filter("miri.f770w").synthetic_flux(ends), 3 * u.uJy, rtol=1e-12)
+
+
 def test_a_filter_says_what_it_has():
     band = Filter("F770W")
     assert band == Filter.from_name("miri.f770w") == pickle.loads(pickle.dumps(band))
