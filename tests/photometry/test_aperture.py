@@ -3,9 +3,14 @@ import numpy as np
 import pytest
 import sep
 from astropy.convolution import Gaussian2DKernel
-from astropy.nddata import Cutout2D
+from astropy.nddata import CCDData, Cutout2D
 from numpy.testing import assert_allclose
-from photutils.aperture import SkyCircularAperture
+from photutils.aperture import (
+    SkyCircularAperture,
+    SkyEllipticalAnnulus,
+    SkyEllipticalAperture,
+    SkyRectangularAperture,
+)
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
@@ -50,6 +55,37 @@ def test_circles_hold_the_light_of_a_gaussian(tools, stars):
     off = aperture_photometry(image, tools.places([3600.0]), 1 * u.arcsec)
     assert np.isnan(off["flux"][0])
     assert off["coverage"][0] == 0
+
+
+def test_apertures_have_their_angle_where_east_is_on_the_right(tools):
+    """A mirrored image of the same sky has the same light in an ellipse, a rectangle and a ring."""
+    place = tools.places([0.0])
+    n = 101
+    axis = np.arange(n) - 50.0
+    # position angle 60 deg, where east is left: columns fall, rows grow
+    along = -axis * np.sin(np.pi / 3) + axis[:, None] * np.cos(np.pi / 3)
+    across = axis * np.cos(np.pi / 3) + axis[:, None] * np.sin(np.pi / 3)
+    data = np.exp(-0.5 * ((along / 12.0) ** 2 + (across / 3.0) ** 2))
+    wcs = north_up_wcs(place[0], 0.1 * u.arcsec, (n, n))
+    mirrored = wcs.deepcopy()
+    mirrored.wcs.cdelt[0] *= -1.0
+    size = {"w": 2.0 * u.arcsec, "h": 0.6 * u.arcsec}
+    ellipse = {"a": 1.0 * u.arcsec, "b": 0.3 * u.arcsec, "theta": 60.0 * u.deg}
+    ring = {"a_in": 0.5 * u.arcsec, "a_out": 1.5 * u.arcsec, "b_out": 0.5 * u.arcsec}
+    apertures = [
+        SkyEllipticalAperture(place, **ellipse),
+        SkyRectangularAperture(place, **size, theta=60.0 * u.deg),
+        SkyEllipticalAnnulus(place[0], **ring, theta=60.0 * u.deg),
+    ]
+    for aperture in apertures:
+        straight = aperture_photometry(CCDData(data, unit="uJy", wcs=wcs), aperture)
+        turned = aperture_photometry(CCDData(data[:, ::-1], unit="uJy", wcs=mirrored), aperture)
+        assert_allclose(turned["flux"].value, straight["flux"].value, rtol=1e-6)
+    # along the light: more than in an ellipse across it
+    wrong = SkyEllipticalAperture(place, **(ellipse | {"theta": 150.0 * u.deg}))
+    image = CCDData(data, unit="uJy", wcs=wcs)
+    right = aperture_photometry(image, apertures[0])["flux"]
+    assert np.all(right > aperture_photometry(image, wrong)["flux"])
 
 
 def test_source_extractor_like_fluxes(tools, stars):

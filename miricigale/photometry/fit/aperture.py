@@ -84,7 +84,7 @@ def aperture_photometry(image, sky, diameter=None):
         check_that(diameter is None, "diameter", "left out with an aperture", diameter)
         aperture = sky
         if isinstance(sky, SkyAperture):
-            aperture = sky.to_pixel(arrays.wcs)
+            aperture = _on_pixels(sky, arrays.wcs)
         flux, flux_err, coverage = aperture_sums(arrays, aperture)
         shape = type(sky).__name__
     else:
@@ -99,6 +99,28 @@ def aperture_photometry(image, sky, diameter=None):
         "coverage": (coverage, "Fraction of the aperture on usable pixels"),
     }
     return described_table(columns)
+
+
+def _on_pixels(aperture, wcs):
+    """
+    Convert an aperture on the sky to pixels of an image.
+
+    Position angles grow from north to east: clockwise in an image whose east is on the right. photutils (3.0.0)
+    turns them counterclockwise in any image.
+    """
+    on_pixels = aperture.to_pixel(wcs)
+    if not hasattr(aperture, "theta"):
+        return on_pixels
+    position = aperture.positions
+    if not aperture.isscalar:
+        position = position[0]
+    angles = [0.0 * u.deg, 90.0 * u.deg, aperture.theta]
+    beside = position.directional_offset_by(u.Quantity(angles), 1.0 * u.arcsec)
+    north, east, along = sky_to_pixels(beside, wcs) - sky_to_pixels(position.reshape(1), wcs)
+    east_is_left = north[0] * east[1] - north[1] * east[0] > 0
+    if not east_is_left:
+        on_pixels.theta = np.arctan2(along[1], along[0]) * u.rad
+    return on_pixels
 
 
 def circle_sums(arrays, xy, radius):
