@@ -6,7 +6,8 @@ import itertools
 import numpy as np
 import scipy.ndimage
 import scipy.spatial
-from astropy.stats import mad_std
+from astropy.stats import gaussian_sigma_to_fwhm, mad_std
+from scipy.special import ndtr
 
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.values import value_class
@@ -18,6 +19,9 @@ LEFT_SNR = 5.0
 _LEFT_SHARE = 0.1
 _LEFT_DISTANCE = 0.7
 _LEFT_REACH = 2.0
+
+#: Largest share of false new sources where the evidence decides whether they are fitted.
+_FALSE_RATE = 0.1
 
 #: Share of a source's flux, and distance to it in full widths, within which peaks are of its wings.
 _WINGS = 0.02, 10.0
@@ -254,3 +258,42 @@ def new_sources(peaks, xy, flux, *, usable=None):
         steps = np.arange(-round(2 * peaks.full_width), round(2 * peaks.full_width) + 1)
         new &= _windows(usable, peaks.xy[:, 1], peaks.xy[:, 0], steps).all(axis=(1, 2))
     return new
+
+
+def chosen_peaks(peaks, negative, xy, flux, usable, second_pass):
+    """
+    Choose the peaks that are fitted as new sources, and say on what evidence.
+
+    Parameters
+    ----------
+    peaks, negative : `ResidualPeaks`
+        Peaks of the residual, and of its negative: these are false, and count how many of the first are.
+    xy, flux : `~numpy.ndarray`, shapes (n, 2) and (n,)
+        Positions of all sources, and their fluxes; NaN where not measured.
+    usable : bool `~numpy.ndarray`, shape (ny, nx)
+        Pixels that are searched.
+    second_pass : bool or None
+        Whether new sources are fitted; None where few enough of them are false.
+
+    Returns
+    -------
+    chosen : bool `~numpy.ndarray`, shape (n_peaks,)
+    evidence : dict of str to object
+        ``"peaks"`` (their number), ``"threshold"``, ``"false_rate"`` and ``"fitted"``.
+    """
+    searched = usable if second_pass is None else None
+    new = new_sources(peaks, xy, flux, usable=searched)
+    false = new_sources(negative, xy, flux, usable=searched)
+    # independent trials: usable pixels over the area of the squared PSF
+    width = peaks.full_width / gaussian_sigma_to_fwhm
+    n_beams = np.count_nonzero(usable) / (4 * np.pi * width**2)
+    n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
+    rate = float(n_false / max(np.count_nonzero(new), 1))
+    fitted = bool(new.any() and (second_pass or rate <= _FALSE_RATE))
+    evidence = {
+        "peaks": int(new.sum()),
+        "threshold": LEFT_SNR,
+        "false_rate": float(f"{rate:.2g}"),
+        "fitted": fitted,
+    }
+    return new & fitted, evidence

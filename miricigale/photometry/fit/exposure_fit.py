@@ -6,7 +6,12 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from miricigale.photometry.fit.template_fit import MIN_COVERAGE, duplicates, inner_products
+from miricigale.photometry.fit.template_fit import (
+    MIN_COVERAGE,
+    duplicates,
+    gaussian_width,
+    inner_products,
+)
 from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.photometry.shapes.shapes import not_fitted
 from miricigale.photometry.templates.free_templates import (
@@ -22,7 +27,6 @@ from miricigale.photometry.templates.normal_equations import (
     sandwich_matrix,
     stated_correlation,
 )
-from miricigale.utils.units import ANGLE
 from miricigale.utils.values import value_class
 
 #: Largest share of a template's power that is its own noise and is taken off (as for one image).
@@ -95,13 +99,6 @@ class ExposurePart:
         source = self if like is None else like
         bank.reuse(source.bank)
         return dataclasses.replace(self, bank=bank)
-
-
-def gaussian_width(kernel):
-    """Return the rms width in arcsec of a Gaussian as peaked as the target of a kernel."""
-    target = kernel.target
-    width = np.sqrt(target.sum() / (2 * np.pi * target.max()))
-    return width * kernel.pixel_scale.to_value(ANGLE)
 
 
 @value_class

@@ -3,19 +3,17 @@
 import dataclasses
 
 import numpy as np
-from astropy.coordinates import SkyCoord
 from astropy.stats import gaussian_sigma_to_fwhm
-from astropy.table import Table
 from astropy.wcs.utils import pixel_to_pixel
-from scipy.special import ndtr
 
 from miricigale.instrument import mosaic_wcs
-from miricigale.photometry.detection.residual_sources import LEFT_SNR, new_sources
-from miricigale.photometry.fit.exposure_fit import ExposureFit, ExposurePart, gaussian_width
+from miricigale.photometry.detection.residual_sources import chosen_peaks
+from miricigale.photometry.fit.exposure_fit import ExposureFit, ExposurePart
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels
 from miricigale.photometry.fit.exposure_result import joint_result, plane_peaks
-from miricigale.photometry.fit.offsets import source_offsets
-from miricigale.photometry.fit.result_table import CatalogRows
+from miricigale.photometry.fit.offsets import excess_variance, row_snr, source_offsets
+from miricigale.photometry.fit.result_table import CatalogRows, warn_of_none
+from miricigale.photometry.fit.template_fit import gaussian_width
 from miricigale.photometry.images.arrays import (
     fit_arrays,
     lengths,
@@ -27,7 +25,6 @@ from miricigale.photometry.images.arrays import (
 from miricigale.photometry.images.coadd import Plane
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.templates.placement import Placement
-from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import single_threaded, threads
@@ -54,9 +51,6 @@ _COMMON_OFFSET = 0.05
 #: How often positions of new sources are refined.
 _REFINED = 2
 
-#: Largest share of false new sources where the evidence decides.
-_FALSE_RATE = 0.1
-
 
 def measure_exposures(photometer, images, highres, segmentation, catalog, *, templates):
     """
@@ -81,24 +75,11 @@ def measure_exposures(photometer, images, highres, segmentation, catalog, *, tem
     ValueError, TypeError, `~astropy.units.UnitsError`
         If an input does not fit, or an option is not offered for exposures.
     """
-    if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
-        catalog = highres
-        highres = None
     # check everything before templates are made
     images = _opened(images)
     settings = _settings_of_each(photometer, len(images))
     _check_offered(photometer)
-    prior_given = any(value is not None for value in (highres, segmentation, catalog))
-    if templates is None:
-        highres, segmentation, catalog = photometer._prior(
-            images[0], highres, segmentation, catalog
-        )
-        sources = SourceTemplates.from_catalog(catalog)
-        sources = dataclasses.replace(sources, sky=catalog["sky"])
-    elif prior_given:
-        raise argument_error("templates", "given alone with the exposures", "a catalog too")
-    else:
-        sources = templates
+    prior, sources = photometer._sources(images[0], highres, segmentation, catalog, templates)
     if sources.components is not None and np.any(sources.components == 2):
         raise argument_error("components", "1 for exposures", "2 for some of the sources")
     arrays = []
@@ -109,10 +90,9 @@ def measure_exposures(photometer, images, highres, segmentation, catalog, *, tem
         placed.append(Placement.of(settings[k], exposure, sources.sky))
     # templates of those sources alone that an exposure shows
     near_rows = np.unique(np.concatenate([place.near_rows for place in placed]))
-    if len(sources.id) and not len(near_rows):
-        msg = f"none of the {len(sources.id)} sources is on or near the exposures: nothing is measured"
-        warn(msg, PhotometryWarning)
+    warn_of_none(sources, near_rows, "the exposures")
     if templates is None:
+        highres, segmentation, catalog = prior
         templates = photometer._templates(highres, segmentation, catalog[near_rows])
     else:
         templates = templates[near_rows]
@@ -122,10 +102,7 @@ def measure_exposures(photometer, images, highres, segmentation, catalog, *, tem
     margin = max(place.margin for place in placed)
     xy = sky_pixels(sources.sky, plane.wcs, plane.shape, margin)
     rows = CatalogRows.of(sources, xy, near_rows, templates)
-    meta = {"template": templates.meta.get("template", photometer.template)}
-    name = images[0].meta.get("filter", images[0].meta.get("FILTER"))
-    if name is not None:
-        meta["filter"] = str(name)
+    meta = photometer._meta_of(images[0], templates)
     with threads(photometer.n_threads) as executor, single_threaded():
         joint = _Joint(photometer, plane, rows)
         joint.place(placed, templates, executor)
@@ -339,29 +316,14 @@ class _Joint:
 
         As for one image, the negative of the residual and Gaussian noise say how many are false.
         """
-        decide = self._settings.second_pass is None
         flux = np.full(len(self._catalog.id), np.nan)
         flux[self._catalog.near_rows] = fit.flux
         xy = self._catalog.xy
         # peaks of the residual, and of its negative, which are false
         peaks, negative, usable = plane_peaks(fit, self._plane, xy)
-        form = {"usable": usable} if decide else {}
-        new = new_sources(peaks, xy, flux, **form)
-        false = new_sources(negative, xy, flux, **form)
-        width = gaussian_width(self._settings.mean_kernel) / self._scale
-        # independent trials: usable pixels over the area of the squared PSF
-        n_beams = np.count_nonzero(usable) / (4 * np.pi * width**2)
-        n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
-        rate = float(n_false / max(np.count_nonzero(new), 1))
-        fitted = bool(self._settings.second_pass or rate <= _FALSE_RATE)
-        positions = peaks.refined[new & fitted]
-        evidence = {
-            "peaks": int(new.sum()),
-            "threshold": LEFT_SNR,
-            "false_rate": float(f"{rate:.2g}"),
-            "fitted": bool(fitted and len(positions)),
-        }
-        return positions, evidence
+        second_pass = self._settings.second_pass
+        chosen, evidence = chosen_peaks(peaks, negative, xy, flux, usable, second_pass)
+        return peaks.refined[chosen], evidence
 
     def _with_points(self, new_xy):
         """Refine positions of new sources, and fit with them."""
@@ -451,9 +413,12 @@ class _Joint:
         for _ in range(_OFFSET_PASSES):
             step, error, neighbors = self._offsets(fit)
             # bright isolated sources with a small error
-            snr = np.zeros(len(fit.xy))
-            snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
-            good = (snr > _BRIGHT_SNR) & (neighbors < _ISOLATED) & ~fit.noisy & np.isfinite(error)
+            good = (
+                (row_snr(fit) > _BRIGHT_SNR)
+                & (neighbors < _ISOLATED)
+                & ~fit.noisy
+                & np.isfinite(error)
+            )
             good &= (fit.light > 0.9).all(axis=1) & (error < width / _BRIGHT_SNR * 2)
             # their offsets, those already applied included
             measured = offsets + np.where(good[:, None], step, 0.0)
@@ -464,9 +429,7 @@ class _Joint:
             common = np.median(measured[good], axis=0)
             if np.hypot(common[0], common[1]) > _COMMON_OFFSET * gaussian_sigma_to_fwhm * width:
                 break
-            # of two normal errors the median distance is 1.18
-            distance = np.median(lengths(measured[good])) / 1.1774
-            scatter = distance**2 - np.median(error[good]) ** 2
+            scatter = excess_variance(lengths(measured[good]), error[good])
             if scatter <= _OFFSET_FLOOR**2:
                 break
             new = np.zeros_like(offsets)

@@ -13,9 +13,8 @@ from miricigale.instrument.image import Image
 from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.detection.residual_sources import residual_peaks, unexplained_neighbors
 from miricigale.photometry.fit.diagnostics import canceling
-from miricigale.photometry.fit.exposure_fit import gaussian_width
 from miricigale.photometry.fit.result_table import result_of_columns
-from miricigale.photometry.fit.template_fit import psf_covariance, row_covariances
+from miricigale.photometry.fit.template_fit import gaussian_width, psf_covariance, row_covariances
 from miricigale.photometry.images.arrays import lengths
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.utils.exceptions import PhotometryWarning, warn
@@ -126,10 +125,16 @@ def _images(fit):
     return models, residuals, inverse
 
 
-def _peaks(fit, plane, xy, models, residuals, inverse, sign=1.0):
+def _plane_means(plane, models, residuals, inverse):
+    """Mean model and residual of all exposures in the plane, and the weight of each pixel."""
     weights = [image.astype(float) ** 2 for image in inverse]
-    residual, weight = plane.mean(residuals, weights)
-    model, _ = plane.mean(models, weights)
+    model, weight = plane.mean(models, weights)
+    residual, _ = plane.mean(residuals, weights)
+    return model, residual, weight
+
+
+def _peaks(fit, plane, xy, models, residuals, inverse, sign=1.0):
+    model, residual, weight = _plane_means(plane, models, residuals, inverse)
     area = pixel_area_map(plane.wcs, plane.shape) * _MICRO
     width = gaussian_width(fit.settings.mean_kernel) / fit.scale
     view = _PlaneFit(np.sqrt(weight) / area, width, fit.parts[0].bank)
@@ -198,7 +203,10 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     for name, term in errors.items():
         columns[f"flux_err{name}"] = term * FNU
     exposures = _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
-    model, residual = _plane_images(plane, models, residuals, inverse, meta)
+    model, residual, pixel_weight = _plane_means(plane, models, residuals, inverse)
+    model, residual = _images_of(
+        model, residual, pixel_weight > 0, np.sqrt(pixel_weight), plane.wcs, meta
+    )
     sky = exposures.table["sky"]
     weight = exposures.table["sky_err"] ** -2
     # mean sky of the exposures, by their errors
@@ -382,24 +390,28 @@ def _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
     residual_images = []
     for k, part in enumerate(fit.parts):
         # images of this exposure in MJy/sr
-        usable = part.arrays.usable
         sky = fit.sky(k) / part.arrays.areas()
-        with np.errstate(divide="ignore"):
-            sigma = np.where(usable, 1 / inverse[k], np.nan)
-        options = {"unit": SURFACE_BRIGHTNESS, "wcs": part.arrays.wcs}
-        image_meta = _selected(images[k].meta, ("filter", "source"))
-        model_images.append(Image(models[k] + sky, meta=dict(image_meta), **options))
-        residual = np.where(usable, residuals[k], np.nan)
-        noise = StdDevUncertainty(sigma)
-        residual_images.append(
-            Image(residual, mask=~usable, uncertainty=noise, meta=dict(image_meta), **options)
+        usable = part.arrays.usable
+        model, residual = _images_of(
+            models[k] + sky, residuals[k], usable, inverse[k], part.arrays.wcs, images[k].meta
         )
+        model_images.append(model)
+        residual_images.append(residual)
     return ExposureResults(table, tuple(model_images), tuple(residual_images))
 
 
-def _selected(meta, keys):
-    """Return those entries of a meta dictionary that have some keys."""
-    return {key: meta[key] for key in keys if key in meta}
+def _images_of(model, residual, usable, inverse_sigma, wcs, meta):
+    """Model and residual as images in MJy/sr; the residual is NaN where there are no data."""
+    with np.errstate(divide="ignore"):
+        sigma = np.where(usable, 1 / inverse_sigma, np.nan)
+    residual = np.where(usable, residual, np.nan)
+    noise = StdDevUncertainty(sigma)
+    options = {"unit": SURFACE_BRIGHTNESS, "wcs": wcs}
+    facts = {key: meta[key] for key in ("filter", "source") if key in meta}
+    return (
+        Image(model, meta=facts, **options),
+        Image(residual, mask=~usable, uncertainty=noise, meta=dict(facts), **options),
+    )
 
 
 def _warn_of_offsets(fit, offsets):
@@ -422,26 +434,3 @@ def _n_seen(part):
     ny, nx = part.arrays.flux.shape
     x, y = part.bank.sources.xy.T
     return int(np.count_nonzero((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)))
-
-
-def _plane_images(plane, models, residuals, inverse, meta):
-    """Average model and residual in the plane, for pictures."""
-    weights = [image.astype(float) ** 2 for image in inverse]
-    model, weight = plane.mean(models, weights)
-    residual, _ = plane.mean(residuals, weights)
-    usable = weight > 0
-    sigma = np.full(plane.shape, np.nan)
-    sigma[usable] = weight[usable] ** -0.5
-    residual[~usable] = np.nan
-    image_meta = _selected(meta, ("filter",))
-    options = {"unit": SURFACE_BRIGHTNESS, "wcs": plane.wcs}
-    return (
-        Image(model, meta=dict(image_meta), **options),
-        Image(
-            residual,
-            mask=~usable,
-            uncertainty=StdDevUncertainty(sigma),
-            meta=dict(image_meta),
-            **options,
-        ),
-    )

@@ -2,9 +2,8 @@
 
 import numpy as np
 from astropy.wcs.utils import pixel_to_pixel
-from scipy.special import ndtr
 
-from miricigale.photometry.detection.residual_sources import LEFT_SNR, new_sources, residual_peaks
+from miricigale.photometry.detection.residual_sources import chosen_peaks, residual_peaks
 from miricigale.photometry.fit.diagnostics import diagnose
 from miricigale.photometry.fit.offsets import fit_offsets, settled, source_offsets
 from miricigale.photometry.fit.template_fit import TemplateFit
@@ -16,9 +15,6 @@ _REFINED = 2
 
 #: Errors by which the center of a profile differs from the catalog's position where it is taken instead.
 _ELSEWHERE = 3.0
-
-#: Largest share of false ones with which new sources are fitted where the evidence decides.
-_FALSE_RATE = 0.1
 
 
 def fit_image(arrays, bank, settings, catalog, grid_wcs, *, until_new):
@@ -101,26 +97,18 @@ def _new_positions(fit, catalog):
     flux = np.full(len(xy), np.nan)
     flux[catalog.near_rows[fit.bank.order]] = fit.total
     usable = fit.arrays.usable
-    decide = fit.settings.second_pass is None
+    second_pass = fit.settings.second_pass
     model = fit.model()
     residual = fit.residual(model)
     # a background that is not fitted is no source
     level_residual = residual - usable * np.median(residual[usable])
-    if decide:
+    if second_pass is None:
         residual = level_residual
     peaks = residual_peaks(fit, residual, model, xy)
     negative = residual_peaks(fit, -level_residual, model, xy)
-    searched = usable if decide else None
-    new = new_sources(peaks, xy, flux, usable=searched)
-    false = new_sources(negative, xy, flux, usable=searched)
-    # independent trials: usable pixels over the area of the squared PSF
-    n_beams = np.count_nonzero(usable) / (4 * np.pi * fit.psf_width**2)
-    n_false = np.count_nonzero(false) + n_beams * ndtr(-LEFT_SNR)
-    rate = float(n_false / max(np.count_nonzero(new), 1))
-    done = fit.settings.second_pass or rate <= _FALSE_RATE
-    at = peaks.refined[new & done]
-    evidence = {"peaks": int(new.sum()), "threshold": LEFT_SNR, "false_rate": float(f"{rate:.2g}")}
-    return at - fit.displacement(at), evidence | {"fitted": bool(done and len(at))}
+    chosen, evidence = chosen_peaks(peaks, negative, xy, flux, usable, second_pass)
+    at = peaks.refined[chosen]
+    return at - fit.displacement(at), evidence
 
 
 def _split(fit, diagnostics, added, poor, new_xy):

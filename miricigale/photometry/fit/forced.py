@@ -13,7 +13,7 @@ from miricigale.instrument import epoch_of
 from miricigale.photometry.detection.prior_catalog import detected_prior, read_catalog, read_prior
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels, are_exposures
 from miricigale.photometry.fit.fit_loop import fit_image
-from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package
+from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package, warn_of_none
 from miricigale.photometry.fit.stars import with_stars
 from miricigale.photometry.images.arrays import fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.images.flags import ForcedFlags
@@ -329,6 +329,8 @@ class ForcedPhotometer(Interactive):
         if templates is not None and not isinstance(templates, SourceTemplates):
             msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
             raise TypeError(msg)
+        if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
+            highres, catalog = None, highres
         if are_exposures(image):
             from miricigale.photometry.fit.exposure_photometry import measure_exposures
 
@@ -338,30 +340,15 @@ class ForcedPhotometer(Interactive):
         if isinstance(self.kernel, ExposureKernels):
             wanted = f"{len(self.kernel)} exposures, one for each kernel"
             raise argument_error("image", wanted, "one image")
-        if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
-            highres, catalog = None, highres
         image = own_pixels(as_mosaic(image, "image"))
         arrays = fit_arrays(image, "image")
-        has_prior = not (highres is None and segmentation is None and catalog is None)
-        if templates is None:
-            highres, segmentation, catalog = self._prior(image, highres, segmentation, catalog)
-            sources = SourceTemplates.from_catalog(catalog)
-            sources = dataclasses.replace(sources, sky=catalog["sky"])
-        elif has_prior:
-            raise argument_error("templates", "given alone with the image", "a catalog too")
-        else:
-            sources = templates
+        prior, sources = self._sources(image, highres, segmentation, catalog, templates)
         if self.psf_stars is not False and not self.bare:
             catalog_sources = QTable({"id": sources.id, "sky": sources.sky})
-            photometer, stars = with_stars(self, image, catalog_sources, highres, sources.wcs)
-            if templates is not None:
-                result = photometer.measure(image, templates=templates)
-            else:
-                result = photometer.measure(image, highres, segmentation, catalog)
+            sharp = prior and prior[0]
+            photometer, stars = with_stars(self, image, catalog_sources, sharp, sources.wcs)
+            result = photometer.measure(image, *(prior or ()), templates=templates)
             return stars.noted(result)
-        prior = None
-        if templates is None:
-            prior = highres, segmentation, catalog
         return self._measured(image, arrays, sources, prior=prior)
 
     def _measure_or_find(self, image, templates):
@@ -386,11 +373,7 @@ class ForcedPhotometer(Interactive):
         """
         # sources on or near the image, and their templates
         place = Placement.of(self, arrays, sources.sky)
-        if len(sources.id) and not len(place.near_rows):
-            msg = (
-                f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
-            )
-            warn(msg, PhotometryWarning)
+        warn_of_none(sources, place.near_rows, "'image'")
         if prior is None:
             templates = sources[place.near_rows]
         else:
@@ -400,11 +383,7 @@ class ForcedPhotometer(Interactive):
             return_freed_memory()
         self._check_grid(templates)
         rows, templates = self._rows(sources, place, templates)
-        # what the result says of its making
-        meta = {"template": templates.meta.get("template", self.template)}
-        name = image.meta.get("filter", image.meta.get("FILTER"))
-        if name is not None:
-            meta["filter"] = str(name)
+        meta = self._meta_of(image, templates)
         if "repeated_pixels" in image.meta:
             meta["repeated_pixels"] = image.meta["repeated_pixels"]
         with threads(self.n_threads) as executor, single_threaded():
@@ -475,6 +454,25 @@ class ForcedPhotometer(Interactive):
             fitted=templates.fitted,
         )
         return rows, templates
+
+    def _meta_of(self, image, templates):
+        """Return what a result says of its making: template and filter."""
+        meta = {"template": templates.meta.get("template", self.template)}
+        name = image.meta.get("filter", image.meta.get("FILTER"))
+        if name is not None:
+            meta["filter"] = str(name)
+        return meta
+
+    def _sources(self, image, highres, segmentation, catalog, templates):
+        """Prior, as `_prior` reads it (None with templates), and the sources that are measured."""
+        has_prior = not (highres is None and segmentation is None and catalog is None)
+        if templates is not None:
+            wanted = "given alone with the image or the exposures"
+            check_that(not has_prior, "templates", wanted, "a catalog too")
+            return None, templates
+        prior = self._prior(image, highres, segmentation, catalog)
+        sources = SourceTemplates.from_catalog(prior[2])
+        return prior, dataclasses.replace(sources, sky=prior[2]["sky"])
 
     def _prior(self, image, highres, segmentation, catalog):
         """Return high-resolution image, segments and catalog; detect those that cutouts need and lack."""

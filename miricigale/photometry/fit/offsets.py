@@ -278,8 +278,7 @@ def settled(fit, bank, catalog):
         smooth = smooth(x, y)
         if np.abs(smooth).max() > _NOTICED * gaussian_sigma_to_fwhm * fit.psf_width:
             break
-        # of two normal errors the median distance is 1.18
-        scatter = (np.median(lengths(deviation)) / 1.1774) ** 2 - np.median(error) ** 2
+        scatter = excess_variance(lengths(deviation), error)
         if scatter <= _FLOOR**2:
             break
         new = np.zeros_like(source_shifts)
@@ -305,6 +304,19 @@ def settled(fit, bank, catalog):
     return fit
 
 
+def row_snr(fit):
+    """Signal-to-noise of rows of a fit by their formal errors; 0 of those that are not fitted."""
+    snr = np.zeros(len(fit.flux))
+    snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
+    return snr
+
+
+def excess_variance(distance, error):
+    """Variance along an axis of distances in a plane, beyond that of their errors; it may be negative."""
+    # of two normal errors the median distance is 1.18
+    return (np.median(distance) / 1.1774) ** 2 - np.median(error) ** 2
+
+
 def _bright_offsets(fit, catalog, moved):
     """Measure offsets of bright isolated sources from the catalog: rows, offsets (pixels) and errors."""
     if not len(fit.rows):
@@ -312,12 +324,10 @@ def _bright_offsets(fit, catalog, moved):
     moved = np.broadcast_to(moved, (len(fit.bank.order), 2))
     model = fit.model()
     residual = fit.residual(model)
-    snr = np.zeros(len(fit.bank.order))
-    snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
     source = catalog.near_rows[fit.bank.order]
     bad = int(ForcedFlags.SHARED_SEGMENT | ForcedFlags.NOISY_SEGMENT)
     is_whole = (fit.light > 0.9).all(axis=1) & (catalog.flags[source] & bad == 0)
-    rows = np.flatnonzero(is_whole & ~fit.noisy & (snr > _BRIGHT))
+    rows = np.flatnonzero(is_whole & ~fit.noisy & (row_snr(fit) > _BRIGHT))
     step, error, neighbors = source_offsets(fit, residual, model, rows)
     with np.errstate(invalid="ignore"):
         # where residuals are larger than the stated noise the latter overstates the significance
@@ -346,9 +356,8 @@ def _robust_field(xy, offset, error, good, shape, order):
     coefficients = solution.x.reshape(start.shape)
     for _ in range(5):
         distance = lengths(offset - terms @ coefficients)
-        # galaxies differ from band to band: what scatters beyond the errors (of two normal
-        # errors the median distance is 1.18) is added to them
-        scatter = (np.median(distance[good]) / 1.1774) ** 2 - np.median(error[good]) ** 2
+        # galaxies differ from band to band: what scatters beyond the errors is added to them
+        scatter = excess_variance(distance[good], error[good])
         total = np.hypot(error, np.sqrt(max(scatter, 0.0)))
         is_used = good & (distance < _CLIP * total)
         matrix, right = weighted(is_used, total)

@@ -38,6 +38,14 @@ _BRIGHT_SNR = 10.0
 _TEMPLATE_ERROR = 0.1
 
 
+def warn_of_none(sources, near_rows, where):
+    """Warn if none of the sources is on or near an image or exposures."""
+    n = len(sources.id)
+    if n and not len(near_rows):
+        msg = f"none of the {n} sources is on or near {where}: nothing is measured"
+        warn(msg, PhotometryWarning)
+
+
 @value_class(kw_only=True)
 class CatalogRows:
     """The sources of a catalog, as far as they are known before the fit."""

@@ -391,9 +391,7 @@ class TemplateFit:
     @property
     def psf_width(self):
         """Rms width in pixels of a Gaussian as peaked as the image's PSF."""
-        target = self.settings.mean_kernel.target
-        fine = self.settings.mean_kernel.pixel_scale.to_value(ANGLE)
-        return np.sqrt(target.sum() / (2 * np.pi * target.max())) * fine / self.scale
+        return gaussian_width(self.settings.mean_kernel) / self.scale
 
     @property
     def common(self):
@@ -427,6 +425,13 @@ class TemplateFit:
         self.add_background(residual, -1.0)
         residual[~self.arrays.usable] = 0.0
         return residual
+
+
+def gaussian_width(kernel):
+    """Return the rms width in arcsec of a Gaussian as peaked as the target of a kernel."""
+    target = kernel.target
+    width = np.sqrt(target.sum() / (2 * np.pi * target.max()))
+    return width * kernel.pixel_scale.to_value(ANGLE)
 
 
 def inner(first, second):
