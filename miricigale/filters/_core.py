@@ -10,6 +10,25 @@ _WEIGHTS = 0.5 * _WEIGHTS
 
 _LARGEST_RATIO = 1.05
 
+# relative width of the step to zero at the end of a curve that does not end in zero
+_STEP = 1e-6
+
+
+def padded(wave, throughput):
+    """Trim zeros to one at each end, or add it."""
+    inside = np.flatnonzero(throughput)
+    first = max(inside[0] - 1, 0)
+    last = min(inside[-1] + 1, wave.size - 1)
+    wave = wave[first : last + 1]
+    throughput = throughput[first : last + 1]
+    if throughput[0] != 0:
+        wave = np.concatenate([[wave[0] * (1 - _STEP)], wave])
+        throughput = np.concatenate([[0.0], throughput])
+    if throughput[-1] != 0:
+        wave = np.concatenate([wave, [wave[-1] * (1 + _STEP)]])
+        throughput = np.concatenate([throughput, [0.0]])
+    return wave, throughput
+
 
 def refine(wave, throughput):
     """Add nodes on the straight pieces of a curve until neighbors differ by 5 % in wavelength at most."""

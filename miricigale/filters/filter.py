@@ -37,25 +37,6 @@ VERSION = 1
 #: Share of a band that a spectrum may leave uncovered.
 UNCOVERED = 1e-4
 
-# relative width of the step to zero at the end of a curve that does not end in zero
-_STEP = 1e-6
-
-
-def _padded(wave, throughput):
-    """Trim zeros to one at each end, or add it."""
-    inside = np.flatnonzero(throughput)
-    first = max(inside[0] - 1, 0)
-    last = min(inside[-1] + 1, wave.size - 1)
-    wave = wave[first : last + 1]
-    throughput = throughput[first : last + 1]
-    if throughput[0] != 0:
-        wave = np.concatenate([[wave[0] * (1 - _STEP)], wave])
-        throughput = np.concatenate([[0.0], throughput])
-    if throughput[-1] != 0:
-        wave = np.concatenate([wave, [wave[-1] * (1 + _STEP)]])
-        throughput = np.concatenate([throughput, [0.0]])
-    return wave, throughput
-
 
 @value_class
 class Filter(Frozen, Interactive):
@@ -128,7 +109,7 @@ class Filter(Frozen, Interactive):
         check_that(good, "wave", "positive and strictly ascending", wave)
         if np.any(throughput < 0) or not np.any(throughput > 0):
             raise argument_error("throughput", "not negative, and somewhere positive", throughput)
-        wave, throughput = _padded(wave, throughput)
+        wave, throughput = _core.padded(wave, throughput)
         wave = frozen_quantity(wave * WAVE, WAVE, "wave")
         throughput = frozen_array(throughput)
         meta = dict(self.meta or {})

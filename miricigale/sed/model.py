@@ -14,28 +14,13 @@ from miricigale.sed.component import in_order, read_config
 from miricigale.sed.derived import DERIVED, Derived
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
-from miricigale.sed.parameter import Parameter, default_values
+from miricigale.sed.parameter import MODEL_PARAMETERS, default_values
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
 from miricigale.utils.units import WAVE
-
-_MODEL_PARAMETERS = {
-    "redshift": Parameter(1.0, (0.0, 20.0), "Redshift."),
-    # a mass formed of 3 to 20 suns is the logarithm of one
-    "mass": Parameter(
-        1e10, (0.0, 1e16), "Mass of all stars ever formed.", unit="Msun", logarithms=(3.0, 20.0)
-    ),
-    "dust_excess": Parameter(
-        1.0,
-        (0.0, 1e6),
-        "Dust luminosity over the power that attenuation takes; 1 is energy balance.",
-    ),
-}
-for _name, _parameter in _MODEL_PARAMETERS.items():
-    _parameter.name = _name
 
 
 class SEDModel(Interactive):
@@ -89,10 +74,10 @@ class SEDModel(Interactive):
             raise argument_error("frac_agn_definition", wanted, "'dust'")
         merged = {}
         for component in self.components:
-            twice = set(component.parameters) & (set(merged) | set(_MODEL_PARAMETERS))
+            twice = set(component.parameters) & (set(merged) | set(MODEL_PARAMETERS))
             check_that(not twice, "components", "without shared parameter names", sorted(twice))
             merged.update(component.parameters)
-        model_parameters = dict(_MODEL_PARAMETERS)
+        model_parameters = dict(MODEL_PARAMETERS)
         if self.component("dust") is None:
             del model_parameters["dust_excess"]
         self._parameters = merged | model_parameters
@@ -522,11 +507,8 @@ class SEDModel(Interactive):
         >>> model.fluxes(rows, ["miri.f770w"])["miri.f770w"].round(2)
         <Quantity [6.57, 2.42] uJy>
         """
+        table, filters = tables.named_first(table, filters, parameters, "table")
         if parameters:
-            if filters is None:
-                # bands alone may stand first
-                filters, table = table, None
-            check_that(table is None, "table", "left out beside parameters by name", "both")
             parameters = tables.by_our_names(parameters, self._parameters, short=True)
             for name in parameters:
                 if name not in self._parameters:
@@ -579,14 +561,7 @@ class SEDModel(Interactive):
         >>> model.grid(axes, ["miri.f770w"], cache=False)
         <ModelGrid 2 redshifts x 3 galaxies x 0 AGN x 1 fractions, 1 bands, 6 models>
         """
-        if values and filters is None:
-            # bands alone may stand first
-            axes, filters = None, axes
-        if values:
-            # an option that is spelled wrong stands among the values too
-            wanted = f"left out beside values of axes by name ({', '.join(values)})"
-            check_that(axes is None, "axes", wanted, "both")
-            axes = values
+        axes, filters = tables.named_first(axes, filters, values, "axes")
         if isinstance(filters, Mapping):
             # bands first, as fitters have them
             axes, filters = filters, axes

@@ -194,3 +194,20 @@ class Parameter:
 def default_values(parameters):
     """Return the default of each `Parameter`, in its unit, by name."""
     return {name: parameter.default for name, parameter in parameters.items()}
+
+
+#: Parameters of a model that are of none of its components.
+MODEL_PARAMETERS = {
+    "redshift": Parameter(1.0, (0.0, 20.0), "Redshift."),
+    # a mass formed of 3 to 20 suns is the logarithm of one
+    "mass": Parameter(
+        1e10, (0.0, 1e16), "Mass of all stars ever formed.", unit="Msun", logarithms=(3.0, 20.0)
+    ),
+    "dust_excess": Parameter(
+        1.0,
+        (0.0, 1e6),
+        "Dust luminosity over the power that attenuation takes; 1 is energy balance.",
+    ),
+}
+for _name, _parameter in MODEL_PARAMETERS.items():
+    _parameter.name = _name

@@ -145,6 +145,33 @@ def _cigale_parameters(known, *, short):
     return meanings | without_module
 
 
+def named_first(values, filters, named, argument):
+    """
+    Sort what is given of values and bands: values by name are in place of others, and bands alone may stand first.
+
+    Parameters
+    ----------
+    values, filters : object or None
+        The first two arguments, as they are given.
+    named : dict of str to object
+        Values by name.
+    argument : str
+        What ``values`` are called in messages.
+
+    Returns
+    -------
+    values, filters : object or None
+    """
+    if not named:
+        return values, filters
+    if filters is None:
+        filters, values = values, None
+    # an option that is spelled wrong stands among the values too
+    wanted = f"left out beside values by name ({', '.join(named)})"
+    check_that(values is None, argument, wanted, "both")
+    return named, filters
+
+
 def parameter_table(parameters):
     """Table of a row for each model, of numbers or arrays of one shape by parameter."""
     values = {name: u.Quantity(value) for name, value in parameters.items()}
