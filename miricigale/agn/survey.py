@@ -471,8 +471,7 @@ class _Sample:
             if "quasar" in columns:
                 quasars = main == "quasar"
                 values[name][quasars] = columns["quasar"][name][quasars]
-        with np.errstate(invalid="ignore"):
-            fraction = np.where(np.isfinite(values["frac_agn"]), values["frac_agn"], np.nan)
+        fraction = np.where(np.isfinite(values["frac_agn"]), values["frac_agn"], np.nan)
         selected = classify(fraction, limits=(CLASS_LIMITS[0], limit)) == "agn"
         selected &= np.isin(main, _WITH_AGN)
         tables = {}

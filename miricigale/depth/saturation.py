@@ -229,8 +229,7 @@ def _sources(sources, rate, group, limit, exposure):
     ny, nx = rate.shape
     x = floats(sources["x"])
     y = floats(sources["y"])
-    with np.errstate(invalid="ignore"):
-        on = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+    on = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
     table = QTable({name: sources[name][on] for name in ("id", "x", "y")})
     column = np.rint(x[on]).astype(int)
     row = np.rint(y[on]).astype(int)

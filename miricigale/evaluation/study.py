@@ -131,8 +131,7 @@ class TruthResults:
     def is_bright(self, band):
         """Whether the true flux of all sources is above 5 sigma of the measured one in a band."""
         # by measured flux it would be those that noise made brighter
-        with np.errstate(invalid="ignore"):
-            return self.matched[f"{band}_true"] > 5 * self.matched[error_column(band)]
+        return self.matched[f"{band}_true"] > 5 * self.matched[error_column(band)]
 
     @functools.cached_property
     def shapes(self):

@@ -160,7 +160,7 @@ def completeness(values, found, edges):
     values = values[np.isfinite(detected)]
     detected = detected[np.isfinite(detected)] > 0
     edges = floats(edges)
-    check_that(is_ascending(edges, least=2), "edges", "ascending", edges)
+    check_that(is_ascending(edges, min_size=2), "edges", "ascending", edges)
     n, _ = np.histogram(values, edges)
     n_found, _ = np.histogram(values[detected], edges)
     shares = []

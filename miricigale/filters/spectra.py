@@ -16,7 +16,7 @@ def check_wave(wave):
     else:
         wave = floats(wave)
     wanted = "two or more strictly ascending wavelengths"
-    check_that(is_ascending(wave, least=2), "wave", wanted, wave)
+    check_that(is_ascending(wave, min_size=2), "wave", wanted, wave)
     return wave
 
 

@@ -319,8 +319,7 @@ def run_trial(field, injection, base, sources, image_file):
         rows[name] = _taken(getattr(result, name).to_value(FNU), measured.rows) * FNU
     rows["flags"] = np.where(measured.rows >= 0, result.flags[measured.rows], 0)
     rows["template"] = np.where(measured.rows >= 0, result.template[measured.rows], "none")
-    with np.errstate(invalid="ignore"):
-        rows["recovered"] = rows["flux"] > injection.threshold * rows["flux_err"]
+    rows["recovered"] = rows["flux"] > injection.threshold * rows["flux_err"]
     at = np.stack(base.model.wcs.world_to_pixel(sources["sky"]), axis=-1)
     rows["neighbor_light"] = over_noise(base.model, at)
     rows["place"] = place_names(at, base.model.shape)

@@ -10,56 +10,45 @@ import numpy as np
 _PLAIN = frozenset([float, int, bool, str, bytes, type(None)])
 
 
-class FrozenDict(dict):
+class _Shared:
+    """What shared dicts and lists have in common: they cannot be changed, and their copies are plain."""
+
+    def _refuse(self, *args, **kwargs):
+        name = self._kind.__name__
+        msg = f"this {name} is shared and cannot be changed; change a copy, {name}(...) or copy.deepcopy"
+        raise TypeError(msg)
+
+    def copy(self):
+        """A plain dict or list of the same values."""
+        return self._kind(self)
+
+    __copy__ = copy
+
+    def __deepcopy__(self, memo):
+        return copy.deepcopy(self._kind(self), memo)
+
+    def __reduce__(self):
+        return type(self), (self._kind(self),)
+
+
+class FrozenDict(_Shared, dict):
     """
     A dict that cannot be changed, shared by all who read it.
 
     ``copy()``, ``dict(...)`` and ``|`` give a plain dict. A copy by `copy.deepcopy` is plain throughout.
     """
 
-    def _refuse(self, *args, **kwargs):
-        msg = "this dict is shared and cannot be changed; change a copy, dict(...) or copy.deepcopy"
-        raise TypeError(msg)
-
-    __setitem__ = __delitem__ = __ior__ = _refuse
-    clear = pop = popitem = setdefault = update = _refuse
-
-    def copy(self):
-        """A plain dict of the same values."""
-        return dict(self)
-
-    def __copy__(self):
-        return dict(self)
-
-    def __deepcopy__(self, memo):
-        return copy.deepcopy(dict(self), memo)
-
-    def __reduce__(self):
-        return type(self), (dict(self),)
+    _kind = dict
+    __setitem__ = __delitem__ = __ior__ = _Shared._refuse
+    clear = pop = popitem = setdefault = update = _Shared._refuse
 
 
-class FrozenList(list):
+class FrozenList(_Shared, list):
     """A list that cannot be changed, shared by all who read it; a slice and a copy are plain lists."""
 
-    def _refuse(self, *args, **kwargs):
-        msg = "this list is shared and cannot be changed; change a copy, list(...) or copy.deepcopy"
-        raise TypeError(msg)
-
-    __setitem__ = __delitem__ = __iadd__ = __imul__ = _refuse
-    append = clear = extend = insert = pop = remove = reverse = sort = _refuse
-
-    def copy(self):
-        """A plain list of the same values."""
-        return list(self)
-
-    def __copy__(self):
-        return list(self)
-
-    def __deepcopy__(self, memo):
-        return copy.deepcopy(list(self), memo)
-
-    def __reduce__(self):
-        return type(self), (list(self),)
+    _kind = list
+    __setitem__ = __delitem__ = __iadd__ = __imul__ = _Shared._refuse
+    append = clear = extend = insert = pop = remove = reverse = sort = _Shared._refuse
 
 
 def frozen(value):

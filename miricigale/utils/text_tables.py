@@ -29,6 +29,12 @@ def is_sextractor(start):
     return _SEXTRACTOR.match(start) is not None
 
 
+def _head(path):
+    """Return the beginning of a text file, packed or not."""
+    with packed_open(path) as stream:
+        return stream.read(_HEAD).decode("utf-8-sig", "replace")
+
+
 def csv_layout(path):
     """
     Find out how a file of comma-separated values is written.
@@ -46,9 +52,7 @@ def csv_layout(path):
         Lines before the names of the columns, all of which begin with ``#``. The names may stand in such a line
         themselves, the last one, if the next line has numbers.
     """
-    with packed_open(path) as stream:
-        head = stream.read(_HEAD).decode("utf-8", "replace").removeprefix(_BOM)
-    lines = head.splitlines()
+    lines = _head(path).splitlines()
     n_comments = 0
     while n_comments < len(lines) and _is_comment(lines[n_comments]):
         n_comments += 1
@@ -98,8 +102,7 @@ def plain_rows(source, path, separator):
         Units of the columns that have one.
     """
     if isinstance(source, str):
-        with packed_open(path) as stream:
-            head = stream.read(_HEAD).decode("utf-8-sig", "replace").splitlines()
+        head = _head(path).splitlines()
     else:
         head = source
     head = [line for line in head[:_BARRED] if line.strip()]
@@ -286,8 +289,7 @@ def drop_repeated(table, path):
             suspects.append((first, name))
     if not suspects:
         return
-    with packed_open(path) as stream:
-        head = stream.read(_HEAD).decode("utf-8", "replace")
+    head = _head(path)
     repeated = {}
     for first, name in suspects:
         stands_there = re.search(rf"(?<![\w.]){re.escape(name)}(?![\w.])", head)

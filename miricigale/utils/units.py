@@ -258,9 +258,9 @@ def is_number(value, kind=np.number):
     return array.ndim == 0 and np.issubdtype(array.dtype, kind)
 
 
-def is_ascending(values, least=1):
-    """Whether an array has one dimension and ``least`` values or more, each above the one before; NaN is not."""
-    return values.ndim == 1 and values.size >= least and bool(np.all(np.diff(values) > 0))
+def is_ascending(values, min_size=1):
+    """Whether an array has one dimension and ``min_size`` values or more, each above the one before; NaN is not."""
+    return values.ndim == 1 and values.size >= min_size and bool(np.all(np.diff(values) > 0))
 
 
 def are_not_negative(values):

@@ -101,8 +101,8 @@ def test_complex_numbers_and_units_of_numbers_without_one_are_refused():
 
 @pytest.mark.parametrize("values", [[1.0, 2.0], [-1.0, 0.0, np.inf]])
 def test_ascending(values):
-    assert is_ascending(np.array(values), least=2)
-    assert not is_ascending(np.array(values), least=4)
+    assert is_ascending(np.array(values), min_size=2)
+    assert not is_ascending(np.array(values), min_size=4)
 
 
 @pytest.mark.parametrize("values", [[], [1.0, 1.0], [2.0, 1.0], [1.0, np.nan], [[1.0, 2.0]]])

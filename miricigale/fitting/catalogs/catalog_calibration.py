@@ -102,8 +102,7 @@ class SourceSample:
         row = np.arange(self._n_rows, self._n_rows + n)
         self._n_rows += n
         in_use = data.used
-        with np.errstate(invalid="ignore"):
-            signal = data.measured & (data.flux > MIN_SIGNAL * data.flux_err)
+        signal = data.measured & (data.flux > MIN_SIGNAL * data.flux_err)
         n_signal = signal[:, self._short].sum(axis=1)
         eligible = n_signal >= min(_MIN_BANDS, len(self._short))
         columns = {
@@ -116,8 +115,7 @@ class SourceSample:
         }
         if redshift is not None:
             known_z = known_redshifts(table, redshift)
-            with np.errstate(invalid="ignore"):
-                eligible &= (known_z >= self._range[0]) & (known_z <= self._range[1])
+            eligible &= (known_z >= self._range[0]) & (known_z <= self._range[1])
             columns["redshift"] = known_z
         if density is not None:
             columns["density"] = np.asarray(density, dtype=float)
@@ -134,8 +132,7 @@ class SourceSample:
         flux = np.full(len(data), np.nan)
         for i in self._short:
             flux = np.where(data.measured[:, i], data.flux[:, i], flux)
-        with np.errstate(invalid="ignore"):
-            is_detectable = flux[:, None] > MIN_SIGNAL * data.flux_err[:, self._long]
+        is_detectable = flux[:, None] > MIN_SIGNAL * data.flux_err[:, self._long]
         return np.any(is_detectable & data.measured[:, self._long], axis=1)
 
     @staticmethod

@@ -497,16 +497,15 @@ def flags_of_fits(results, measured, edge_weight):
     fitted = results.fitted
     pdf = results.pdf["redshift"]
     signal = np.where(measured, results.best_flux / results.sigma, 0.0)
-    with np.errstate(invalid="ignore"):
-        flags[fitted & (results.band_off != "")] |= FitFlags.BAND_OFF
-        flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
-        # S/N of the best model in all bands together
-        faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
-        flags[fitted & faint] |= FitFlags.LOW_SIGNAL
-        if edge_weight is not None and pdf.shape[1] > 2:
-            edge = np.maximum(pdf[:, 0], pdf[:, -1]) > edge_weight
-            flags[fitted & edge] |= FitFlags.REDSHIFT_EDGE
-        if edge_weight is not None and "stellar_mass" in results.quantities:
-            flags[fitted & (results.median("stellar_mass").value < LOW_MASS)] |= FitFlags.LOW_MASS
+    flags[fitted & (results.band_off != "")] |= FitFlags.BAND_OFF
+    flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
+    # S/N of the best model in all bands together
+    faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
+    flags[fitted & faint] |= FitFlags.LOW_SIGNAL
+    if edge_weight is not None and pdf.shape[1] > 2:
+        edge = np.maximum(pdf[:, 0], pdf[:, -1]) > edge_weight
+        flags[fitted & edge] |= FitFlags.REDSHIFT_EDGE
+    if edge_weight is not None and "stellar_mass" in results.quantities:
+        flags[fitted & (results.median("stellar_mass").value < LOW_MASS)] |= FitFlags.LOW_MASS
     flags[~fitted & ((flags & FitFlags.UNFITTED) == 0)] |= FitFlags.NO_SIGNAL
     return flags

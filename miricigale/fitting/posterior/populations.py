@@ -57,7 +57,7 @@ def agn_fraction_prior(frac_agn):
     array([0.9247, 0.0497, 0.017 , 0.0073, 0.0013])
     """
     frac = floats(frac_agn)
-    good = is_ascending(frac, least=2) and frac[0] == 0
+    good = is_ascending(frac, min_size=2) and frac[0] == 0
     check_that(good, "frac_agn", "ascending values from 0", frac_agn)
     edges = cell_edges(frac, (0.0, 1.0))[1:-1]
     log = np.linspace(-2.0, 2.0, 4001)
@@ -103,7 +103,7 @@ def red_dot_prior(redshift):
     array([0.01, 0.38, 0.43, 0.15, 0.03])
     """
     z = floats(redshift)
-    good = is_ascending(z, least=2) and z[0] >= 0
+    good = is_ascending(z, min_size=2) and z[0] >= 0
     check_that(good, "redshift", "two or more, ascending from 0 or more", redshift)
     deviation = (np.log1p(z) - np.log1p(_RED_DOT_REDSHIFT)) / _RED_DOT_WIDTH
     # density in ln(1 + z) times the widths of the cells

@@ -264,8 +264,7 @@ def plot_redshift(results, z_spec, ax=None, **kwargs):
     z_known = np.atleast_1d(z_known)
     wanted = f"{len(results_list)} redshifts, one for each object"
     check_that(z_known.shape == (len(results_list),), "z_spec", wanted, f"shape {z_known.shape}")
-    with np.errstate(invalid="ignore"):
-        good = results_list.fitted & (z_known > 0)
+    good = results_list.fitted & (z_known > 0)
     check_that(np.any(good), "z_spec", "positive for one fitted object at least", "none")
     low, middle, high = results_list[good].percentile("redshift", [0.16, 0.5, 0.84]).value.T
     true = z_known[good]

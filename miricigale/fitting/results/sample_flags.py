@@ -67,8 +67,7 @@ def with_high_chi2(results, limit):
     results : `~miricigale.fitting.FitResults`
     """
     unlikely = chi2.sf(results.chi2, results.n_bands) < _MIN_PROBABILITY
-    with np.errstate(invalid="ignore"):
-        poor = results.fitted & unlikely & (results.reduced_chi2 > limit)
+    poor = results.fitted & unlikely & (results.reduced_chi2 > limit)
     if not poor.any():
         return results
     flags = np.array(results.flags)

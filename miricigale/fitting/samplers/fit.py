@@ -10,7 +10,12 @@ from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.data.settings import SamplerSettings
 from miricigale.fitting.posterior.posterior import cell_edges, check_pairs
 from miricigale.fitting.posterior.priors import GridAxis
-from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, FORMED_TEXT, column_values
+from miricigale.fitting.posterior.quantities import (
+    DERIVED_LEVELS,
+    FORMED_TEXT,
+    column_values,
+    draws_summary,
+)
 from miricigale.fitting.results.results import FitResults
 from miricigale.fitting.samplers import CITATIONS, get_sampler
 from miricigale.fitting.samplers.run import Calls, FluxModel, positive_normal, systematic_draws
@@ -384,7 +389,8 @@ class SamplerFit:
 
         columns = [values[name] for name in axes] + list(derived.values())
         # parameters first, then derived quantities
-        moments, quantiles = zip(*(_summary(array, weight) for array in columns), strict=True)
+        summaries = [draws_summary(array, weight=weight) for array in columns]
+        moments, quantiles = zip(*summaries, strict=True)
         n = len(axes)
         # posterior mean and standard deviation of the model fluxes
         mean = weight @ flux
@@ -408,21 +414,3 @@ def _cell(axis, values):
     # inner edges alone: the outermost cells are open
     edges = cell_edges(axis.values, axis.bounds)
     return np.searchsorted(edges[1:-1], values, side="right")
-
-
-def _summary(values, weight):
-    """Compute mean, standard deviation and mean of log10, and quantiles, of a weighted sample."""
-    good = np.isfinite(values)
-    if not good.any():
-        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
-    values = values[good]
-    weight = weight[good] / weight[good].sum()
-    mean = weight @ values
-    std = np.sqrt(weight @ np.square(values - mean))
-    lit = values > 0
-    log_mean = np.nan
-    if lit.any():
-        log_mean = weight[lit] @ np.log10(values[lit]) / weight[lit].sum()
-    order = np.argsort(values, kind="stable")
-    middle = np.cumsum(weight[order]) - 0.5 * weight[order]
-    return np.array([mean, std, log_mean]), np.interp(DERIVED_LEVELS, middle, values[order])

@@ -285,10 +285,9 @@ def select_fluxes(
     """
     if longest is None:
         longest = LONGEST_REST
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(flux) & (flux_err > 0) & np.isfinite(flux_err)
-        good &= (predicted > MIN_SIGNAL * flux_err) & np.isfinite(predicted_std)
-        good &= (rest_wave > SHORTEST_REST) & (rest_wave < longest)
+    good = np.isfinite(flux) & (flux_err > 0) & np.isfinite(flux_err)
+    good &= (predicted > MIN_SIGNAL * flux_err) & np.isfinite(predicted_std)
+    good &= (rest_wave > SHORTEST_REST) & (rest_wave < longest)
     if template_error is None:
         model_error = np.zeros(np.count_nonzero(good))
     else:

@@ -50,9 +50,8 @@ def _residuals(results):
     flux = results.flux
     error = results.flux_err
     model = results.best_flux
-    with np.errstate(invalid="ignore"):
-        good = results.fitted[:, None] & np.isfinite(results.sigma) & ~results.limit & (model > 0)
-        good &= flux > _MIN_SIGNAL * error
+    good = results.fitted[:, None] & np.isfinite(results.sigma) & ~results.limit & (model > 0)
+    good &= flux > _MIN_SIGNAL * error
     return flux, error, model, good
 
 
@@ -204,7 +203,7 @@ def measure_template_error(results, *, model_error=0.0, edges=None):
         edges = _EDGES * WAVE
     edges = to_array(edges, WAVE, "edges", ndim=1)
     check_that(
-        is_ascending(edges, least=2), "edges", "two wavelengths or more that increase", edges
+        is_ascending(edges, min_size=2), "edges", "two wavelengths or more that increase", edges
     )
     band_error = per_band(model_error, results.filters, "model_error")
     flux, error, _, good = _residuals(results)

@@ -295,7 +295,7 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
             low = min(negative.min(), positive.min(initial=np.inf))
             snr_edges = np.append(np.linspace(low, max(top, low + 1e-6), 11), np.inf)
     edges = floats(snr_edges)
-    good = is_ascending(edges, least=2)
+    good = is_ascending(edges, min_size=2)
     check_that(good, "snr_edges", "two numbers or more that ascend", snr_edges)
     n_positive, _ = np.histogram(positive, edges)
     n_negative, _ = np.histogram(negative, edges)

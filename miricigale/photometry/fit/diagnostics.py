@@ -212,10 +212,9 @@ def canceling(flux, error, core_flux):
     canceling : bool `~numpy.ndarray`, shape (n,)
         Those above twice the image's light by three errors, or negative by five.
     """
-    with np.errstate(invalid="ignore"):
-        # more than twice the light that is there
-        is_above = flux - 2.0 * np.maximum(core_flux, 0.0) > _ABOVE_LIGHT * error
-        return is_above | (flux < -_NEGATIVE * error)
+    # more than twice the light that is there
+    is_above = flux - 2.0 * np.maximum(core_flux, 0.0) > _ABOVE_LIGHT * error
+    return is_above | (flux < -_NEGATIVE * error)
 
 
 def source_flags(fit, diagnostics, place, flux, blending):

@@ -329,9 +329,8 @@ def _bright_offsets(fit, catalog, moved):
     is_whole = (fit.light > 0.9).all(axis=1) & (catalog.flags[source] & bad == 0)
     rows = np.flatnonzero(is_whole & ~fit.noisy & (row_snr(fit) > _BRIGHT))
     step, error, neighbors = source_offsets(fit, residual, model, rows)
-    with np.errstate(invalid="ignore"):
-        # where residuals are larger than the stated noise the latter overstates the significance
-        keep = np.isfinite(error) & (neighbors < _ISOLATED) & (error < fit.psf_width / _BRIGHT * 2)
+    # where residuals are larger than the stated noise the latter overstates the significance
+    keep = np.isfinite(error) & (neighbors < _ISOLATED) & (error < fit.psf_width / _BRIGHT * 2)
     rows = rows[keep]
     offset = moved[fit.bank.order[rows]] + step[keep]
     return rows, offset, np.hypot(error[keep], _FLOOR)

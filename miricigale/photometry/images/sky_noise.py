@@ -214,8 +214,7 @@ def warn_of_background(result, kernel):
     step = np.s_[:: max(1, residual.data.size // 10_000_000)]
     sigma = residual.uncertainty.array[step]
     data = residual.data[step]
-    with np.errstate(invalid="ignore"):
-        is_free = ~residual.mask[step] & (np.abs(result.model_image.data[step]) < 0.3 * sigma)
+    is_free = ~residual.mask[step] & (np.abs(result.model_image.data[step]) < 0.3 * sigma)
     error = result.flux_err[np.isfinite(result.flux_err)]
     if np.count_nonzero(is_free) < 400 or not len(error):
         return

@@ -111,7 +111,7 @@ def read_ised(path):
         source = _Records(data, order, path)
     out = _content(source)
     for name, array in (("ages", out.age), ("wavelengths", out.wave)):
-        if not is_ascending(array, least=2) or array[0] < 0:
+        if not is_ascending(array, min_size=2) or array[0] < 0:
             raise _foreign(path, f"{name} must be positive and ascending")
     for name, array in (("spectra", out.spectra), *out.quantities.items()):
         if not np.all(np.isfinite(array)):

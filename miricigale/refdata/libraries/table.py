@@ -72,7 +72,7 @@ class LibraryTable:
         else:
             wave = self.wave
         wave = self.__dict__["wave"] = frozen_array(wave)
-        good = is_ascending(wave, least=2) and wave[0] > 0 and np.isfinite(wave[-1])
+        good = is_ascending(wave, min_size=2) and wave[0] > 0 and np.isfinite(wave[-1])
         got = f"{wave.size} of shape {wave.shape}"
         check_that(good, "wave", "two or more positive, ascending wavelengths", got)
         self._check_names()

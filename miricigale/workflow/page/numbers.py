@@ -247,8 +247,7 @@ def _band_numbers(config, tables, name):
     formal = matched[f"{name}_formal_err"].value
     isolated = bright_isolated(matched, name)
     bright = recovery_metrics(true[isolated], flux[isolated], relative=True)
-    with np.errstate(invalid="ignore"):
-        faint = usable & is_complete(matched, name) & (true < 20 * formal) & np.isfinite(flux)
+    faint = usable & is_complete(matched, name) & (true < 20 * formal) & np.isfinite(flux)
     pulls = (flux[faint] - true[faint]) / formal[faint]
     time = pointing_time(config, name)
     median = np.nan

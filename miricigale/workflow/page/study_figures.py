@@ -270,8 +270,7 @@ def detection_figure(study):
     else:
         groups = {"detected in the MIRI band": n_detected >= 1}
     if "mips.24" in table.colnames:
-        with np.errstate(invalid="ignore"):
-            groups["MIPS 24 µm above its limit"] = ab_magnitude(table["mips.24"]) < MIPS_LIMIT
+        groups["MIPS 24 µm above its limit"] = ab_magnitude(table["mips.24"]) < MIPS_LIMIT
     z = np.asarray(table["redshift"], float)
     power = table["ir_luminosity"].to_value(u.Lsun)
     good = reference.field & (power > 0) & np.isfinite(z)

@@ -158,5 +158,4 @@ def bright_isolated(matched, name):
     crowded = has_flag(matched, f"{name}_condition", ConditionFlags.CROWDED)
     true = matched[f"{name}_true"].value
     formal = matched[f"{name}_formal_err"].value
-    with np.errstate(invalid="ignore"):
-        return usable & (true > 20 * formal) & ~crowded
+    return usable & (true > 20 * formal) & ~crowded
