@@ -47,9 +47,6 @@ FAINTER = 1.0
 #: Largest slope of the logarithm of the counts with magnitude: that of a Euclidean universe.
 _STEEPEST = 0.6
 
-#: Attempts to place each source.
-_ATTEMPTS = 50
-
 
 def fitted_shapes(image, segments, sources, psf, n_threads):
     """
@@ -350,38 +347,3 @@ def draw_sources(population, n, star_share, slope, magnitudes, rng):
     sources["flux"] = 10 ** (0.4 * (23.9 - magnitude)) * FNU
     sources["prior_flux"] = 10 ** (0.4 * (23.9 - magnitude - color)) * FNU
     return sources
-
-
-def draw_places(usable, n, separation, rng):
-    """
-    Draw places on usable pixels, apart from each other.
-
-    Parameters
-    ----------
-    usable : bool `~numpy.ndarray`, shape (ny, nx)
-        Pixels on which a source may be.
-    n : int
-        How many.
-    separation : float
-        Least distance in pixels.
-    rng : `~numpy.random.Generator`
-        Random numbers.
-
-    Returns
-    -------
-    xy : `~numpy.ndarray`, shape (m, 2)
-        Pixel positions; fewer than ``n`` where there is no room.
-    """
-    y, x = np.nonzero(usable)
-    places = np.empty((n, 2))
-    m = 0
-    for _ in range(_ATTEMPTS * n):
-        if m == n or not len(x):
-            break
-        k = rng.integers(len(x))
-        place = np.array([x[k], y[k]]) + rng.uniform(-0.5, 0.5, 2)
-        if m and np.min(np.hypot(*(places[:m] - place).T)) < separation:
-            continue
-        places[m] = place
-        m += 1
-    return places[:m]

@@ -109,11 +109,13 @@ class InjectionResult(Interactive):
             If there is no such question or kind.
         """
         check_choice(question, "question", tuple(QUESTIONS))
+        return self._curve(question, self._of_kind(kind))
+
+    def _of_kind(self, kind):
+        """Which sources are of a kind; all of None."""
         check_choice(kind, "kind", (None, "star", "galaxy"))
-        rows = np.ones(len(self.sources), bool)
-        if kind is not None:
-            rows = np.asarray(self.sources["kind"]) == kind
-        return self._curve(question, rows)
+        kinds = np.asarray(self.sources["kind"])
+        return (kinds == kind) | (kind is None)
 
     def _curve(self, question, rows):
         if not rows.any():
@@ -151,10 +153,7 @@ class InjectionResult(Interactive):
             If there is no such bin or kind.
         """
         check_choice(by, "by", BINNED_BY)
-        check_choice(kind, "kind", (None, "star", "galaxy"))
-        chosen = np.ones(len(self.sources), bool)
-        if kind is not None:
-            chosen = np.asarray(self.sources["kind"]) == kind
+        chosen = self._of_kind(kind)
         limits = {}
         if by != "magnitude":
             for question in QUESTIONS:

@@ -9,13 +9,12 @@ from miricigale.injection.population import (
     FAINTER,
     SHAPE,
     counts_slope,
-    draw_places,
     draw_sources,
     measured_population,
 )
 from miricigale.instrument.image import Image
 from miricigale.photometry import ForcedFlags, detect_sources
-from miricigale.photometry.images.arrays import nearest_values, pixel_scale
+from miricigale.photometry.images.arrays import draw_places, nearest_values, pixel_scale
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that

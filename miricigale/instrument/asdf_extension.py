@@ -17,7 +17,7 @@ from astropy.modeling.models import (
 
 from miricigale.instrument.siaf import attitude_matrix, unit_vector, vector_angles
 from miricigale.instrument.sky_axes import pixel_to_radec
-from miricigale.instrument.wcs import scaled_fit
+from miricigale.instrument.wcs import chebyshev_pixels, scaled_fit
 from miricigale.utils.exceptions import file_errors
 from miricigale.utils.optional_packages import require
 
@@ -175,10 +175,8 @@ def imager_gwcs(wcs, shape, header):
 
     ra, dec, roll, v2, v3 = (float(header[name]) for name in _REFERENCE)
     ny, nx = shape
-    nodes = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
-    x, y = np.meshgrid((nx / 2) * (1 + nodes) - 0.5, (ny / 2) * (1 + nodes) - 0.5)
     # the first is the middle, from which the polynomials count
-    pixel = np.stack([np.append(nodes.mean(), nodes) for nodes in (x, y)])
+    pixel = np.stack([np.append(nodes.mean(), nodes) for nodes in chebyshev_pixels(shape)])
     matrix = attitude_matrix(ra, dec, roll, v2=v2, v3=v3)
     sky_lon, sky_lat = np.radians(pixel_to_radec(wcs, pixel[0], pixel[1]))
     v2v3 = np.degrees(vector_angles(matrix.T @ unit_vector(sky_lon, sky_lat))) * 3600

@@ -239,10 +239,7 @@ def _compare_with_gwcs(wcs, hdus, shape, file):
     exact = read_gwcs(hdus, optional=True)
     if exact is None:
         return
-    ny, nx = shape
-    x = np.array([0, nx - 1, 0, nx - 1, (nx - 1) / 2])
-    y = np.array([0, 0, ny - 1, ny - 1, (ny - 1) / 2])
-    offset = _pixels_apart(wcs, exact, x, y)
+    offset = _pixels_apart(wcs, exact, *compared_pixels(shape))
     if offset > _APART:
         msg = (
             f"{file}: the coordinates in its header and those in its extension ASDF (gwcs) are up to {offset:.3g} "
@@ -250,6 +247,14 @@ def _compare_with_gwcs(wcs, hdus, shape, file):
             "the header; if not, the extension ASDF"
         )
         warn(msg, PhotometryWarning)
+
+
+def compared_pixels(shape):
+    """Return x and y of the corners and the middle of an image, where two coordinates are compared."""
+    ny, nx = shape
+    x = np.array([0, nx - 1, 0, nx - 1, (nx - 1) / 2])
+    y = np.array([0, 0, ny - 1, ny - 1, (ny - 1) / 2])
+    return x, y
 
 
 def _pixels_apart(wcs, reference, x, y):

@@ -81,6 +81,13 @@ def scaled_fit(x, y, values, order):
     return tables
 
 
+def chebyshev_pixels(shape):
+    """Return x and y of 40 x 40 Chebyshev nodes on an image: fits are as good at its edge as inside."""
+    ny, nx = shape
+    nodes = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
+    return np.meshgrid((nx / 2) * (1 + nodes) - 0.5, (ny / 2) * (1 + nodes) - 0.5)
+
+
 @cached
 def _sip(subarray):
     """
@@ -90,10 +97,7 @@ def _sip(subarray):
     frame, so one fit serves every pointing and roll.
     """
     part = aperture(subarray)
-    ny, nx = part.shape
-    # Chebyshev nodes: the fit is as good at the edge as inside
-    nodes = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
-    gx, gy = np.meshgrid((nx / 2) * (1 + nodes) - 0.5, (ny / 2) * (1 + nodes) - 0.5)
+    gx, gy = chebyshev_pixels(part.shape)
     v2_ref, v3_ref = pixel_to_v2v3(*part.reference, subarray=subarray)
     matrix = attitude_matrix(0.0, 0.0, 0.0, v2=float(v2_ref), v3=float(v3_ref))
     v2, v3 = pixel_to_v2v3(gx, gy, subarray=subarray)

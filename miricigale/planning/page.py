@@ -10,6 +10,7 @@ from miricigale.planning.browser import MAX_SOURCES, write_browser
 from miricigale.planning.exposures import background_options
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, new_figure, plain_text
 from miricigale.utils.package_tables import declared
+from miricigale.utils.tables import plain_rows
 from miricigale.workflow.background import background_text
 from miricigale.workflow.page.study_figures import redshift_figure
 
@@ -122,8 +123,7 @@ def _bands_in_words(name, plans):
 
 def _entries(table):
     """Rows of a table as dictionaries of plain values, with what bands and frames are called."""
-    for row in table:
-        entry = {name: getattr(row[name], "value", row[name]) for name in table.colnames}
+    for entry in plain_rows(table):
         if "filter" in entry:
             entry["band"] = entry["filter"].removeprefix("miri.")
         if "groups" in entry:

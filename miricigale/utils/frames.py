@@ -4,6 +4,7 @@ import numpy as np
 
 from miricigale.utils.exceptions import CatalogWarning, warn
 from miricigale.utils.ids import is_id_name, is_written_index
+from miricigale.utils.missing_values import between_missing
 from miricigale.utils.named_values import subset
 from miricigale.utils.options import check_that
 
@@ -65,9 +66,7 @@ def as_column(values):
     if isinstance(values, list) and any(value is None for value in values):
         missing = np.array([value is None for value in values])
         present = np.array([value for value in values if value is not None])
-        out = np.zeros(len(values), dtype=present.dtype)
-        out[~missing] = present
-        return np.ma.MaskedArray(out, mask=missing)
+        return np.ma.MaskedArray(between_missing(present, missing), mask=missing)
     return values
 
 
@@ -114,10 +113,8 @@ def _of_series(series):
     present = series[~missing].to_numpy()
     if present.dtype.kind == "O":
         present = np.array(present.tolist())
+    out = between_missing(present, missing)
     if present.dtype.kind == "f":
-        out = np.full(len(series), np.nan, dtype=present.dtype)
-        out[~missing] = present
+        out[missing] = np.nan
         return out
-    out = np.zeros(len(series), dtype=present.dtype)
-    out[~missing] = present
     return np.ma.MaskedArray(out, mask=missing)

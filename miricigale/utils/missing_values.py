@@ -178,6 +178,13 @@ def mask_of(values):
     return mask
 
 
+def between_missing(present, missing):
+    """Put the values that are there in their places, and zeros or empty text where ``missing`` (bool) is True."""
+    values = np.zeros(missing.size, dtype=present.dtype)
+    values[~missing] = present
+    return values
+
+
 def without_mask(values):
     """
     Take values and their mask apart.
@@ -196,9 +203,7 @@ def without_mask(values):
     """
     if hasattr(values, "isna") and hasattr(values, "to_numpy"):
         missing = np.asarray(values.isna(), dtype=bool)
-        present = values[~missing].to_numpy()
-        unmasked = np.zeros(len(values), dtype=present.dtype)
-        unmasked[~missing] = present
+        unmasked = between_missing(values[~missing].to_numpy(), missing)
         return unmasked, (missing if missing.any() else None)
     if isinstance(values, (list, tuple)) and any(
         value is None or value is np.ma.masked for value in values

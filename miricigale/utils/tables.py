@@ -263,6 +263,12 @@ def row_dicts(table):
     return [dict(zip(table.colnames, row, strict=True)) for row in table]
 
 
+def plain_rows(table):
+    """Yield rows of a table as dicts by column, of quantities the values."""
+    for row in table:
+        yield {name: getattr(row[name], "value", row[name]) for name in table.colnames}
+
+
 def read_ids(table, argument="photometry"):
     """
     Ids of a catalog: integers, or text whether it came as such or as bytes (`miricigale.utils.ids`).

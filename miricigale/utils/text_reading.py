@@ -17,7 +17,7 @@ from miricigale.utils.exceptions import CatalogWarning, warn
 from miricigale.utils.files import is_zip, packed_open
 from miricigale.utils.fits_tables import check_names_differ
 from miricigale.utils.ids import WRITTEN_INDEX, ids_of_text, is_id_name, is_written_index
-from miricigale.utils.missing_values import is_missing_word
+from miricigale.utils.missing_values import between_missing, is_missing_word
 from miricigale.utils.region_files import region_table
 from miricigale.utils.text_tables import (
     commas_for_tabs,
@@ -175,8 +175,7 @@ def _ids_as_written(table, path, source, layout, names):
             # a word may be an id among text
             missing = column.mask | (texts == "")
             ids = texts[~missing]
-        texts_as_numbers = np.zeros(len(texts), dtype=ids.dtype)
-        texts_as_numbers[~missing] = ids
+        texts_as_numbers = between_missing(ids, missing)
         if missing.any():
             table[name] = MaskedColumn(texts_as_numbers, mask=missing)
         else:

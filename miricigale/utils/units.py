@@ -259,7 +259,7 @@ def is_number(value, kind=np.number):
 
 
 def is_ascending(values, min_size=1):
-    """Whether an array has one dimension and ``min_size`` values or more, each above the one before; NaN is not."""
+    """Whether an array has one dimension and ``min_size`` values or more, each above the last; NaN is not."""
     return values.ndim == 1 and values.size >= min_size and bool(np.all(np.diff(values) > 0))
 
 

@@ -14,9 +14,10 @@ from miricigale.cli import main
 from miricigale.injection import CompletenessCurve, Injection, InjectionResult
 from miricigale.injection.field import ImageField, joined_segments, recovered_rows
 from miricigale.injection.light import light_on_file, light_on_image, psf_on_pixels
-from miricigale.injection.population import counts_slope, draw_magnitudes, draw_places, read_sources
+from miricigale.injection.population import counts_slope, draw_magnitudes, read_sources
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import MosaicFile, detect_sources, measure_files
+from miricigale.photometry.images.arrays import draw_places
 from miricigale.psf import gaussian_psf
 from miricigale.utils.exceptions import OtherResultsError
 from miricigale.utils.tables import match_sky

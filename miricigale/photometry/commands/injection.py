@@ -14,8 +14,8 @@ from miricigale.photometry.detection.detection import bright_centroids
 from miricigale.photometry.errors.error_calibration import ErrorCalibration
 from miricigale.photometry.fit.forced import ForcedPhotometer
 from miricigale.photometry.images.arrays import (
+    draw_places,
     image_arrays,
-    lengths,
     nearest_values,
     pixel_scale,
     pixels_to_sky,
@@ -36,9 +36,8 @@ from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, check_count
 #: Radius (fine pixels) of a profile that is as good as a point.
 _POINT = 0.05
 
-#: Least distance of two injected sources in widths of the PSF (FWHM), and attempts to place each.
+#: Least distance of two injected sources in widths of the PSF (FWHM).
 _APART = 4.0
-_ATTEMPTS = 50
 
 #: Injected fluxes, over the median error of sources by noise: uniform in the logarithm between these.
 _SNR_RANGE = (1.0, 100.0)
@@ -218,29 +217,15 @@ class _Field:
             return None
         return _Donor(parameters, float(light), mask, corner, kind == "point")
 
-    def _places(self, n, rng):
-        """Draw positions (x, y) on usable pixels of the image, apart from each other."""
-        y, x = np.nonzero(self.arrays.usable)
-        # in pixels of the image
-        min_distance = _APART * self.fwhm / pixel_scale(self.image.wcs)
-        positions = []
-        for _ in range(_ATTEMPTS * n):
-            if len(positions) == n:
-                break
-            k = rng.integers(len(x))
-            at = np.array([x[k], y[k]]) + rng.uniform(-0.5, 0.5, 2)
-            if positions and np.min(lengths(np.array(positions) - at)) < min_distance:
-                continue
-            positions.append(at)
-        return positions
-
     def trial(self, n, rng):
         """Inject sources and measure them: a table of true and measured fluxes."""
-        at = self._places(2 * n, rng)
+        # apart from each other, in pixels of the image
+        separation = _APART * self.fwhm / pixel_scale(self.image.wcs)
+        at = draw_places(self.arrays.usable, 2 * n, separation, rng)
         check_that(len(at) >= 2, "image", "large enough for sources", "none")
         # every other place stays empty
-        full = np.array(at[::2])
-        empty = np.array(at[1::2])
+        full = at[::2]
+        empty = at[1::2]
         low, high = np.log(_SNR_RANGE)
         flux = self.error * np.exp(rng.uniform(low, high, len(full)))
         if self.donors:

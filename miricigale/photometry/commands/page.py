@@ -22,7 +22,7 @@ from miricigale.plotting.posteriors import plot_pulls
 from miricigale.psf.star_fit import TERMS
 from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.package_tables import declared
-from miricigale.utils.tables import row_dicts
+from miricigale.utils.tables import plain_rows, row_dicts
 from miricigale.utils.units import ANGLE, ab_magnitude
 
 #: Largest number of pixels across a drawing of a whole image, rows of a table, arcsec across a source.
@@ -153,17 +153,11 @@ def _notices(page, bands, highres):
 def _exposure_rows(table):
     """Make rows of the table of exposures that were fitted together."""
     rows = []
-    for exposure in table:
-        row = _plain_values(exposure, table.colnames)
+    for row in plain_rows(table):
         offset = f"{row['offset_east']:+.3f}, {row['offset_north']:+.3f} ± {row['offset_err']:.3f}"
         sky = f"{row['sky']:.5g} ± {row['sky_err']:.1g}"
         rows.append(row | {"source": Path(row["source"]).name, "offset": offset, "level": sky})
     return rows
-
-
-def _plain_values(row, names):
-    """Return columns of a row of a table by name, without units."""
-    return {name: getattr(row[name], "value", row[name]) for name in names}
 
 
 def _pairs(meta):
@@ -379,8 +373,7 @@ def _source_rows(result, confidence):
     order = np.argsort(np.nan_to_num(-result.flux.value, nan=np.inf), kind="stable")[:_ROWS]
     table = result.to_table(confidence=confidence)[order]
     rows = []
-    for source in table:
-        row = _plain_values(source, table.colnames)
+    for source, row in zip(table, plain_rows(table), strict=True):
         flags = ", ".join(ForcedFlags.names(row["flags"])).replace("_", " ") or "none"
         position = {"ra": f"{source['sky'].ra.deg:.5f}", "dec": f"{source['sky'].dec.deg:.5f}"}
         limit = float(ab_magnitude(source["upper"]))

@@ -15,6 +15,9 @@ from miricigale.utils.positions import middle_pixel, plain_positions
 from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS, scalar
 from miricigale.utils.values import value_class
 
+#: Attempts to place each of some sources apart from each other.
+_ATTEMPTS = 50
+
 #: uJy per MJy.
 _MICRO = 1e12
 
@@ -184,6 +187,41 @@ def pixel_scale(wcs):
 def lengths(vectors):
     """Return the lengths of vectors (x, y), shape (n, 2)."""
     return np.hypot(vectors[:, 0], vectors[:, 1])
+
+
+def draw_places(usable, n, separation, rng):
+    """
+    Draw places on usable pixels, apart from each other.
+
+    Parameters
+    ----------
+    usable : bool `~numpy.ndarray`, shape (ny, nx)
+        Pixels on which a source may be.
+    n : int
+        How many.
+    separation : float
+        Least distance in pixels.
+    rng : `~numpy.random.Generator`
+        Random numbers.
+
+    Returns
+    -------
+    xy : `~numpy.ndarray`, shape (m, 2)
+        Pixel positions; fewer than ``n`` where there is no room.
+    """
+    y, x = np.nonzero(usable)
+    places = np.empty((n, 2))
+    m = 0
+    for _ in range(_ATTEMPTS * n):
+        if m == n or not len(x):
+            break
+        k = rng.integers(len(x))
+        place = np.array([x[k], y[k]]) + rng.uniform(-0.5, 0.5, 2)
+        if m and np.min(np.hypot(*(places[:m] - place).T)) < separation:
+            continue
+        places[m] = place
+        m += 1
+    return places[:m]
 
 
 def pixels_to_sky(xy, wcs):

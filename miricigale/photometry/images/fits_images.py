@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
 
-from miricigale.instrument.header_wcs import image_wcs
+from miricigale.instrument.header_wcs import compared_pixels, image_wcs
 from miricigale.instrument.image_planes import plane_shape
 from miricigale.instrument.sky_axes import grid_angle as grid_angle
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
@@ -263,9 +263,7 @@ def check_same_grid(wcs, reference, shape, path, reference_path):
     """
     from astropy.wcs.utils import pixel_to_pixel
 
-    ny, nx = shape
-    x = np.array([0, nx - 1, 0, nx - 1, (nx - 1) / 2])
-    y = np.array([0, 0, ny - 1, ny - 1, (ny - 1) / 2])
+    x, y = compared_pixels(shape)
     place = pixel_to_pixel(reference, wcs, x, y)
     distance = np.hypot(place[0] - x, place[1] - y)
     if not np.all(distance <= 0.1):
