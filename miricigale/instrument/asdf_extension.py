@@ -35,7 +35,7 @@ _INVERSE = 8
 _REFERENCE = ("RA_REF", "DEC_REF", "ROLL_REF", "V2_REF", "V3_REF")
 
 
-def read_gwcs(hdus, *, optional=False):
+def read_gwcs(hdus):
     """
     Read the gwcs in the extension ASDF of JWST's pipeline.
 
@@ -43,36 +43,32 @@ def read_gwcs(hdus, *, optional=False):
     ----------
     hdus : `~astropy.io.fits.HDUList`
         The file, with an extension ASDF.
-    optional : bool, optional
-        Whether None is returned if the extension has none.
 
     Returns
     -------
     exact : `gwcs.WCS` or None
+        None if the extension has none.
 
     Raises
     ------
     ImportError
         If gwcs is not installed.
     `~miricigale.utils.exceptions.DataError`
-        If the extension has no gwcs and ``optional`` is False.
+        If the extension cannot be read.
     """
     require("gwcs", extra="gwcs")
     asdf = require("asdf", extra="gwcs")
     content = np.asarray(hdus["ASDF"].data["ASDF_METADATA"][0]).tobytes()
     refused = file_errors(hdus.filename(), "has no gwcs in its extension ASDF")
     with refused, asdf.open(io.BytesIO(content)) as tree:
-        meta = tree.tree.get("meta", {})
-        if optional and meta.get("wcs") is None:
-            return None
-        return meta["wcs"]
+        return tree.tree.get("meta", {}).get("wcs")
 
 
-def asdf_wcs(header, hdus, *, optional=False):
-    """The gwcs in the extension ASDF of JWST's pipeline (`read_gwcs`), as FITS polynomials good to 0.01 pixels."""
+def asdf_wcs(header, hdus):
+    """The gwcs in the extension ASDF, if it has one (`read_gwcs`), as FITS polynomials good to 0.01 pixels."""
     from astropy.wcs import WCS
 
-    exact = read_gwcs(hdus, optional=optional)
+    exact = read_gwcs(hdus)
     if exact is None:
         return None
     box = tuple((-0.5, header[f"NAXIS{k}"] - 0.5) for k in (1, 2))

@@ -172,11 +172,11 @@ def image_wcs(header, hdus):
     if "ASDF" not in hdus:
         return wcs
     if wcs is None:
-        return asdf_wcs(header, hdus, optional=True)
+        return asdf_wcs(header, hdus)
     shape = header["NAXIS2"], header["NAXIS1"]
     if is_exposure(lambda key: header.get(key, hdus[0].header.get(key))) and wcs.sip is None:
         try:
-            distorted = asdf_wcs(header, hdus, optional=True)
+            distorted = asdf_wcs(header, hdus)
         except ImportError as err:
             msg = (
                 f"{file}: the coordinates in the header lack the distortion, which is in "
@@ -236,7 +236,7 @@ def _compare_with_gwcs(wcs, hdus, shape, file):
     """Warn if the gwcs of a file, where it can be read, says something else than its header."""
     if any(importlib.util.find_spec(name) is None for name in ("gwcs", "asdf")):
         return
-    exact = read_gwcs(hdus, optional=True)
+    exact = read_gwcs(hdus)
     if exact is None:
         return
     offset = _pixels_apart(wcs, exact, *compared_pixels(shape))

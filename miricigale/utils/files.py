@@ -322,16 +322,20 @@ def unpacked_size(path):
     return n_bytes
 
 
+def _start(path):
+    """First bytes of a file, which say how it is packed."""
+    with open(path, "rb") as stream:
+        return stream.read(6)
+
+
 def is_zip(path):
     """Whether a file is a zip archive."""
-    with open(path, "rb") as stream:
-        return stream.read(len(_ZIP)) == _ZIP
+    return _start(path).startswith(_ZIP)
 
 
 def packed_open(path):
     """Open a file for reading bytes, unpacked if it is packed by gzip, bzip2 or xz, or alone in a zip archive."""
-    with open(path, "rb") as stream:
-        start = stream.read(6)
+    start = _start(path)
     if start.startswith(_ZIP):
         # refuses what unpacks to too much, before it is in memory
         unpacked_size(path)
@@ -350,8 +354,7 @@ def packed_open(path):
 @cached_by_file(256)
 def _count(path, limit):
     """Bytes after unpacking; one more than the most if there are more."""
-    with open(path, "rb") as stream:
-        start = stream.read(6)
+    start = _start(path)
     if start.startswith(_ZIP):
         with zipfile.ZipFile(path) as archive:
             return sum(member.file_size for member in archive.infolist())

@@ -320,21 +320,25 @@ def _known_floats(column, name, argument):
     return values
 
 
+def _factor(column, unit, kind, name, argument):
+    """Factor from the unit of a column, by default ``unit``, to this one."""
+    column_unit = u.Unit(getattr(column, "unit", None) or unit)
+    if not column_unit.is_equivalent(unit):
+        raise units_error(argument, kind, column_unit, column=name)
+    return column_unit.to(unit)
+
+
 def _motion(table, name, argument):
     """Proper motions, mas / yr, NaN where they are missing."""
     column = table[name]
-    unit = u.Unit(getattr(column, "unit", None) or _MOTION)
-    if not unit.is_equivalent(_MOTION):
-        raise units_error(argument, "a proper motion", unit, column=name)
-    return _known_floats(column, name, argument) * unit.to(_MOTION)
+    factor = _factor(column, _MOTION, "a proper motion", name, argument)
+    return _known_floats(column, name, argument) * factor
 
 
 def _plain_years(column, name, argument):
     """Years as plain floats, NaN where they are missing."""
-    unit = u.Unit(getattr(column, "unit", None) or u.yr)
-    if not unit.is_equivalent(u.yr):
-        raise units_error(argument, "years", unit, column=name)
-    return plain_floats(column, name, argument) * unit.to(u.yr)
+    factor = _factor(column, u.yr, "years", name, argument)
+    return plain_floats(column, name, argument) * factor
 
 
 def _by_plain_name(colnames):
@@ -342,9 +346,9 @@ def _by_plain_name(colnames):
     columns = {}
     for name in colnames:
         lower = name.lower()
-        plain = lower.removesuffix("_j2000")
-        if plain not in columns or plain == lower:
-            columns[plain] = name
+        stem = lower.removesuffix("_j2000")
+        if stem not in columns or stem == lower:
+            columns[stem] = name
     return columns
 
 

@@ -41,6 +41,13 @@ def native(array):
     return np.ascontiguousarray(array, dtype=dtype)
 
 
+def _also(mask, bad):
+    """Return a mask, or None, with further pixels masked."""
+    if mask is None:
+        return bad
+    return mask | bad
+
+
 def _image(data, mask):
     """Return native data with non-finite pixels zeroed and added to the mask."""
     data = native(data)
@@ -53,10 +60,7 @@ def _image(data, mask):
         check_that(mask.shape == data.shape, "mask", "of the image's shape", got)
     bad = ~np.isfinite(data)
     if bad.any():
-        if mask is None:
-            mask = bad
-        else:
-            mask = mask | bad
+        mask = _also(mask, bad)
         data = np.where(bad, data.dtype.type(0), data)
     return data, mask
 
@@ -157,10 +161,7 @@ def extract(
     check_that(err.shape == data.shape, "err", f"of the image's shape {data.shape}", str(err.shape))
     bad = ~(np.isfinite(err) & (err > 0))
     if bad.any():
-        if mask is None:
-            mask = bad
-        else:
-            mask = mask | bad
+        mask = _also(mask, bad)
         err = np.where(bad, err.dtype.type(1), err)
     # sep's buffer of detected pixels never overflows, also where all of them are above the threshold
     stack = data.size + data.shape[1] + 16

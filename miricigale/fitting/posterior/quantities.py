@@ -82,16 +82,12 @@ def _weighted_summary(value, weight, with_log):
     return np.array([mean, std, log]), np.interp(DERIVED_LEVELS, place, value[order])
 
 
-def put_draws(results, new, i, values, weight=None):
-    """
-    Put moments and quantiles of derived quantities of draws, by name, into arrays of results, row ``i``.
-
-    Draws have the same weight, or the weights ``weight``.
-    """
+def put_draws(results, new, i, values):
+    """Put moments and quantiles of derived quantities of draws, by name, into arrays of results, row ``i``."""
     for j, name in enumerate(results.quantities):
         if name in values:
             with_log = np.isfinite(results.moments[i, j, 2])
-            moments, quantiles = draws_summary(values[name], with_log=with_log, weight=weight)
+            moments, quantiles = draws_summary(values[name], with_log=with_log)
             new["moments"][i, j] = moments
             new["quantiles"][i, j] = quantiles
 

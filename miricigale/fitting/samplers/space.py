@@ -11,6 +11,7 @@ from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.fitting.posterior.priors import integrals_to, known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import without
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.units import are_not_negative
 from miricigale.utils.values import value_class
@@ -278,14 +279,14 @@ class Space:
                 constants[name] = prior
         return cls(free_priors, constants)
 
-    def with_prior(self, name, prior):
-        """Copy in which a parameter has another prior, or a value."""
-        free_priors = {key: value for key, value in self.free.items() if key != name}
-        constants = {key: value for key, value in self.fixed.items() if key != name}
+    def with_redshift(self, prior):
+        """Copy in which the redshift has another prior, or a value."""
+        free_priors = without(self.free, ["redshift"])
+        constants = without(self.fixed, ["redshift"])
         if isinstance(prior, float):
-            constants[name] = prior
+            constants["redshift"] = prior
         else:
-            free_priors[name] = prior
+            free_priors["redshift"] = prior
         return replace(self, free=free_priors, fixed=constants)
 
     @property
@@ -302,7 +303,7 @@ class Space:
         flags[missing] |= FitFlags.NO_REDSHIFT
         flags[outside] |= FitFlags.REDSHIFT_OUTSIDE
         good = np.where(missing | outside, 0.5 * (low + high), values)
-        return [self.with_prior("redshift", float(z)) for z in good]
+        return [self.with_redshift(float(z)) for z in good]
 
     def with_densities(self, limits, redshift_prior, flags):
         """
@@ -320,7 +321,7 @@ class Space:
             if prior is None:
                 flags[row] |= FitFlags.NO_MODEL
                 prior = Flat(low, high)
-            out.append(self.with_prior("redshift", prior))
+            out.append(self.with_redshift(prior))
         return out
 
     def values(self, points):
