@@ -232,6 +232,7 @@ def test_several_bands_are_measured_in_one_call(files, tmp_path, capsys):
     ):
         assert text in page
     facts = (folder / "out-sources.html").read_text()
+    assert f"<h1>Forced photometry: {BAND}, {red}</h1>" in facts
     assert f'"mag_{red}"' in facts
     assert len(list((folder / "out-sources").iterdir())) == 2
     # an option given once for two images, and one filter twice

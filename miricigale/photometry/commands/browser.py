@@ -77,10 +77,10 @@ def write_browser(path, title, bands, highres, confidence, detected):
         table |= {f"chi2_{band}": result.chi2, f"flags_{band}": result.flags}
         of_limit = {"digits": 2, "limit": f"limit_{band}"}
         columns["AB"].append(list_column(f"mag_{band}", label, limited, group="AB", **of_limit))
-        title = "template-weighted mean of (residual / sigma)²"
-        columns["χ²"].append(list_column(f"chi2_{band}", label, title, group="χ²", digits=2))
-        title = "measured flux over its error"
-        columns["S/N"].append(list_column(f"sn_{band}", label, title, group="S/N", digits=1))
+        of_fit = "template-weighted mean of (residual / sigma)²"
+        columns["χ²"].append(list_column(f"chi2_{band}", label, of_fit, group="χ²", digits=2))
+        of_ratio = "measured flux over its error"
+        columns["S/N"].append(list_column(f"sn_{band}", label, of_ratio, group="S/N", digits=1))
         flag_columns.append([f"flags_{band}", "photometry", label])
     table["with_magnitude"] = has_magnitude
     # the columns in the order of the page
