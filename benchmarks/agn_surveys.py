@@ -1,16 +1,18 @@
 """
 How well `miricigale.agn.draw_shares` counts AGN in mock surveys of fitted objects of which the AGN are known.
 
-    python benchmarks/agn_surveys.py [--n 600] [--errors-of-models] [--surveys 40] [--tables FILE]
+    python benchmarks/agn_surveys.py [--n 600] [--errors stated|models|true-models] [--surveys 40] [--tables FILE]
 
 Truths are models of `SEDModel.survey` between the nodes of its axes, drawn with the priors of the fit at z = 0.2
-to 4 (F444W < 26), half of them with an AGN, in six bands of NIRCam, two of ACS and six of MIRI. Errors are the
-depths of `DEPTHS` and 5 % of the flux, with ``--errors-of-models`` also those of `SurveyCalibration.survey`, by
-which mock fluxes scatter. Mock surveys are drawn from one half of the objects, with AGN in 8 or 25 % of them and
-three distributions of their fractions. Each line: size, share of AGN, distribution; the sum of the counted AGN
-(medians) with a fraction of 0.2 or more over the true ones, with its error; the share of totals, and of bins of
-redshift and luminosity (fractions of 0.1 or more), whose 68 % interval holds the truth, by randomized ranks.
-``--tables`` keeps the posteriors, for they take nearly all of the time, 0.2 CPU-seconds an object.
+to 4 (F444W < 26), half of them with an AGN, in equal numbers by fraction, in six bands of NIRCam, two of ACS and
+six of MIRI. Errors are the depths of `DEPTHS` and 5 % of the flux, with ``--errors models`` also those of
+`SurveyCalibration.survey`, by which mock fluxes scatter. A fit takes these as parts of the measured flux; with
+``true-models`` it is given them as parts of the true one, which no user knows. Mock surveys are drawn from one
+half of the objects, with AGN in 8 or 25 % of them and three distributions of their fractions. Each line: size,
+share of AGN, distribution; the sum of the counted AGN (medians) with a fraction of 0.2 or more over the true
+ones, with its error; the share of totals, and of bins of redshift and luminosity (fractions of 0.1 or more),
+whose 68 % interval holds the truth, by randomized ranks. ``--tables`` keeps the posteriors, for they take nearly
+all of the time, 0.2 CPU-seconds an object.
 """
 
 import argparse
@@ -62,13 +64,13 @@ DISTRIBUTIONS = {
 HALF_OF_INTERVAL = 0.3413
 
 
-def make_fitter(errors_of_models):
+def make_fitter(errors):
     """Fitter of all objects."""
     axes = SEDModel.survey_axes()
     z = axes["redshift"]
     axes["redshift"] = z[(z > REDSHIFTS[0]) & (z < REDSHIFTS[1])]
     template_error = None
-    if errors_of_models:
+    if errors == "models":
         template_error = SurveyCalibration.survey().template_error
     return BayesFitter(
         SEDModel.survey(),
@@ -76,28 +78,46 @@ def make_fitter(errors_of_models):
         axes=axes,
         priors={"frac_agn": agn_fraction_prior(axes["frac_agn"])},
         calibration=None,
-        model_error=MODEL_ERROR,
+        model_error=0.0 if errors == "true-models" else MODEL_ERROR,
         template_error=template_error,
         settings=GridSettings(agn_bins=BINS, mass_function=MassFunction()),
     )
 
 
 def draw_models(fitter, n, rng):
-    """Values of parameters drawn from the priors of a fitter but for mass, half of them with an AGN: dict."""
+    """
+    Values of parameters drawn from the priors of a fitter but for mass: dict.
+
+    Half of the models have an AGN, with equal numbers in all bins of the fraction and the prior within these.
+    """
     priors = fitter.priors
     galaxy = rng.choice(priors.galaxy.size, n, p=priors.galaxy / priors.galaxy.sum())
     values = {}
     for name, axis in fitter.backend.between.axes.items():
         low, high = np.clip(axis.cells(), axis.values[0], axis.values[-1])
-        weights = np.array(axis.weights)
         if axis.kind == "galaxy":
             node = np.argmax(axis.share[:, galaxy], axis=0)
         else:
-            if name == "frac_agn":
-                weights[0] = weights[1:].sum()
-            node = rng.choice(axis.values.size, n, p=weights / weights.sum())
+            node = rng.choice(axis.values.size, n, p=axis.weights)
         values[name] = low[node] + (high - low)[node] * rng.random(n)
+        if name == "frac_agn":
+            values[name] = _equal_in_bins(values[name], rng)
     return values
+
+
+def _equal_in_bins(fraction, rng):
+    """Draw fractions of the prior again: half of them 0, the others with equal numbers in all bins."""
+    ones = np.ones(fraction.size)
+    _, place, _ = BINS.place(ones, fraction, ones)
+    n_bins = len(BINS.frac_agn) - 1
+    wanted = np.where(
+        rng.random(fraction.size) < 0.5, 0, rng.integers(1, n_bins + 1, fraction.size)
+    )
+    out = np.zeros(fraction.size)
+    for j in range(1, n_bins + 1):
+        chosen = wanted == j
+        out[chosen] = rng.choice(fraction[place == j], chosen.sum())
+    return out
 
 
 def draw_truths(fitter, n, rng):
@@ -129,28 +149,30 @@ def draw_truths(fitter, n, rng):
     return flux[accepted], z[accepted], rows["frac_agn"], luminosity
 
 
-def observe(flux, redshift, template_error, rng):
+def observe(flux, redshift, errors, rng):
     """Photometry of fluxes in uJy, with noise."""
     part = np.full(flux.shape, MODEL_ERROR)
-    if template_error is not None:
+    if errors != "stated":
         rest = pivots(DEPTHS).to_value(u.um) / (1.0 + redshift[:, None])
-        part = np.hypot(part, template_error(rest * u.um))
+        part = np.hypot(part, SurveyCalibration.survey().template_error(rest * u.um))
     table = QTable({"id": np.arange(len(flux))})
     for j, (band, depth) in enumerate(DEPTHS.items()):
         error = 0.2 * (depth * u.ABmag).to_value(u.uJy)
         noise = error * rng.standard_normal(len(flux))
         noise += part[:, j] * flux[:, j] * rng.standard_normal(len(flux))
         table[band] = (flux[:, j] + noise) * u.uJy
-        table[error_column(band)] = np.full(len(flux), error) * u.uJy
+        if errors == "true-models":
+            error = np.hypot(error, part[:, j] * flux[:, j])
+        table[error_column(band)] = error * np.ones(len(flux)) * u.uJy
     return table
 
 
-def fitted_objects(n, errors_of_models, seed):
+def fitted_objects(n, errors, seed):
     """Posteriors of objects in bins, their true bins, and the prior of the bins of the fraction: dict."""
     rng = np.random.default_rng(seed)
-    fitter = make_fitter(errors_of_models)
+    fitter = make_fitter(errors)
     flux, redshift, fraction, luminosity = draw_truths(fitter, n, rng)
-    results = fitter.fit(observe(flux, redshift, fitter.template_error, rng))
+    results = fitter.fit(observe(flux, redshift, errors, rng))
     z_bin, frac_bin, l_bin = BINS.place(redshift, fraction, luminosity)
     return {
         "table": results.agn_weights,
@@ -224,7 +246,8 @@ def main():
     """Run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--n", type=int, default=600, help="objects that are fitted")
-    parser.add_argument("--errors-of-models", action="store_true")
+    kinds = ("stated", "models", "true-models")
+    parser.add_argument("--errors", choices=kinds, default="stated")
     parser.add_argument("--surveys", type=int, default=40, help="mock surveys a line")
     parser.add_argument("--sizes", type=int, nargs="+", default=[400], help="objects of a survey")
     parser.add_argument("--tables", type=Path, help="where posteriors are kept (npz)")
@@ -234,7 +257,7 @@ def main():
     if args.tables is not None and args.tables.exists():
         objects = dict(np.load(args.tables))
     else:
-        objects = fitted_objects(args.n, args.errors_of_models, args.seed)
+        objects = fitted_objects(args.n, args.errors, args.seed)
         if args.tables is not None:
             np.savez(args.tables, **objects)
     usable = np.isfinite(objects["table"].sum(axis=(1, 2, 3)))

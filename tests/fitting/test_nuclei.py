@@ -12,6 +12,7 @@ from helpers import grids
 from helpers.errors import refuses
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings
 from miricigale.fitting.grid.nuclei import _cholesky
+from miricigale.fitting.posterior.posterior import randomized_ranks
 from miricigale.utils.exceptions import FitWarning
 
 N = 5
@@ -153,6 +154,47 @@ def test_likelihoods_between_nodes_are_those_of_correlated_data(grid, catalog, m
 
 
 @pytest.mark.parametrize("interpolate", [0, 300])
+def draw_from_prior(fitter, n, stars, rng):
+    """Photometry with points of models drawn from the prior of a fitter, and the places of their AGN fractions."""
+    grid = fitter.grid
+    priors = fitter.priors
+    weight = priors.redshift[:, None] * grid.allowed * priors.galaxy
+    place = rng.choice(weight.size, n, p=weight.ravel() / weight.sum())
+    z, galaxy = np.unravel_index(place, weight.shape)
+    model = rng.choice(grid.n_agn, n, p=priors.agn / priors.agn.sum())
+    fraction = rng.choice(grid.frac_agn.size, n, p=priors.frac / priors.frac.sum())
+    ratio = (grid.frac_agn / (1.0 - grid.frac_agn))[fraction]
+    light = (grid.dust_luminosity[galaxy] * ratio)[:, None] * grid.agn[z, model]
+    host = grid.galaxy[z, galaxy]
+    scale = 10.0 ** rng.uniform(10.0, 11.0, n)[:, None]
+    flux = scale * (host + light)
+    noise = rng.standard_normal(flux.shape)
+    table = grids.photometry_table(grid.filters, flux + noise, 1.0)
+    share = stars * rng.standard_normal(n)
+    for name, correlation in CORRELATION.items():
+        j = grid.filters.index(name)
+        own = np.sqrt(1.0 - correlation**2) * rng.standard_normal(n)
+        point = scale[:, 0] * (light[:, j] + share * host[:, j])
+        point += 2.0 * (correlation * noise[:, j] + own)
+        table[f"{name}_flux_point"] = point * u.uJy
+        table[f"{name}_flux_point_err"] = np.full(n, 2.0) * u.uJy
+        table[f"{name}_flux_point_corr"] = np.full(n, correlation)
+    return table, fraction
+
+
+@pytest.mark.parametrize("stars", [0.0, 0.2])
+def test_intervals_hold_truths_drawn_from_the_prior(grid, stars):
+    settings = GridSettings(interpolate=0, nuclear_stars=stars)
+    fitter = BayesFitter(grid, model_error=0.0, nuclei=True, settings=settings)
+    rng = np.random.default_rng(8)
+    table, fraction = draw_from_prior(fitter, 400, stars, rng)
+    results = fitter.fit(table)
+    ranks = randomized_ranks(results.pdf["frac_agn"], fraction, rng.random(400))
+    # 68 and 95 %, with binomial errors of 2.3 and 1.1 %
+    assert np.mean(np.abs(ranks - 0.5) < 0.34) == pytest.approx(0.68, abs=0.06)
+    assert np.mean(np.abs(ranks - 0.5) < 0.475) == pytest.approx(0.95, abs=0.03)
+
+
 def test_without_nuclei_nothing_changes(grid, catalog, interpolate):
     settings = GridSettings(interpolate=interpolate)
     fitter = BayesFitter(grid, nuclei=True, settings=settings)
