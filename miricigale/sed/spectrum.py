@@ -11,6 +11,7 @@ from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet, as_filter
+from miricigale.filters.spectra import spectrum_arrays
 from miricigale.instrument import DQ
 from miricigale.utils.curve_columns import (
     curve_columns,
@@ -480,13 +481,40 @@ class SED(Frozen, Interactive):
         redshift : float, optional
             Redshift of the source; the spectrum's ``z`` if not given.
         """
-        wave = spectrum.waveset
-        check_that(wave is not None, "spectrum", "one with a waveset", spectrum)
-        fnu = spectrum(wave, flux_unit=u.Jy)
-        order = np.argsort(wave)
+        check_that(spectrum.waveset is not None, "spectrum", "one with a waveset", spectrum)
+        wave, fnu = spectrum_arrays(spectrum, ())
         if redshift is None:
             redshift = spectrum.z
-        return cls(wave[order], fnu[order], redshift=redshift)
+        return cls(wave * WAVE, fnu * FNU, redshift=redshift)
+
+    @classmethod
+    def from_specutils(cls, spectrum, *, redshift=None):
+        """
+        Make an SED from a spectrum of specutils.
+
+        Parameters
+        ----------
+        spectrum : `specutils.Spectrum`
+            One spectrum as observed, in any unit of flux density and wavelength or frequency.
+        redshift : float, optional
+            Redshift of the source; the spectrum's ``redshift`` if not given.
+
+        Returns
+        -------
+        sed : `SED`
+            Without samples that are masked or NaN, of which a warning tells.
+
+        Raises
+        ------
+        ValueError
+            If it holds several spectra, or fewer than two samples are left.
+        `~astropy.units.UnitsError`
+            If its flux has other units than a flux density's.
+        """
+        wave, fnu = spectrum_arrays(spectrum, ())
+        if redshift is None:
+            redshift = float(spectrum.redshift)
+        return cls(wave * WAVE, fnu * FNU, redshift=redshift)
 
     def to_synphot(self):
         """

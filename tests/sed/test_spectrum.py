@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 from helpers.errors import refuses
 from miricigale.filters import Filter
 from miricigale.sed import COSMOLOGY, SED, SEDModel
+from miricigale.utils.exceptions import ModelWarning
 
 WAVE = np.geomspace(0.3, 40.0, 300) * u.um
 
@@ -108,6 +109,30 @@ def test_a_spectrum_goes_to_specutils():
     assert_quantity_allclose(other.flux, sed.fnu)
     got = Filter("F770W").synthetic_flux(other)
     assert_quantity_allclose(got, sed.synthetic_flux("F770W"), rtol=1e-12)
+
+
+def test_a_spectrum_comes_from_specutils():
+    """By frequency and F_lambda, with a redshift, and without a sample that is masked."""
+    specutils = pytest.importorskip(
+        "specutils", reason="needs specutils: pip install miricigale[specutils]"
+    )
+    fnu = np.linspace(1, 9, WAVE.size) * u.uJy
+    flam = fnu.to(u.erg / u.s / u.cm**2 / u.AA, u.spectral_density(WAVE))
+    axis = WAVE.to(u.THz, u.spectral())
+    sed = SED.from_specutils(specutils.Spectrum(spectral_axis=axis, flux=flam, redshift=0.5))
+    assert_quantity_allclose(sed.wave, WAVE, rtol=1e-12)
+    assert_quantity_allclose(sed.fnu, fnu, rtol=1e-12)
+    # specutils keeps it as a velocity
+    assert_allclose(sed.redshift, 0.5, rtol=1e-12)
+    masked = np.arange(WAVE.size) == 7
+    spoiled = np.where(masked, 1e6, fnu.value) * u.uJy
+    spectrum = specutils.Spectrum(spectral_axis=WAVE, flux=spoiled, mask=masked)
+    with pytest.warns(ModelWarning, match="1 of 300 samples"):
+        sed = SED.from_specutils(spectrum, redshift=1.0)
+    assert_quantity_allclose(sed.fnu, fnu[~masked], rtol=1e-12)
+    assert sed.redshift == 1.0
+    several = specutils.Spectrum(spectral_axis=WAVE, flux=np.ones((2, WAVE.size)) * u.uJy)
+    refuses("an array of 1 dimension", SED.from_specutils, several)
 
 
 SAMPLED = np.array([1.0, 5.0, 9.0, 20.0])
