@@ -114,8 +114,9 @@ class InjectionResult(Interactive):
     def _of_kind(self, kind):
         """Which sources are of a kind; all of None."""
         check_choice(kind, "kind", (None, "star", "galaxy"))
-        kinds = np.asarray(self.sources["kind"])
-        return (kinds == kind) | (kind is None)
+        if kind is None:
+            return np.ones(len(self.sources), bool)
+        return np.asarray(self.sources["kind"]) == kind
 
     def _curve(self, question, rows):
         if not rows.any():

@@ -122,6 +122,7 @@ class FittedStar:
         self.right = self.columns.T @ self._open_residual
         light = np.maximum(light, 0.0)
         self.chi2 = float(light @ (self.residual * weight) ** 2 / light.sum())
+        self.snr = flux * np.sqrt(np.sum((columns[:, 0] / sigma) ** 2))
 
     @property
     def dof(self):

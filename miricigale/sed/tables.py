@@ -121,7 +121,7 @@ def by_our_names(values, known=(), *, short=False):
 
 
 @cached
-def _cigale_parameters(known, *, short):
+def _cigale_parameters(known, short):
     """Find our name and CIGALE's unit of CIGALE's parameters that are among ours: dict by CIGALE's name."""
     tables = declared("miricigale.cigale", "names.toml")
     meanings = {}

@@ -153,7 +153,6 @@ def test_likelihoods_between_nodes_are_those_of_correlated_data(grid, catalog, m
         assert_allclose(results.log_evidence[i], log_evidence, rtol=1e-6)
 
 
-@pytest.mark.parametrize("interpolate", [0, 300])
 def draw_from_prior(fitter, n, stars, rng):
     """Photometry with points of models drawn from the prior of a fitter, and the places of their AGN fractions."""
     grid = fitter.grid
@@ -195,6 +194,7 @@ def test_intervals_hold_truths_drawn_from_the_prior(grid, stars):
     assert np.mean(np.abs(ranks - 0.5) < 0.475) == pytest.approx(0.95, abs=0.03)
 
 
+@pytest.mark.parametrize("interpolate", [0, 300])
 def test_without_nuclei_nothing_changes(grid, catalog, interpolate):
     settings = GridSettings(interpolate=interpolate)
     fitter = BayesFitter(grid, nuclei=True, settings=settings)

@@ -45,6 +45,7 @@ ARGUMENTS = {
     "sed.components.attenuation._exponents": (WAVE, "calzetti"),
     "sed.components.agn._polar_grid": (WAVE, "smc"),
     "sed.foreground._table": ("G23", 3.1),
+    "sed.tables._cigale_parameters": (("tau", "age"), True),
     "fitting.grid.points.quasi_random": (3, 6, 1),
     "fitting.grid.labels.places_in_cells": (3, 64),
     "fitting.survey.defaults._survey_calibration": (("miri.f770w",),),
