@@ -81,9 +81,10 @@ class SourceSample:
         zero = dict.fromkeys(self.bands, 0.0)
         self._reader = PhotometryReader(tuple(self.bands), tuple(self.bands), zero, zero, 1)
         self._columns = None
+        self._nodes = None
         self._n_rows = 0
 
-    def add(self, table, *, redshift=None, density=None):
+    def add(self, table, *, redshift=None, redshift_prior=None):
         """
         Add the next rows of the catalog.
 
@@ -93,8 +94,8 @@ class SourceSample:
             Photometry under our names.
         redshift : str or array_like, optional
             Known redshifts; sources without one are left out.
-        density : array_like, shape (n, n_z), optional
-            Densities of redshift of these rows.
+        redshift_prior : tuple of array_like, optional
+            Redshifts, and densities at each: of all of these rows, or row by row.
         """
         n = len(table)
         data = self._reader.read(table)
@@ -117,8 +118,10 @@ class SourceSample:
             known_z = known_redshifts(table, redshift)
             eligible &= (known_z >= self._range[0]) & (known_z <= self._range[1])
             columns["redshift"] = known_z
-        if density is not None:
-            columns["density"] = np.asarray(density, dtype=float)
+        if redshift_prior is not None:
+            self._nodes, density = redshift_prior
+            density = np.asarray(density, dtype=float)
+            columns["density"] = np.broadcast_to(density, (n, density.shape[-1]))
         columns = {name: values[eligible] for name, values in columns.items()}
         if self._columns is not None:
             columns = {k: np.concatenate([self._columns[k], v]) for k, v in columns.items()}
@@ -179,10 +182,10 @@ class SourceSample:
         return None
 
     @property
-    def density(self):
-        """Densities of redshift of the sources, or None."""
+    def redshift_prior(self):
+        """Redshifts, and their densities for each source, or None."""
         if "density" in self._columns:
-            return self._chosen("density")
+            return self._nodes, self._chosen("density")
         return None
 
     def photometry(self):
@@ -257,13 +260,8 @@ def calibrate_bands(
         # the fit of the catalog warns of it
         table = fitter._table_of(photometry)
     sample = sample_of(fitter, table.colnames, check_seed(seed))
-    density = None
-    nodes = None
-    if redshift_prior is not None:
-        nodes, density = redshift_prior
-        density = np.broadcast_to(density, (len(table), np.shape(density)[-1]))
-    sample.add(table, redshift=redshift, density=density)
-    return calibrate_sample(fitter, sample, name=name, density_nodes=nodes, executor=executor)
+    sample.add(table, redshift=redshift, redshift_prior=redshift_prior)
+    return calibrate_sample(fitter, sample, name=name, executor=executor)
 
 
 def sample_of(fitter, columns, seed):
@@ -272,22 +270,22 @@ def sample_of(fitter, columns, seed):
     return SourceSample(bands, (fitter.grid.redshift[0], fitter.grid.redshift[-1]), seed)
 
 
-def calibrate_sample(fitter, sample, *, name, density_nodes, executor):
-    """Do what `calibrate_bands` does, with sources that were chosen; ``density_nodes`` are those of densities."""
+def calibrate_sample(fitter, sample, *, name, executor):
+    """Do what `calibrate_bands` does, with sources that were chosen."""
     # scores are of the sources that its errors of models and priors were measured on
     first = dataclasses.replace(_calibration_of(fitter), name=name, scores=None)
     calibration = first.with_prior_errors(sample.bands)
     if len(sample) < MIN_SOURCES or len(sample.predicting) < MIN_PREDICTING_BANDS:
         return calibration
-    options = {"redshift": sample.redshift, "executor": executor}
-    if density_nodes is not None:
-        options["redshift_prior"] = (density_nodes, sample.density)
+    options = {"redshift": sample.redshift, "redshift_prior": sample.redshift_prior}
     predicting = on_nodes(fitter).replace(filters=sample.predicting, outliers=None)
     data = sample.photometry()
     table = sample.table
     for _ in range(_TURNS):
         with without_warnings():
-            moments = flux_moments(with_errors_of(predicting, calibration), table, **options)
+            moments = flux_moments(
+                with_errors_of(predicting, calibration), table, executor=executor, **options
+            )
         error = calibration.template_error
         errors = measure_bands(moments, moments.redshift, data, sample.bands, error)
         calibration = first.with_band_errors(errors)
@@ -398,16 +396,10 @@ def _bands_of_file(fitter, rows, name, options):
     """Calibrate the bands of a catalog on disk, of which one piece is in memory at a time."""
     take = _take_rows(fitter, rows, options)
     sample = sample_of(fitter, rows.colnames, seed=0)
-    nodes = None
     for i in range(rows.n_chunks):
         table, redshift_options = take(i)
-        density = None
-        if redshift_options["redshift_prior"] is not None:
-            nodes, density = redshift_options["redshift_prior"]
-            density = np.broadcast_to(density, (len(table), np.shape(density)[-1]))
-        sample.add(table, redshift=redshift_options["redshift"], density=density)
-    executor = options.get("executor")
-    return calibrate_sample(fitter, sample, name=name, density_nodes=nodes, executor=executor)
+        sample.add(table, **redshift_options)
+    return calibrate_sample(fitter, sample, name=name, executor=options.get("executor"))
 
 
 def _redshifts_of_file(fitter, rows, column, name, options):
