@@ -27,6 +27,7 @@ from miricigale.utils.package_tables import declared
 from miricigale.utils.progress import progress
 from miricigale.utils.table_files import write_table
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.values import value_class
 
 log = logging.getLogger(__name__)
 
@@ -212,15 +213,15 @@ def _settings(reducer):
     return values
 
 
+@value_class
 class _Reduction:
     """Reduction of files into a folder of products, of which those that stand are kept."""
 
-    def __init__(self, reducer, products, settings, resume, integrations):
-        self.reducer = reducer
-        self.products = products
-        self.settings = settings
-        self.resume = resume
-        self.integrations = integrations
+    reducer: Reducer
+    products: ProductFolder
+    settings: dict
+    resume: bool
+    integrations: bool
 
     def reduce(self, path):
         """Reduce one file: its row, its calibrated product (None without one), and the key of that."""
