@@ -111,7 +111,8 @@ def test_the_limit_of_a_fit_solves_its_equation():
     time = 4 * etc_setup(NAME).n_groups * 2.77504 * u.s
     sky, photon = fitted_noise(NAME, time, n_integrations=4, frame_time=2.77504 * u.s)
     for n in (1.0, 5.0, 50.0):
-        flux = sensitivity(NAME, time, n_sigma=n, n_groups=etc_setup(NAME).n_groups).value
+        limit = sensitivity(NAME, time, n_sigma=n, n_groups=etc_setup(NAME).n_groups)
+        flux = limit.to_value(u.uJy)
         assert_allclose(flux / np.sqrt(sky**2 + photon * flux), n, rtol=1e-4)
     assert sensitivity(NAME, time) == sensitivity(NAME, time, n_sigma=5, excess="flight")
     # the ideal fit is asked for by name; read noise and sky alone are 1.4 times as large in flight

@@ -108,6 +108,8 @@ def test_floats_that_cannot_tell_ids_apart_are_refused():
     )
     single = np.array([1, 2**24 + 2], dtype=np.float32)
     refuses("floats of 32 bits are not exact", read_ids, Table({"id": single}))
+    mixed = QTable({"id": np.array(["a", 7], dtype=object)})
+    refuses(r"ids of one kind, got \['int', 'str'\]", read_ids, mixed)
     # which is what 2^24 + 1 becomes
     single = np.array([1, 2**24 + 1], dtype=np.float32)
     refuses("floats of 32 bits are not exact", read_ids, Table({"id": single}))
