@@ -274,6 +274,9 @@ def test_curves_of_ones_own_stand_among_names():
     lines = results[0].plot_sed()[0].get_lines()
     assert any(np.isclose(line.get_xdata(), box.pivot.value).any() for line in lines)
     plt.close("all")
+    labels = results[0].plot_sed(components=True)[0].get_legend_handles_labels()[1]
+    assert {"stellar", "dust", "best model"} <= set(labels)
+    plt.close("all")
     # the best history forms the best mass
     line = results[0].plot_sfh().lines[0]
     steps = np.diff(line.get_xdata())[0] * 1e9

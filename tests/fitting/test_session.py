@@ -31,6 +31,7 @@ def figure():
 def test_levels_are_parts_or_percent(results):
     parts = results.percentile("redshift", [0.16, 0.5, 0.84])
     assert_array_equal(results.percentile("redshift", [16, 50, 84]), parts)
+    assert_array_equal(results.percentile("redshift"), parts)
     assert_array_equal(results.percentile("redshift", 16), parts[:, 0])
     assert_allclose(results.interval("redshift"), parts[:, [0, 2]], rtol=1e-12)
     assert_allclose(results.interval("redshift", 68), parts[:, [0, 2]], rtol=1e-12)

@@ -95,7 +95,7 @@ def fitted_curves(results):
     return FilterSet([user_curves.get(name, name) for name in results.filters])
 
 
-def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
+def plot_sed(results, ax=None, *, model=None, filters=None, components=False, **kwargs):
     """
     Draw photometry, upper limits (as arrows), best model and residuals of a single object.
 
@@ -109,6 +109,8 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
         See `best_sed`; without one only the fluxes of the best model are drawn.
     filters : `~miricigale.filters.FilterSet`, optional
         Where the wavelengths of the bands are taken from.
+    components : bool, optional
+        Whether the parts of the best model (stars, dust, torus, ...) are drawn too.
     **kwargs
         Passed to `miricigale.plotting.posteriors.plot_sed_fit`.
 
@@ -123,9 +125,17 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
     if filters is None:
         filters = fitted_curves(results)
     order = places(results.filters, filters.names)
-    if model is not None or results.model is not None:
+    has_model = model is not None or results.model is not None
+    check_that(has_model or not components, "model", "an SEDModel where 'components'", "None")
+    if has_model:
         sed = results.best_sed(model)
         kwargs.setdefault("spectrum", (sed.wave, sed.fnu))
+        if components:
+            parts = {}
+            for name, part in sed.components.items():
+                if np.any(part.fnu > 0):
+                    parts[name.replace("_", " ")] = (part.wave, part.fnu)
+            kwargs.setdefault("parts", parts)
     in_fit = np.isfinite(results.sigma)
     if results.outlier is not None and np.any(results.outlier > 0.5):
         kwargs.setdefault("groups", np.where(results.outlier > 0.5, "looks wrong", "fluxes"))

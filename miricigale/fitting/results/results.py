@@ -334,7 +334,7 @@ class FitResults(FitRows):
         labels = "1 + z", f"stellar mass ({mass.unit}), posterior medians"
         return plot_relation(1 + self.median("redshift").value, mass.value, ax=ax, labels=labels)
 
-    def percentile(self, name, levels):
+    def percentile(self, name, levels=(16, 50, 84)):
         """
         Posterior percentiles.
 
@@ -342,8 +342,8 @@ class FitResults(FitRows):
         ----------
         name : str
             A parameter or derived quantity, by our name or CIGALE's (``"stellar.m_star"``).
-        levels : array_like
-            Levels in (0, 1), or all in percent (16, 50, 84); of derived quantities, and of all of a sampler, from
+        levels : array_like, optional
+            Levels in (0, 1), or all in percent; of derived quantities, and of all of a sampler, from
             0.001 to 0.999.
 
         Returns

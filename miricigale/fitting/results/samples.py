@@ -300,7 +300,7 @@ model : `~miricigale.sed.SEDModel`, optional
         """Return the standard deviations of the draws: Quantity, shape (n,)."""
         return self.values(name).std(axis=-1)
 
-    def percentile(self, name, levels):
+    def percentile(self, name, levels=(16, 50, 84)):
         """
         Compute percentiles of the draws.
 
@@ -308,7 +308,7 @@ model : `~miricigale.sed.SEDModel`, optional
         ----------
         name : str
             A parameter or derived quantity.
-        levels : array_like, shape (n_levels,)
+        levels : array_like, shape (n_levels,), optional
             Levels in (0, 1), or all in percent, of percentiles of shape (n, n_levels); (n,) for a single level.
         """
         values = self.values(name)
