@@ -69,16 +69,16 @@
   // what a range such as 0.5..2, >5, <=1 or a value asks for; null where it cannot be read
   function range(text) {
     const plain = text.replaceAll("−", "-").replaceAll(" ", "");
-    let match = plain.match(/^(.*?)\.\.(.*)$/);
-    if (!match) {
-      const [, side, value] = plain.match(/^([<>]?=?)(.*)$/);
-      match = side.startsWith("<") ? [0, "", value] : side.startsWith(">") ? [0, value, ""] : [0, value, value];
-      if (!value) return null;
-      if (side === "<" || side === ">") match.open = true;
-    }
-    const low = match[1] ? Number(match[1]) : -Infinity, high = match[2] ? Number(match[2]) : Infinity;
+    const span = plain.match(/^(.*?)\.\.(.*)$/), side = plain.match(/^([<>]=?)(.+)$/);
+    let low = -Infinity, high = Infinity;
+    if (span && span[1]) low = Number(span[1]);
+    if (span && span[2]) high = Number(span[2]);
+    if (!span && side && side[1].startsWith("<")) high = Number(side[2]);
+    else if (!span && side) low = Number(side[2]);
+    else if (!span) low = high = Number(plain.replace("=", ""));
     if (isNaN(low) || isNaN(high)) return null;
-    return (value) => match.open ? value > low && value < high : value >= low && value <= high;
+    const open = !span && side && side[1].length === 1;
+    return (value) => open ? value > low && value < high : value >= low && value <= high;
   }
 
   function testOf(column, text) {
@@ -125,9 +125,9 @@
   function buildList() {
     columns.forEach((column, k) => { column.first = k > 0 && columns[k - 1].group !== column.group; });
     const first = columns.filter((column, k) => k === 0 || column.first);
-    const sizeOf = (column) => (columns.indexOf(first[first.indexOf(column) + 1]) + columns.length + 1) % (columns.length + 1) - columns.indexOf(column);
+    const starts = [...first.map((column) => columns.indexOf(column)), columns.length];
     $("list").tHead.append(
-      make("tr", { class: "group" }, first.map((column) => make("th", { colspan: sizeOf(column), class: cellClass(column) }, column.group))),
+      make("tr", { class: "group" }, first.map((column, k) => make("th", { colspan: starts[k + 1] - starts[k], class: cellClass(column) }, column.group))),
       make("tr", {}, columns.map((column) => make("th", { class: cellClass(column), title: column.title },
         make("button", { type: "button", "data-key": column.key,
           onclick: () => setState("sort", (state.get("sort") || "id") === column.key ? "-" + column.key : column.key) }, column.label, make("span"))))),
