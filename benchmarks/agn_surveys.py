@@ -1,18 +1,18 @@
 """
 How well `miricigale.agn.draw_shares` counts AGN in mock surveys of fitted objects of which the AGN are known.
 
-    python benchmarks/agn_surveys.py [--n 600] [--errors stated|models|true-models] [--surveys 40] [--tables FILE]
+    python benchmarks/agn_surveys.py [--n 600] [--errors-of-models] [--surveys 40] [--tables FILE]
 
 Truths are models of `SEDModel.survey` between the nodes of its axes, drawn with the priors of the fit at z = 0.2
 to 4 (F444W < 26), half of them with an AGN, in equal numbers by fraction, in six bands of NIRCam, two of ACS and
-six of MIRI. Errors are the depths of `DEPTHS` and 5 % of the flux, with ``--errors models`` also those of
-`SurveyCalibration.survey`, by which mock fluxes scatter. A fit takes these as parts of the measured flux; with
-``true-models`` it is given them as parts of the true one, which no user knows. Mock surveys are drawn from one
-half of the objects, with AGN in 8 or 25 % of them and three distributions of their fractions. Each line: size,
-share of AGN, distribution; the sum of the counted AGN (medians) with a fraction of 0.2 or more over the true
-ones, with its error; the share of totals, and of bins of redshift and luminosity (fractions of 0.1 or more),
-whose 68 % interval holds the truth, by randomized ranks. ``--tables`` keeps the posteriors, for they take nearly
-all of the time, 0.2 CPU-seconds an object.
+six of MIRI. Errors are the depths of `DEPTHS` and 5 % of the flux, with ``--errors-of-models`` also those of
+`SurveyCalibration.survey`, by which mock fluxes scatter. The first lines have the true numbers of objects by AGN
+fraction, and those by the posteriors, for the fits to be right. Mock surveys are then drawn from the objects by
+their posteriors, with AGN in 8 or 25 % and three distributions of their fractions. Each line: size, share of AGN,
+distribution; the sum of the counted AGN (medians) with a fraction of 0.2 or more over the true ones, with its
+error; the share of totals, and of bins of redshift and luminosity (fractions of 0.1 or more), whose 68 % interval
+holds the truth, by randomized ranks. ``--tables`` keeps the posteriors, for they take nearly all of the time, 0.2
+CPU-seconds an object.
 """
 
 import argparse
@@ -60,17 +60,19 @@ DISTRIBUTIONS = {
     "faint": (8.0, 4.0, 2.0, 1.0, 0.5, 0.25),
     "bright": (0.5, 0.5, 1.0, 2.0, 3.0, 3.0),
 }
+#: Steps towards the most likely numbers.
+N_ITERATIONS = 200
 #: Half-width of 68.27 % of uniform ranks.
 HALF_OF_INTERVAL = 0.3413
 
 
-def make_fitter(errors):
+def make_fitter(errors_of_models):
     """Fitter of all objects."""
     axes = SEDModel.survey_axes()
     z = axes["redshift"]
     axes["redshift"] = z[(z > REDSHIFTS[0]) & (z < REDSHIFTS[1])]
     template_error = None
-    if errors == "models":
+    if errors_of_models:
         template_error = SurveyCalibration.survey().template_error
     return BayesFitter(
         SEDModel.survey(),
@@ -78,7 +80,7 @@ def make_fitter(errors):
         axes=axes,
         priors={"frac_agn": agn_fraction_prior(axes["frac_agn"])},
         calibration=None,
-        model_error=0.0 if errors == "true-models" else MODEL_ERROR,
+        model_error=MODEL_ERROR,
         template_error=template_error,
         settings=GridSettings(agn_bins=BINS, mass_function=MassFunction()),
     )
@@ -149,30 +151,28 @@ def draw_truths(fitter, n, rng):
     return flux[accepted], z[accepted], rows["frac_agn"], luminosity
 
 
-def observe(flux, redshift, errors, rng):
+def observe(flux, redshift, template_error, rng):
     """Photometry of fluxes in uJy, with noise."""
     part = np.full(flux.shape, MODEL_ERROR)
-    if errors != "stated":
+    if template_error is not None:
         rest = pivots(DEPTHS).to_value(u.um) / (1.0 + redshift[:, None])
-        part = np.hypot(part, SurveyCalibration.survey().template_error(rest * u.um))
+        part = np.hypot(part, template_error(rest * u.um))
     table = QTable({"id": np.arange(len(flux))})
     for j, (band, depth) in enumerate(DEPTHS.items()):
         error = 0.2 * (depth * u.ABmag).to_value(u.uJy)
         noise = error * rng.standard_normal(len(flux))
         noise += part[:, j] * flux[:, j] * rng.standard_normal(len(flux))
         table[band] = (flux[:, j] + noise) * u.uJy
-        if errors == "true-models":
-            error = np.hypot(error, part[:, j] * flux[:, j])
-        table[error_column(band)] = error * np.ones(len(flux)) * u.uJy
+        table[error_column(band)] = np.full(len(flux), error) * u.uJy
     return table
 
 
-def fitted_objects(n, errors, seed):
+def fitted_objects(n, errors_of_models, seed):
     """Posteriors of objects in bins, their true bins, and the prior of the bins of the fraction: dict."""
     rng = np.random.default_rng(seed)
-    fitter = make_fitter(errors)
+    fitter = make_fitter(errors_of_models)
     flux, redshift, fraction, luminosity = draw_truths(fitter, n, rng)
-    results = fitter.fit(observe(flux, redshift, errors, rng))
+    results = fitter.fit(observe(flux, redshift, fitter.template_error, rng))
     z_bin, frac_bin, l_bin = BINS.place(redshift, fraction, luminosity)
     return {
         "table": results.agn_weights,
@@ -183,16 +183,53 @@ def fitted_objects(n, errors, seed):
     }
 
 
-def draw_survey(objects, size, share, weights, rng):
-    """Rows of a mock survey."""
-    fraction = objects["frac_bin"]
-    without = np.flatnonzero(fraction == 0)
-    with_agn = np.flatnonzero(fraction > 0)
-    number = np.bincount(fraction[with_agn], minlength=len(weights) + 1)
-    weight = np.asarray(weights)[fraction[with_agn] - 1] / number[fraction[with_agn]]
-    n_agn = rng.binomial(size, share)
-    chosen = rng.choice(with_agn, n_agn, p=weight / weight.sum())
-    return np.concatenate([chosen, rng.choice(without, size - n_agn)])
+def probabilities(objects, number):
+    """Probability of each object to be in a bin of the fraction, (n, n_frac), if so many of them are."""
+    weight = objects["table"].sum(axis=(1, 3)) * number / objects["prior"]
+    return weight / weight.sum(axis=1, keepdims=True)
+
+
+def calibrate(objects):
+    """Print true numbers by bin of the fraction, and those by the posteriors; return the most likely ones."""
+    number = np.bincount(objects["frac_bin"], minlength=BINS.shape[1])
+    part = probabilities(objects, number)
+    error = np.sqrt(np.sum(part * (1.0 - part), axis=0))
+    for j in range(number.size):
+        print(
+            f"bin {j}: {number[j]} objects, {part[:, j].sum():.1f} +- {error[j]:.1f} by posteriors"
+        )
+    high = part[:, FIRST_OF_TOTAL:].sum(axis=1)
+    error = np.sqrt(np.sum(high * (1.0 - high)))
+    print(f"from 0.2: {number[FIRST_OF_TOTAL:].sum()}, {high.sum():.1f} +- {error:.1f}", flush=True)
+    most_likely = np.array(number, float)
+    for _ in range(N_ITERATIONS):
+        most_likely = probabilities(objects, most_likely).sum(axis=0)
+    return most_likely
+
+
+def draw_survey(objects, number, size, share, weights, rng):
+    """
+    Rows of a mock survey, and the true numbers in bins.
+
+    An object with a fraction in a bin is drawn by its probability to be there, its redshift and luminosity by its
+    posterior, so that posteriors are right and surveys are independent of the errors of the few that are fitted.
+    """
+    part = probabilities(objects, number)
+    weights = np.asarray(weights) / np.sum(weights)
+    shares = np.concatenate([[1.0 - share], share * weights])
+    n_of_bins = rng.multinomial(size, shares)
+    true = np.zeros(BINS.shape, int)
+    rows = []
+    for j, n_of_bin in enumerate(n_of_bins):
+        chosen = rng.choice(len(part), n_of_bin, p=part[:, j] / part[:, j].sum())
+        rows.append(chosen)
+        for row in chosen:
+            place = objects["table"][row, :, j]
+            z, k = np.unravel_index(
+                rng.choice(place.size, p=place.ravel() / place.sum()), place.shape
+            )
+            true[z, j, k] += 1
+    return np.concatenate(rows), true
 
 
 def ranks(draws, true, rng):
@@ -202,29 +239,26 @@ def ranks(draws, true, rng):
     return below + equal * rng.random(np.shape(true))
 
 
-def counted(objects, rows, seed):
+def counted(objects, rows, true, seed):
     """Draws of the total and of bins of redshift and luminosity, and the true numbers."""
     n_z = len(BINS.redshift) - 1
-    draws = draw_shares(objects["table"][rows], objects["prior"], n_draws=500, seed=seed)
+    draws = draw_shares(objects["table"][rows], objects["prior"], n_draws=1000, seed=seed)
     counts = draws.counts["galaxy"][:, :n_z]
-    true = np.zeros(BINS.shape, int)
-    place = (objects["z_bin"][rows], objects["frac_bin"][rows], objects["l_bin"][rows])
-    np.add.at(true, place, 1)
     true = true[:n_z]
     total = counts[:, :, FIRST_OF_TOTAL:].sum(axis=(1, 2, 3))
     bins = counts[:, :, FIRST_OF_BINS:, 1:].sum(axis=2)
     return total, true[:, FIRST_OF_TOTAL:].sum(), bins, true[:, FIRST_OF_BINS:, 1:].sum(axis=1)
 
 
-def score(objects, size, share, name, n_surveys, rng):
+def score(objects, number, size, share, name, n_surveys, rng):
     """Print a line of the table."""
     medians = []
     numbers = []
     of_totals = []
     of_bins = []
     for seed in range(n_surveys):
-        rows = draw_survey(objects, size, share, DISTRIBUTIONS[name], rng)
-        total, true_total, bins, true_bins = counted(objects, rows, seed)
+        rows, true = draw_survey(objects, number, size, share, DISTRIBUTIONS[name], rng)
+        total, true_total, bins, true_bins = counted(objects, rows, true, seed)
         medians.append(np.median(total))
         numbers.append(true_total)
         of_totals.append(ranks(total, true_total, rng))
@@ -246,8 +280,7 @@ def main():
     """Run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("--n", type=int, default=600, help="objects that are fitted")
-    kinds = ("stated", "models", "true-models")
-    parser.add_argument("--errors", choices=kinds, default="stated")
+    parser.add_argument("--errors-of-models", action="store_true")
     parser.add_argument("--surveys", type=int, default=40, help="mock surveys a line")
     parser.add_argument("--sizes", type=int, nargs="+", default=[400], help="objects of a survey")
     parser.add_argument("--tables", type=Path, help="where posteriors are kept (npz)")
@@ -257,17 +290,18 @@ def main():
     if args.tables is not None and args.tables.exists():
         objects = dict(np.load(args.tables))
     else:
-        objects = fitted_objects(args.n, args.errors, args.seed)
+        objects = fitted_objects(args.n, args.errors_of_models, args.seed)
         if args.tables is not None:
             np.savez(args.tables, **objects)
     usable = np.isfinite(objects["table"].sum(axis=(1, 2, 3)))
     for name in ("table", "z_bin", "frac_bin", "l_bin"):
         objects[name] = objects[name][usable]
+    number = calibrate(objects)
     rng = np.random.default_rng(args.seed)
     for size in args.sizes:
         for share in (0.08, 0.25):
             for name in DISTRIBUTIONS:
-                score(objects, size, share, name, args.surveys, rng)
+                score(objects, number, size, share, name, args.surveys, rng)
 
 
 if __name__ == "__main__":

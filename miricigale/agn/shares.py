@@ -17,8 +17,10 @@ COMMON_AGN = 5.0
 _FLAT = 1.0
 #: Pseudo-objects of the Dirichlet prior of the classes.
 _CLASS_OBJECTS = 1.0
-#: Draws that are left out at the beginning, over those that are kept.
+#: Draws that are left out at the beginning, over those that are kept, and at least: shares that data hardly tell
+#: apart forget slowly where they began.
 _BURN_IN = 0.2
+_MIN_BURN_IN = 300
 #: Ln of the largest ratio of evidences.
 _LARGEST_RATIO = 300.0
 
@@ -145,7 +147,7 @@ def draw_shares(table, prior, *, others=None, n_draws=1000, seed=None):
     for name in ["galaxy"] + list(classes):
         counts[name] = np.zeros((n_draws,) + table.shape[1:], int)
     probability = np.zeros((n, divided.shape[1] + ratio.shape[1]))
-    n_burn = int(np.ceil(_BURN_IN * n_draws))
+    n_burn = max(int(np.ceil(_BURN_IN * n_draws)), _MIN_BURN_IN)
     for turn in range(-n_burn, n_draws):
         of_galaxy = class_shares[0] * divided * shares.ravel()
         weight = np.concatenate([of_galaxy, class_shares[1:] * ratio], axis=1)
