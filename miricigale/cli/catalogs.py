@@ -6,6 +6,7 @@ import sys
 
 from miricigale.cli.options import filled, read_input, refuse, workers
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.named_values import attributes, without_none
 
 
 def fit(args):
@@ -128,7 +129,7 @@ def images_of(args, paths, prefix=""):
 def photometer_options(args):
     """Return the options of the photometer; those of files count where none is given."""
     names = ("max_shift", "background_order", "offset_order", "second_pass", "components")
-    options = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    options = without_none(attributes(args, names))
     if args.no_background:
         options["background_order"] = None
     return options

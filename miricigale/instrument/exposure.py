@@ -16,6 +16,7 @@ from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3,
 from miricigale.instrument.wcs import imager_wcs, tangent_offset
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import check_count, scalar
@@ -220,8 +221,7 @@ class Exposure(Interactive):
         return f"{text}>"
 
     def _facts(self):
-        fields = (field.name for field in dataclasses.fields(self))
-        values = {name.replace("_", " "): getattr(self, name) for name in fields}
+        values = {name.replace("_", " "): value for name, value in field_values(self).items()}
         return values | {"exposure time": self.exposure_time}
 
     @classmethod

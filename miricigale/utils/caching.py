@@ -6,6 +6,8 @@ import functools
 
 import numpy as np
 
+from miricigale.utils.named_values import field_names
+
 #: Types of values that nobody can change, the most common ones.
 _PLAIN = frozenset([float, int, bool, str, bytes, type(None)])
 
@@ -116,7 +118,7 @@ def _fields_to_freeze(cls):
     """Names of the fields of a frozen dataclass; none of another."""
     if not cls.__dataclass_params__.frozen:
         return ()
-    return tuple(field.name for field in dataclasses.fields(cls))
+    return tuple(field_names(cls))
 
 
 def cached(function=None, *, maxsize=None, copies=False):

@@ -13,6 +13,7 @@ from miricigale.photometry.commands.file_inputs import (
 )
 from miricigale.photometry.commands.kernel_files import image_psf, matching_kernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error
+from miricigale.utils.named_values import field_values
 
 
 def with_exposures(inputs):
@@ -34,8 +35,7 @@ def with_exposures(inputs):
     repeated_files = [file for file in inputs.images if counts[file.header.filter] > 1]
     if not repeated_files or not all(file.header.exposure for file in repeated_files):
         return inputs
-    values = {field.name: getattr(inputs, field.name) for field in dataclasses.fields(inputs)}
-    return ExposureInputs(**values)
+    return ExposureInputs(**field_values(inputs))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ from miricigale.photometry.images.mosaic_headers import stated_filter
 from miricigale.photometry.images.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import file_place
+from miricigale.utils.named_values import field_names
 from miricigale.utils.positions import middle_pixel
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 from miricigale.utils.values import value_class
@@ -57,8 +58,8 @@ class Inputs:
         if len(kernels) != len(images):
             raise argument_error("kernel", f"one for each of {len(images)} images", len(kernels))
         # settings that are none of these are options of the photometer
-        names = {field.name for field in dataclasses.fields(cls)}
-        options = {name: settings.pop(name) for name in sorted(settings.keys() - names)}
+        names = settings.keys() - field_names(cls)
+        options = {name: settings.pop(name) for name in sorted(names)}
         return cls(
             highres=_as_file(highres),
             images=tuple(map(_as_file, images)),

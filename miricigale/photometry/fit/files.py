@@ -20,6 +20,7 @@ from miricigale.photometry.images.fits_images import grid_text, text_grid
 from miricigale.photometry.shapes.shapes import FITTED, not_fitted
 from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.utils.file_formats import register
+from miricigale.utils.named_values import attributes, without_none
 from miricigale.utils.positions import sky_as_angles
 from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.tables import ascii_ids
@@ -33,7 +34,7 @@ def _sky_columns(sky):
 
 def _existing(thing, names):
     """Return those attributes of an object, by name, that are not None."""
-    return {name: getattr(thing, name) for name in names if getattr(thing, name) is not None}
+    return without_none(attributes(thing, names))
 
 
 def _columns(table):

@@ -26,6 +26,7 @@ from miricigale.psf import KernelField, MatchingKernel, as_kernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.memory import return_freed_memory
+from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, is_number, positive, to_array
@@ -284,7 +285,7 @@ class ForcedPhotometer(Interactive):
         return f"<ForcedPhotometer template={self.template!r}, {self.kernel!r}>"
 
     def _facts(self):
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return field_values(self)
 
     def measure(self, image, highres=None, segmentation=None, catalog=None, *, templates=None):
         """

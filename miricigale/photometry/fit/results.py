@@ -26,6 +26,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.interactive import Tabular
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed
@@ -228,8 +229,7 @@ class ForcedPhotometryResult(Tabular):
     def __post_init__(self):
         # a column refers to its table, and does not pickle
         object.__setattr__(self, "sky", self.sky.copy())
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+        for value in field_values(self).values():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
 

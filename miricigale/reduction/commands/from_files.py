@@ -21,7 +21,7 @@ from miricigale.reduction.sky.background import known_background
 from miricigale.utils.content_hash import content_sha256, file_sha256
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import open_fits
-from miricigale.utils.named_values import subset
+from miricigale.utils.named_values import field_values, subset, without
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.progress import progress
@@ -203,9 +203,8 @@ def _reason(err):
 def _settings(reducer):
     """What the products depend on: settings, and the content of reference files."""
     values = {}
-    for field in dataclasses.fields(reducer):
-        if field.name != "n_threads":
-            values[field.name] = repr(getattr(reducer, field.name))
+    for name, value in without(field_values(reducer), ["n_threads"]).items():
+        values[name] = repr(value)
     if isinstance(reducer.references, ReferenceFiles):
         for name in reducer.references.names():
             if isinstance(path := getattr(reducer.references, name), Path):
