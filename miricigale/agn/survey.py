@@ -19,6 +19,7 @@ from miricigale.fitting.catalogs.classes import fit_classes
 from miricigale.utils.exceptions import FitWarning, OtherResultsError, argument_error, warn
 from miricigale.utils.files import replacing
 from miricigale.utils.interactive import Interactive
+from miricigale.utils.named_values import places, without
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
@@ -221,7 +222,7 @@ class AGNSurvey:
         photometry, truth = self._photometry(results, truth, options.get("redshift"))
         catalog = output / "injected.fits"
         _write_injected(photometry, catalog, resume=options.get("resume", True))
-        fit_options = {name: value for name, value in options.items() if name not in _OF_CATALOG}
+        fit_options = without(options, _OF_CATALOG)
         # errors and zero points are those of the catalog
         measured = measured_calibration(results)
         if measured is not None:
@@ -273,7 +274,7 @@ class AGNSurvey:
         """Photometry of the hosts with AGN, and what is known of the AGN: two tables."""
         hosts = results[truth["row"]]
         bands = list(hosts.fitted_filters)
-        columns = [hosts.filters.index(band) for band in bands]
+        columns = places(bands, hosts.filters)
         points = results.job["settings"].get("zero_point", {})
         points = np.array([points.get(band, 1.0) for band in bands])
         flux = hosts.flux[:, columns] / points
@@ -424,7 +425,7 @@ def _noise_curves(results, bands, points):
     flux = []
     error = []
     for part in results.parts():
-        columns = [part.filters.index(band) for band in bands]
+        columns = places(bands, part.filters)
         measured = np.isfinite(part.sigma[:, columns]) & ~part.limit[:, columns]
         flux.append(np.where(measured, part.flux[:, columns] / points, np.nan))
         error.append(np.where(measured, part.flux_err[:, columns] / points, np.nan))

@@ -5,6 +5,7 @@ import math
 from miricigale.cli.catalogs import images_of, photometer_options
 from miricigale.cli.exposures import reducer_of
 from miricigale.cli.options import declarations, destination, filled, refuse, workers
+from miricigale.utils.named_values import attributes, without_none
 
 #: Options that need a prior, besides those of the prior itself.
 _OF_PRIOR = ("segmentation", "catalog", "kernel", "psf_stars")
@@ -27,9 +28,7 @@ def inject(args):
     options = photometer_options(args)
     if priors:
         (highres,) = images_of(args, priors, "highres_")
-        for name in _OF_PRIOR:
-            if getattr(args, name) is not None:
-                options[name] = getattr(args, name)
+        options |= without_none(attributes(args, _OF_PRIOR))
     else:
         highres = None
         of_prior = [name for name in vars(args) if name.startswith("highres_")]

@@ -11,6 +11,8 @@ import tomllib
 from importlib import resources
 from pathlib import Path
 
+from miricigale.utils.named_values import without
+
 
 class Parser(argparse.ArgumentParser):
     """A parser whose errors are one sentence."""
@@ -330,7 +332,7 @@ _EXTRA_KEYS = ("flags", "group", "key", "heading")
 
 def _add(parser, groups, flags, option, words):
     """Add an option to a parser, or to its group of options of which one may be given."""
-    arguments = {key: value for key, value in option.items() if key not in _EXTRA_KEYS}
+    arguments = without(option, _EXTRA_KEYS)
     arguments["help"] = _replaced(arguments["help"], words)
     if "type" in arguments:
         # argparse applies it to a default that is text

@@ -8,7 +8,7 @@ from astropy.time import Time
 
 from miricigale.instrument.keywords import steps_done
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.named_values import attributes
+from miricigale.utils.named_values import attributes, without_none
 from miricigale.utils.package_tables import declared
 
 _STEPS = declared("miricigale.instrument", "keywords.toml")["references"].items()
@@ -142,11 +142,7 @@ class ExposureHistory:
             **attributes(self, ("day", "gain")),
             **{f"reference_{name}": text for name, text in self.references.items()},
         }
-        recorded = {}
-        for name, value in values.items():
-            if value is not None:
-                recorded[name] = value
-        return recorded
+        return without_none(values)
 
     @property
     def simulated(self):

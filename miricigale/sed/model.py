@@ -19,6 +19,7 @@ from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
+from miricigale.utils.named_values import without_none
 from miricigale.utils.options import check_that
 from miricigale.utils.units import WAVE
 
@@ -324,11 +325,7 @@ class SEDModel(Interactive):
             "frac_agn_definition": self.frac_agn_definition if self.has_agn else None,
             "cosmology": f"H0={self.cosmology.H0.value:g}, Om0={self.cosmology.Om0:g}",
         }
-        settings = {}
-        for name, value in out.items():
-            if value is not None:
-                settings[name] = value
-        return settings
+        return without_none(out)
 
     @property
     def meta(self):

@@ -9,6 +9,7 @@ from scipy.integrate import cumulative_trapezoid
 from miricigale.sed.presets import red_dot_axes
 from miricigale.sed.spectrum import SED
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import without
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.units import FNU, WAVE, to_array
 
@@ -199,7 +200,7 @@ def red_dots(axes=None, *, atmospheres=None):
     if axes is None:
         axes = red_dot_axes()
         if atmospheres is not None:
-            axes = {name: axis for name, axis in axes.items() if name not in _OF_BLACK_BODY}
+            axes = without(axes, _OF_BLACK_BODY)
     else:
         axes = dict(axes)
     axes.pop("redshift", None)

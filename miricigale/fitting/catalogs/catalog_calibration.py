@@ -29,6 +29,7 @@ from miricigale.fitting.survey.survey import (
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import OtherResultsError
 from miricigale.utils.files import replacing
+from miricigale.utils.named_values import places, rows_of
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column
@@ -74,8 +75,8 @@ class SourceSample:
         predicting = [band for band in self.bands if band not in long]
         #: Bands that predict the others, by wavelength.
         self.predicting = sorted(predicting, key=wave.get)
-        self._long = [self.bands.index(band) for band in long]
-        self._short = [self.bands.index(band) for band in self.predicting]
+        self._long = places(long, self.bands)
+        self._short = places(self.predicting, self.bands)
         self._range = redshift_range
         self._random = stream(seed, "calibration of bands")
         zero = dict.fromkeys(self.bands, 0.0)
@@ -122,13 +123,13 @@ class SourceSample:
             self._nodes, density = redshift_prior
             density = np.asarray(density, dtype=float)
             columns["density"] = np.broadcast_to(density, (n, density.shape[-1]))
-        columns = {name: values[eligible] for name, values in columns.items()}
+        columns = rows_of(columns, eligible)
         if self._columns is not None:
             columns = {k: np.concatenate([self._columns[k], v]) for k, v in columns.items()}
         # all others may be needed, if long bands detect no more sources
         long, short_only = self._by_key(columns)
         rows_to_keep = np.sort(np.concatenate([long, short_only[:MAX_SOURCES]]))
-        self._columns = {name: values[rows_to_keep] for name, values in columns.items()}
+        self._columns = rows_of(columns, rows_to_keep)
 
     def _seen_by_long_bands(self, data):
         """Find rows whose flux in the longest of the other bands is above five times the error of a long band."""

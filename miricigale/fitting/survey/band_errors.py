@@ -8,6 +8,7 @@ from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from miricigale.fitting.data.template_error import pivots
+from miricigale.utils.named_values import subset
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.units import WAVE
 from miricigale.utils.values import value_class
@@ -450,7 +451,7 @@ def measure_bands(results, redshift, data, bands, template_error):
             joined = PredictedFluxes.concatenate([samples[band] for band in group])
             common = estimate_band_errors(joined, prior_of_band(group[0]))
             estimates |= dict.fromkeys(group, common)
-    return relative_zero_points({band: estimates[band] for band in bands})
+    return relative_zero_points(subset(estimates, bands))
 
 
 def relative_zero_points(errors, reference=None):

@@ -13,7 +13,7 @@ from miricigale.photometry.commands.file_inputs import (
 )
 from miricigale.photometry.commands.kernel_files import image_psf, matching_kernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error
-from miricigale.utils.named_values import field_values
+from miricigale.utils.named_values import field_values, subset
 
 
 def with_exposures(inputs):
@@ -115,7 +115,7 @@ class ExposureInputs(Inputs):
                 photometers[band] = ForcedPhotometer(
                     self._kernels(rows), psf_stars=False, **options
                 )
-        return {band: photometers[band] for band in self.groups}
+        return subset(photometers, self.groups)
 
     def _kernels(self, rows):
         """Make the kernels of some exposures: of files, or models by place and roll."""

@@ -7,6 +7,7 @@ from miricigale.photometry.commands.exposure_files import with_exposures
 from miricigale.photometry.commands.file_inputs import Inputs
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing
+from miricigale.utils.named_values import without_none
 from miricigale.utils.outputs import check_output, check_outputs
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.progress import progress
@@ -119,7 +120,7 @@ def measure_files(
             ("model", k): _labelled(model, label),
             ("residual", k): _labelled(residual, label),
         }
-    results = {key: path for key, path in results.items() if path is not None}
+    results = without_none(results)
     for (kind, _), path in results.items():
         check_output(path, kind, overwrite=overwrite, inputs=inputs.paths, **_KINDS[kind])
     if page is not None:

@@ -15,6 +15,7 @@ from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import without_none
 from miricigale.utils.options import check_names, check_positive, check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.sep_tools import background as sep_background
@@ -331,8 +332,7 @@ def _prepared(
     if not isinstance(preset, DetectionPreset):
         check_names([preset], "detection preset", DETECTION_PRESETS)
         preset = DETECTION_PRESETS[preset]
-    changes = {name: value for name, value in changes.items() if value is not None}
-    settings = dataclasses.replace(preset, **changes)
+    settings = dataclasses.replace(preset, **without_none(changes))
     check_positive(settings.threshold, "threshold")
     arrays = image_arrays(as_mosaic(image, "image"), "image")
     ratio = 1.0

@@ -12,7 +12,7 @@ from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import data_error, file_errors
-from miricigale.utils.named_values import convert_values
+from miricigale.utils.named_values import convert_values, rows_of
 from miricigale.utils.options import check_data
 from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table
@@ -85,7 +85,7 @@ def read_skirtor(path):
         name="torus.skirtor2016",
         wave=wave,
         axes=axes,
-        spectra={name: array[order] for name, array in spectra.items()},
+        spectra=rows_of(spectra, order),
         units={"opening_angle": "deg", "inclination": "deg", "disk": "um-1", "dust": "um-1"},
         meta={
             "files": files,
