@@ -20,7 +20,7 @@ from miricigale.utils.exceptions import argument_error, config_error, unknown_na
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.named_values import without_none
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.units import WAVE
 
 
@@ -400,9 +400,8 @@ class SEDModel(Interactive):
             If a value is outside its bounds, or the galaxy older than the universe.
         """
         parameters = tables.by_our_names(parameters, self._parameters, short=True)
+        check_names(parameters, "parameter", self._parameters)
         for name, value in parameters.items():
-            if name not in self._parameters:
-                raise unknown_name("parameter", name, self._parameters)
             wanted = "one number (fluxes() takes several models)"
             check_that(np.ndim(value) == 0, name, wanted, f"shape {np.shape(value)}")
         out = {}
@@ -507,9 +506,7 @@ class SEDModel(Interactive):
         table, filters = tables.named_first(table, filters, parameters, "table")
         if parameters:
             parameters = tables.by_our_names(parameters, self._parameters, short=True)
-            for name in parameters:
-                if name not in self._parameters:
-                    raise unknown_name("parameter", name, self._parameters)
+            check_names(parameters, "parameter", self._parameters)
             table = tables.parameter_table(parameters)
         for name, value in (("table", table), ("filters", filters)):
             check_that(value is not None, name, "given, or parameters by name", "None")

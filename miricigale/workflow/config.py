@@ -4,7 +4,8 @@ from importlib import resources
 from typing import ClassVar
 
 from miricigale.refdata import resources as known_resources
-from miricigale.utils.exceptions import ConfigError, unknown_name
+from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.options import check_names
 from miricigale.workflow.analysis_sections import (
     ErrorSection,
     FitSection,
@@ -221,8 +222,7 @@ def load_config(source, *, quick=False, overrides=None):
             raise ConfigError(msg)
         texts = [(source, read_text(source))]
     else:
-        if source not in preset_names():
-            raise unknown_name("preset", source, preset_names())
+        check_names([source], "preset", preset_names())
         names = [f"{source}.toml"]
         if quick:
             names.append(f"{source}.quick.toml")

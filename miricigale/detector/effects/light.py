@@ -10,7 +10,7 @@ from miricigale.detector._core.charge import add_poisson
 from miricigale.detector._core.random import standard_normals
 from miricigale.detector.effects.base import Effect, check_share, key_words
 from miricigale.instrument import electrons_per_brightness, flat_field
-from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.options import check_names
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +53,7 @@ class Residual(Effect):
 
     def __post_init__(self):
         if isinstance(self.amplitude, str):
-            if self.amplitude not in residual_presets():
-                raise unknown_name("residual preset", self.amplitude, residual_presets())
+            check_names([self.amplitude], "residual preset", residual_presets())
         else:
             check_share("amplitude", self.amplitude, 0.2)
         check_share("correlation", self.correlation, 30)
