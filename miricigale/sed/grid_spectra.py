@@ -5,7 +5,7 @@ from astropy.table import QTable
 
 from miricigale.filters import FilterSet, find_filter
 from miricigale.sed.chain import STELLAR
-from miricigale.sed.spectrum import cell_means, distance
+from miricigale.sed.spectrum import cell_means, distance, edges_around
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import places
@@ -205,8 +205,7 @@ def observed_spectra(model, grid, index, scale):
     low = rest_wave[0] * (1.0 + redshift.max())
     high = rest_wave[-1] * (1.0 + redshift.min())
     wave = wave[(wave >= low) & (wave <= high)]
-    centers = 0.5 * (wave[1:] + wave[:-1])
-    edges = np.concatenate([wave[:1], centers, wave[-1:]])
+    edges = edges_around(wave)
     out = np.empty((redshift.size, wave.size))
     for z in np.unique(redshift):
         sky = model.chain.sky(model.defaults | {"redshift": float(z)})

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from miricigale.sed.presets import red_dot_axes
-from miricigale.sed.spectrum import SED
+from miricigale.sed.spectrum import SED, edges_around
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
 from miricigale.utils.options import check_names, check_that
@@ -253,8 +253,7 @@ def _photosphere(atmosphere):
     optical = fnu[near].mean()
     check_that(optical > 0, "atmosphere", "with light at 0.51 um", f"{optical:g} uJy")
     # libraries have narrow absorption lines, which are finer than the points
-    middles = 0.5 * (_WAVE_UM[1:] + _WAVE_UM[:-1])
-    edges = np.concatenate([_WAVE_UM[:1], middles, _WAVE_UM[-1:]])
+    edges = edges_around(_WAVE_UM)
     fine = np.union1d(wave, edges)
     light = np.interp(fine, wave, fnu, left=0.0)
     far = fine > wave[-1]

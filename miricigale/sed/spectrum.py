@@ -9,6 +9,7 @@ import numpy as np
 from astropy.constants import c
 from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
+from scipy.integrate import cumulative_trapezoid
 
 from miricigale.filters import FilterSet, as_filter
 from miricigale.filters.spectra import spectrum_arrays
@@ -67,6 +68,12 @@ def distance(redshift, cosmology):
     return np.where(z > 0, far, (10.0 * u.pc).to_value(u.m))
 
 
+def edges_around(points):
+    """Return the edges of cells around points: half way to the neighbors, the outermost at the points."""
+    middle = 0.5 * (points[1:] + points[:-1])
+    return np.concatenate([points[:1], middle, points[-1:]])
+
+
 def cell_means(x, y, edges):
     """
     Compute the mean of a function in cells, so that narrow lines keep their light.
@@ -83,7 +90,7 @@ def cell_means(x, y, edges):
     means : `~numpy.ndarray`, shape (m,)
     """
     width = np.diff(x)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * width)])
+    integral = cumulative_trapezoid(y, x, initial=0.0)
     step = np.clip(np.searchsorted(x, edges, side="right") - 1, 0, width.size - 1)
     slope = (y[step + 1] - y[step]) / width[step]
     beyond = edges - x[step]

@@ -224,6 +224,11 @@ def draw_places(usable, n, separation, rng):
     return places[:m]
 
 
+def stamp_starts(box):
+    """Where the pixels of each of n stamps begin, one after another, and where the last ends: shape (n + 1,)."""
+    return np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
+
+
 def pixels_to_sky(xy, wcs):
     """Return the coordinates of pixels (x, y), shape (n, 2)."""
     return wcs.pixel_to_world(xy[:, 0], xy[:, 1])

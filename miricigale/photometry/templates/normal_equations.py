@@ -18,6 +18,7 @@ from miricigale.photometry._core.stamps import (
     projections,
     whiten_stamps,
 )
+from miricigale.photometry.images.arrays import stamp_starts
 from miricigale.photometry.templates.templates import Block, batches
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map
@@ -328,7 +329,7 @@ class _Spread:
             return dataclasses.replace(block, values=block.values * self._kernel[0, 0])
         # stamps grow by the lag on each side
         box = block.box + np.array([-lag, -lag, 2 * lag, 2 * lag])
-        start = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
+        start = stamp_starts(box)
         values = np.empty(int(start[-1]), np.float32)
 
         def convolve(batch):

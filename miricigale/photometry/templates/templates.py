@@ -17,6 +17,7 @@ from miricigale.photometry._core.sampling import (
 )
 from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.detection.cutouts import RIM, convolve_padded
+from miricigale.photometry.images.arrays import stamp_starts
 from miricigale.utils.caching import cached
 from miricigale.utils.parallel import parallel_map
 from miricigale.utils.values import value_class
@@ -249,7 +250,7 @@ class TemplateBank:
         box = self._boxes(self.shape)
         self.order = np.argsort(box[:, 0], kind="stable")
         self.box = np.ascontiguousarray(box[self.order])
-        self.start = np.concatenate([[0], np.cumsum(self.box[:, 2] * self.box[:, 3])])
+        self.start = stamp_starts(self.box)
         self._kept = None
         self._same = {}
 
@@ -405,7 +406,7 @@ class TemplateBank:
             box = block.box[rows]
             poly = self.sources.poly[sources[rows]]
             poly[:, :, 0] -= origin
-            begin = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
+            begin = stamp_starts(box)
             sums = np.zeros(int(begin[-1]))
             center = self.sources.xy[sources[rows]]
             sample_stamps(coefficients, member, amplitude, center, poly, box, begin, sums)
