@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from miricigale.fitting.grid.moves import move_places, systematic
+from miricigale.fitting.grid.moves import N_SWEEPS, move_places, systematic
 
 
 def _moved(log_density, score, group, active, seed=1):
@@ -64,6 +64,21 @@ def test_places_move_along_a_curved_ridge():
     assert_allclose(across.std(), 0.1, rtol=0.05)
     assert abs(score[:, 0].mean()) < 0.1
     assert_allclose(score[:, 0].std(), 1.0, rtol=0.1)
+
+
+def test_moves_end_where_places_have_the_distribution():
+    """Begun with draws of it there are fewer evaluations than of all sweeps, and they keep its moments."""
+    start = np.random.default_rng(9).standard_normal((2000, 3))
+    evaluations = []
+
+    def log_density(_, score):
+        evaluations.append(len(score))
+        return -0.5 * np.sum(score**2, axis=1)
+
+    score = _moved(log_density, start, np.zeros(2000, int), np.ones((2000, 3), bool))
+    assert 40 * 2000 <= sum(evaluations) < 0.8 * N_SWEEPS * 2000
+    assert_allclose(score.mean(axis=0), 0.0, atol=0.07)
+    assert_allclose(np.cov(score.T), np.eye(3), atol=0.1)
 
 
 def test_small_groups_stay():

@@ -65,6 +65,8 @@ _FLAT_EACH = 50
 _MAX_FLAT = 150
 #: Number of narrow parts that are added to each label and peak where weights are large.
 _N_LOCAL = 16
+#: Part of the effective number that is wanted, above which places keep their weights and are not moved.
+_MIN_WEIGHED = 0.5
 #: Number of places that are moved where weights stay too unequal.
 _N_MOVED = 768
 #: Smallest number of them in each label and peak.
@@ -208,7 +210,7 @@ class AdaptiveSampler:
             self.n_fitted *= 2
             parts = self._fit(self._places(self.n_fitted), n_local=_N_LOCAL)
             share = sample.wanted
-        if best.enough:
+        if best.effective >= _MIN_WEIGHED * self.wanted:
             return self._models(best)
         return self._moved(best)
 

@@ -179,11 +179,13 @@ def labels_of_ranges(labels):
     members = []
     # labels of one axis differ in the cells that they have there
     for first, count in zip(labels.first.T, labels.count.T, strict=True):
-        ranges = np.unique(np.stack([first, count], axis=1), axis=0)
-        if len(ranges) < 2:
+        # one number for each range, in the order of the first cells
+        code = first * (count.max() + 1) + count
+        codes = np.unique(code)
+        if len(codes) < 2:
             continue
-        for start, size in ranges:
-            members.append(np.flatnonzero((first == start) & (count == size)))
+        for each in codes:
+            members.append(np.flatnonzero(code == each))
     return members
 
 

@@ -2,8 +2,10 @@
 
 import numpy as np
 
-#: Sweeps over all places, in each of which half of them are moved, then the other half.
+#: Largest number of sweeps over all places, in each of which half of them are moved, then the other half.
 N_SWEEPS = 100
+#: Number of sweeps over which the mean of ln(posterior) is taken: they end when it is no larger than before.
+_N_MEAN = 20
 #: Smallest step, a part of the difference of two places, over the one that is best for normal distributions.
 _MIN_PART = 0.4
 #: Share of steps by the whole difference, from one peak to another.
@@ -20,7 +22,8 @@ def move_places(evaluate, group, active, score, evaluated, place, seed):
 
     A place is tried at itself plus a difference of two others of its group, and moved there by the rule of
     Metropolis (ter Braak 2006, Statistics and Computing 16, 239); half of the places are moved at once by
-    differences of the other half (Goodman & Weare 2010, CAMCoS 5, 65).
+    differences of the other half (Goodman & Weare 2010, CAMCoS 5, 65). Sweeps end when the mean of ln(posterior)
+    over the places rises no more.
 
     Parameters
     ----------
@@ -43,7 +46,8 @@ def move_places(evaluate, group, active, score, evaluated, place, seed):
     best = 2.38 / np.sqrt(2.0 * np.maximum(n_active, 1))
     size = np.bincount(group)
     movable = size[group] >= _MIN_PLACES_PER_AXIS * (n_active + 1)
-    for _ in range(N_SWEEPS):
+    mean_log = np.empty(N_SWEEPS)
+    for sweep in range(N_SWEEPS):
         order = np.lexsort([rng.random(n), group])
         order = order[movable[order]]
         for parity in (0, 1):
@@ -62,6 +66,14 @@ def move_places(evaluate, group, active, score, evaluated, place, seed):
             score[rows] = new[accepted]
             evaluated[rows] = evaluated_new[accepted]
             place[rows] = place_new[accepted]
+        # it rises until places that began too wide have the distribution, and then goes up and down
+        mean_log[sweep] = evaluated[:, 0].mean()
+        n_done = sweep + 1
+        if n_done >= 2 * _N_MEAN:
+            last = mean_log[n_done - _N_MEAN : n_done].mean()
+            before = mean_log[n_done - 2 * _N_MEAN : n_done - _N_MEAN].mean()
+            if last <= before:
+                break
 
 
 def _partners_of_group(group, rows, partners, rng):
