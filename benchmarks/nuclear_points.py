@@ -3,6 +3,7 @@ How well AGN fractions are recovered with and without fluxes of nuclei: photomet
 
     python benchmarks/nuclear_points.py coverage [--n 300] [--chain] [--model-error 0.05]
     python benchmarks/nuclear_points.py detection [--n 100] [--shallow 1 5] [--miri miri.f770w]
+    python benchmarks/nuclear_points.py pulls [--n 40]
 
 Galaxies at known redshifts of 0.5 to 2.5 in ten bands with the errors of `DEPTHS` and 5 % of the flux, 2 to 40
 uJy in F770W. Points have 1.5 times the errors of the totals, a correlation of -0.2, and a share of the host's
@@ -16,6 +17,10 @@ fraction.
 detection: the fits have `agn_fraction_prior` (92.5 % without an AGN). Galaxies without an AGN whose median
 fraction is above 0.2, and AGN of 10^44 erg/s with fractions of 0.1 to 0.95 whose 16th percentile is above 0.1,
 with errors of MIRI that are ``--shallow`` times as large. ``--miri`` leaves out its other bands.
+
+pulls: points as forced photometry measures them with two components on images of galaxies without neighbors, by
+the templates of their profiles, total S/N 20: mean and standard deviation of the pulls of points and totals, and
+their correlation, stated and measured. Sizes are half-light radii in arcsec.
 """
 
 import argparse
@@ -23,10 +28,16 @@ import warnings
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable
 
+from miricigale import ForcedPhotometer
 from miricigale.evaluation import posterior_ranks
 from miricigale.fitting import BayesFitter, GridSettings, agn_fraction_prior
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import SourceTemplates
+from miricigale.psf import MatchingKernel, filter_psf, hst_psf
 from miricigale.sed import SEDModel
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import LUMINOSITY
@@ -52,6 +63,11 @@ LUMINOSITY_OF_AGN = 1e44
 #: Smallest fraction that counts as an AGN, and that of a false one.
 AGN, FALSE = 0.1, 0.2
 HALF_OF_INTERVAL = 0.3413
+#: Pixels between galaxies on images, their total flux in uJy and its S/N, and the part of it that is a point.
+APART = 60
+TOTAL, SIGNAL, PART = 5.0, 20.0, 0.3
+#: Half-light radii in arcsec and Sersic indices.
+PROFILES = ((0.45, 1.0), (0.2, 1.0), (0.25, 4.0))
 EFFECTIVE = 200
 
 
@@ -234,10 +250,61 @@ def detection(n, bands, factors, model_error, seed):
                 )
 
 
+def galaxies_on_image(n, radius, index, wcs, rng):
+    """Catalog of galaxies in a row."""
+    table = QTable({"id": np.arange(n)})
+    columns = APART * (0.5 + np.arange(n)) + rng.uniform(-0.5, 0.5, n)
+    rows = 0.5 * APART + rng.uniform(-0.5, 0.5, n)
+    table["sky"] = SkyCoord.from_pixel(columns, rows, wcs)
+    table["half_light_radius"] = np.full(n, radius) * u.arcsec
+    table["sersic_index"] = index
+    table["axis_ratio"] = 0.7
+    table["position_angle"] = rng.uniform(0.0, 180.0, n) * u.deg
+    return table
+
+
+def pulls(n, seed):
+    """Print pulls of points and totals."""
+    center = SkyCoord(53.1, -27.8, unit="deg")
+    wcs = north_up_wcs(center, 0.11 * u.arcsec, (APART, n * APART))
+    for band in ("F770W", "F1500W"):
+        psf = filter_psf(band, pixel_scale=0.06 * u.arcsec, pa=0 * u.deg)
+        kernel = MatchingKernel.from_psfs(hst_psf("F160W"), psf, extent=6 * u.arcsec)
+        photometer = ForcedPhotometer(kernel)
+        for radius, index in PROFILES:
+            rng = np.random.default_rng(seed)
+            table = galaxies_on_image(n, radius, index, wcs, rng)
+            smooth = SourceTemplates.from_catalog(table, template="sersic")
+            points = SourceTemplates.from_catalog(table, template="psf")
+            table["components"] = 2
+            templates = SourceTemplates.from_catalog(table, template="sersic")
+            sigma = 0.01
+            normal = rng.standard_normal((APART, n * APART))
+            # errors go as the noise: the second image has the S/N that is wanted
+            for _ in range(2):
+                error = StdDevUncertainty(np.full(normal.shape, sigma))
+                image = CCDData(sigma * normal, unit="MJy/sr", wcs=wcs, uncertainty=error)
+                light = photometer.render(image, smooth, np.full(n, (1.0 - PART) * TOTAL) * u.uJy)
+                light += photometer.render(image, points, np.full(n, PART * TOTAL) * u.uJy)
+                image.data += light.value
+                result = photometer.measure(image, templates=templates)
+                signal = TOTAL / np.nanmedian(result.flux_err.value)
+                sigma *= signal / SIGNAL
+            point = (result.flux_point.value - PART * TOTAL) / result.flux_point_err.value
+            total = (result.flux.value - TOTAL) / result.flux_err.value
+            measured = np.corrcoef(point, total)[0, 1]
+            print(
+                f"{band} {radius} {index}: points {point.mean():+.2f}, {point.std():.2f}, "
+                f"totals {total.mean():+.2f}, {total.std():.2f}, correlation "
+                f"{np.median(result.flux_point_corr):.2f}, {measured:.2f}",
+                flush=True,
+            )
+
+
 def main():
     """Run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument("what", choices=("coverage", "detection"))
+    parser.add_argument("what", choices=("coverage", "detection", "pulls"))
     parser.add_argument("--n", type=int, default=300)
     parser.add_argument("--chain", action="store_true")
     parser.add_argument("--shallow", type=float, nargs="+", default=[1.0, 5.0])
@@ -248,6 +315,8 @@ def main():
     warnings.simplefilter("ignore")
     if args.what == "coverage":
         coverage(args.n, args.chain, args.model_error, args.seed)
+    elif args.what == "pulls":
+        pulls(args.n, args.seed)
     else:
         bands = [band for band in DEPTHS if band not in MIRI or band in args.miri]
         detection(args.n, bands, args.shallow, args.model_error, args.seed)
