@@ -400,6 +400,7 @@ class SEDModel(Interactive):
             If a value is outside its bounds, or the galaxy older than the universe.
         """
         parameters = tables.by_our_names(parameters, self._parameters, short=True)
+        parameters = tables.with_mass_formed(self, parameters)
         check_names(parameters, "parameter", self._parameters)
         for name, value in parameters.items():
             wanted = "one number (fluxes() takes several models)"
@@ -427,7 +428,8 @@ class SEDModel(Interactive):
         ----------
         **parameters
             Any of `parameters`, as quantities or numbers in their units; or parameters of CIGALE, such as
-            ``tau_main`` or ``sfh.tau_main``, whose numbers are in CIGALE's units (Myr).
+            ``tau_main`` or ``sfh.tau_main``, whose numbers are in CIGALE's units (Myr). ``mass`` is the mass
+            formed; ``stellar_mass``, that of living stars, can stand in its place.
 
         Returns
         -------
@@ -469,7 +471,8 @@ class SEDModel(Interactive):
         ----------
         table : `~astropy.table.Table`, dict, `pandas.DataFrame` or path-like
             A row for each model; columns by parameter name, the defaults where there is
-            none; ``redshift`` is needed. Other columns than parameters are left alone.
+            none; ``redshift`` is needed. ``stellar_mass``, that of living stars, counts where there is no
+            ``mass``, the mass formed. Other columns are left alone.
         filters : `~miricigale.filters.FilterSet` or list of str
             The bands.
         **parameters
@@ -506,7 +509,8 @@ class SEDModel(Interactive):
         table, filters = tables.named_first(table, filters, parameters, "table")
         if parameters:
             parameters = tables.by_our_names(parameters, self._parameters, short=True)
-            check_names(parameters, "parameter", self._parameters)
+            known = [*self._parameters, tables.LIVING_MASS]
+            check_names(parameters, "parameter", known)
             table = tables.parameter_table(parameters)
         for name, value in (("table", table), ("filters", filters)):
             check_that(value is not None, name, "given, or parameters by name", "None")

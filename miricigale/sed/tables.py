@@ -22,7 +22,9 @@ from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
 
 #: Names of parameters that are usual elsewhere, with ours.
-_OTHER_NAMES = {"z": "redshift", "stellar_mass": "mass", "fracAGN": "frac_agn"}
+_OTHER_NAMES = {"z": "redshift", "fracAGN": "frac_agn"}
+#: Mass of living stars, in place of the mass formed that models have as their parameter.
+LIVING_MASS = "stellar_mass"
 #: Names of the logarithm of a mass in lower case.
 _LOG_MASSES = ("log_mass", "logmass", "lmass", "log_m")
 
@@ -174,7 +176,13 @@ def named_first(values, filters, named, argument):
 
 def parameter_table(parameters):
     """Table of a row for each model, of numbers or arrays of one shape by parameter."""
-    values = {name: u.Quantity(value) for name, value in parameters.items()}
+    values = {}
+    for name, value in parameters.items():
+        # numbers without a unit are in that of the parameter; a list may hold quantities
+        quantity = u.Quantity(value)
+        if quantity.unit == u.dimensionless_unscaled:
+            quantity = quantity.value
+        values[name] = quantity
     try:
         shape = np.broadcast_shapes((1,), *(value.shape for value in values.values()))
     except ValueError:
@@ -267,6 +275,47 @@ def _stack(filters):
     curves = [np.asarray(band.throughput, dtype=float) for band in filters]
     start = np.append(0, np.cumsum(list(map(len, waves))))
     return _core.band_tables(start, np.concatenate(waves), np.concatenate(curves))
+
+
+def with_mass_formed(model, parameters):
+    """
+    Parameters of one model with the mass formed in place of that of living stars.
+
+    Parameters
+    ----------
+    model : `SEDModel`
+        The model.
+    parameters : dict
+        By our names; ``stellar_mass``, a number in solar masses or a quantity, is that of living stars.
+
+    Raises
+    ------
+    ValueError
+        If there are both masses.
+    """
+    if LIVING_MASS not in parameters:
+        return parameters
+    check_that(
+        "mass" not in parameters, LIVING_MASS, "left out beside 'mass', the mass formed", "both"
+    )
+    out = dict(parameters)
+    living = u.Quantity(out.pop(LIVING_MASS), u.Msun)
+    per_formed = spectra(model, model.values(out | {"mass": 1.0 * u.Msun})).derived[LIVING_MASS]
+    return out | {"mass": living / per_formed.to_value(u.Msun)}
+
+
+def _with_masses_formed(model, table, filters):
+    """Table with the masses formed of rows in place of those of living stars."""
+    if LIVING_MASS not in table.colnames or "mass" in table.colnames:
+        return table
+    out = table.copy()
+    living = model.parameters["mass"].array(out[LIVING_MASS])
+    del out[LIVING_MASS]
+    out["mass"] = np.ones(len(out)) * u.Msun
+    per_formed = _evaluate_rows(model, out, filters)[LIVING_MASS].to_value(u.Msun)
+    # rows without a model are flagged, whatever their mass
+    out["mass"] = living / np.where(per_formed > 0, per_formed, 1.0) * u.Msun
+    return out
 
 
 def spectra(model, values):
@@ -410,6 +459,11 @@ def flux_table(model, table, filters):
     """Fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
     table = by_our_names(quantity_table(as_table(table, "table"), copy=False), model.parameters)
     _warn_of_slips(model, table.colnames)
+    return _evaluate_rows(model, _with_masses_formed(model, table, filters), filters)
+
+
+def _evaluate_rows(model, table, filters):
+    """Do what `flux_table` does with a table of parameters by our names."""
     n = len(table)
     names = model.derived_columns()
     reserved = set(filters.names) & {"id", "flags", *names}

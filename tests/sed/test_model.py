@@ -543,3 +543,24 @@ def test_bands_keep_the_lines_of_spectra_at_other_redshifts():
         wanted = filters.synthetic_fluxes(model.evaluate(**values)).to_value(u.uJy)
         seen = filters.synthetic_fluxes(SED(wave * u.um, light[row] * u.uJy)).to_value(u.uJy)
         assert_allclose(seen, wanted, rtol=5e-3)
+
+
+def test_a_stellar_mass_is_that_of_living_stars():
+    """As results and catalogs of other codes have it: the mass formed is larger by what stars lost."""
+    model = SEDModel.yang2021(libraries="bundled")
+    options = {"redshift": 1.0, "age": 3.0, "tau": 0.5, "frac_agn": 0.3}
+    sed = model.evaluate(**options, stellar_mass=3e10)
+    assert_quantity_allclose(sed.derived["stellar_mass"], 3e10 * u.Msun, rtol=1e-9)
+    assert sed.parameters["mass"] > 4e10 * u.Msun
+    rows = QTable({name: np.full(2, value) for name, value in options.items()})
+    rows["stellar_mass"] = [3e10, 6e10] * u.Msun
+    # the second is older than the universe
+    rows["age"][1] = 9.0
+    table = model.fluxes(rows, ["miri.f770w"])
+    assert_quantity_allclose(table["miri.f770w"][0], sed.synthetic_flux("miri.f770w"), rtol=1e-4)
+    assert_quantity_allclose(table["stellar_mass"][0], 3e10 * u.Msun, rtol=1e-9)
+    assert table["flags"][1] == ModelFlags.OLDER_THAN_UNIVERSE
+    # numbers by keyword are in the units of the parameters, as those of one model are
+    named = model.fluxes(["miri.f770w"], **options, stellar_mass=3e10)
+    assert_quantity_allclose(named["miri.f770w"], table["miri.f770w"][:1], rtol=1e-12)
+    refuses("'stellar_mass' must be left out beside 'mass'", model, mass=3e10, stellar_mass=3e10)
