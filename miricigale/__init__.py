@@ -3,8 +3,8 @@ Plan and analyse JWST/MIRI deep imaging.
 
 The seven classes `Filter`, `SEDModel`, `Scene`, `Detector`, `Reducer`,
 `ForcedPhotometer` and `BayesFitter`, and what they take and give (`SED`, `FilterSet`, `ModelGrid`,
-`Exposure`, `Ramp`, `MatchingKernel`, `ErrorModel`, `FitResults`), are loaded on first use (PEP 562), so
-that ``import miricigale`` opens no file and compiles nothing.
+`Exposure`, `Ramp`, `MatchingKernel`, `ErrorModel`, `FitResults`), are loaded on first use (PEP 562), as
+are the subpackages, so that ``import miricigale`` opens no file and compiles nothing.
 """
 
 import lazy_loader

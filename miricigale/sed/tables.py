@@ -106,7 +106,8 @@ def by_our_names(values, known=(), *, short=False):
     """
     names = values.colnames if isinstance(values, Table) else list(values)
     others = {theirs: (ours, "") for theirs, ours in _OTHER_NAMES.items()}
-    for theirs, meaning in _cigale_parameters(tuple(known), short=short).items():
+    our_names = (*known, LIVING_MASS)
+    for theirs, meaning in _cigale_parameters(our_names, short=short).items():
         if theirs not in known:
             others.setdefault(theirs, meaning)
     out = values.copy()
@@ -299,7 +300,7 @@ def with_mass_formed(model, parameters):
         "mass" not in parameters, LIVING_MASS, "left out beside 'mass', the mass formed", "both"
     )
     out = dict(parameters)
-    living = u.Quantity(out.pop(LIVING_MASS), u.Msun)
+    living = model.parameters["mass"].convert(out.pop(LIVING_MASS)) * u.Msun
     per_formed = spectra(model, model.values(out | {"mass": 1.0 * u.Msun})).derived[LIVING_MASS]
     return out | {"mass": living / per_formed.to_value(u.Msun)}
 

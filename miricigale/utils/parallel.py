@@ -5,7 +5,6 @@ import functools
 import itertools
 import logging
 import multiprocessing
-import operator
 import os
 import pickle
 import signal
@@ -139,7 +138,7 @@ def parallel_map(function, items, *, executor=None, progress_bar=False, desc=Non
     function : callable
         Called with one item; must be picklable for process executors. One that carries much
         data (a model grid) is not sent with every item: a process pool reads it from a
-        temporary file once for each process, dask gets it by ``client.scatter``.
+        temporary file once for each process, workers of dask keep it.
     items : iterable
         The pieces of work.
     executor : `concurrent.futures.Executor`, optional
@@ -188,8 +187,9 @@ def _sent_once(function, executor):
     """What to submit before the item, so that a heavy function travels once."""
     # dask's executor has no public way to its client
     client = getattr(executor, "_client", None)
-    scatter = getattr(client, "scatter", None)
-    if scatter is None and not isinstance(executor, ProcessPoolExecutor):
+    if not hasattr(client, "register_plugin"):
+        client = None
+    if client is None and not isinstance(executor, ProcessPoolExecutor):
         yield (function,)
         return
     try:
@@ -199,9 +199,12 @@ def _sent_once(function, executor):
         data = b""
     if len(data) <= _HEAVY:
         yield (function,)
-    elif scatter is not None:
-        # one of the workers may be lost
-        yield (operator.call, scatter(function, broadcast=True))
+    elif client is not None:
+        # optional
+        from miricigale.utils.dask_workers import call_kept, kept_by_workers
+
+        with kept_by_workers(client, function) as name:
+            yield call_kept, name
     else:
         handle, name = tempfile.mkstemp(prefix="miricigale-", suffix=".pickle")
         try:

@@ -102,6 +102,25 @@ def test_two_dask_workers_give_the_numbers_of_one_process(
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_workers_that_are_left_or_start_later_keep_a_function():
+    """Seconds after it was sent, when dask has taken back copies of data, with one worker after the other lost."""
+    distributed = pytest.importorskip("distributed")
+    from miricigale.utils.dask_workers import call_kept, kept_by_workers
+
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
+    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+        with kept_by_workers(client, partial(operator.add, 1)) as name:
+            time.sleep(3.0)
+            for pid in list(client.run(os.getpid).values()):
+                os.kill(pid, signal.SIGKILL)
+                futures = client.map(partial(call_kept, name), range(4), pure=False)
+                assert client.gather(futures) == [1, 2, 3, 4]
+        client.wait_for_workers(2)
+        kept = client.run(lambda dask_worker: name in dask_worker.plugins)
+        assert not any(kept.values())
+
+
 def test_processes_get_the_grid_once(fitter, photometry, whole, process):
     assert len(pickle.dumps(fitter)) > 400_000
     process.n_bytes.clear()

@@ -563,4 +563,7 @@ def test_a_stellar_mass_is_that_of_living_stars():
     # numbers by keyword are in the units of the parameters, as those of one model are
     named = model.fluxes(["miri.f770w"], **options, stellar_mass=3e10)
     assert_quantity_allclose(named["miri.f770w"], table["miri.f770w"][:1], rtol=1e-12)
+    by_cigale = model.evaluate(**options, **{"stellar.m_star": 3e10 * u.Msun})
+    assert_quantity_allclose(by_cigale.fnu, sed.fnu, rtol=1e-12)
     refuses("'stellar_mass' must be left out beside 'mass'", model, mass=3e10, stellar_mass=3e10)
+    refuses("not its logarithm", model, stellar_mass=10.5)

@@ -230,8 +230,8 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
     with (
         progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar,
         _seen_ids(folder) as seen_before,
+        _workers(fitter, folder, rows.n_chunks, executor) as (submit, n_waiting),
     ):
-        submit, n_waiting = _workers(fitter, folder, rows.n_chunks, executor)
         for i in range(rows.n_chunks):
             name = part_name(i)
             if name in folder.records and folder.is_whole(name):
@@ -265,9 +265,10 @@ def _fit_parts(fitter, rows, take, folder, seed, executor, progress_bar):
     logger.info("%s: %d parts, %d of them new", folder.folder, rows.n_chunks, n_new)
 
 
+@contextlib.contextmanager
 def _workers(fitter, folder, n_chunks, executor):
     """
-    Return a function that sends a piece to a worker of dask, and the largest number of pieces to send.
+    Yield a function that sends a piece to a worker of dask, and the largest number of pieces to send.
 
     None if there are fewer pieces than workers.
     """
@@ -277,12 +278,14 @@ def _workers(fitter, folder, n_chunks, executor):
     if client is not None:
         n_workers = sum(client.nthreads().values())
     if not 0 < n_workers <= n_chunks:
-        return None, 0
-    # every worker has the fitter, in case one is lost
-    shared_fitter = client.scatter(fitter, broadcast=True)
-    place = FileFolder(folder.folder.absolute())
+        yield None, 0
+        return
+    # optional
+    from miricigale.utils.dask_workers import call_kept, kept_by_workers
 
-    return partial(executor.submit, _make_part, shared_fitter, place), 2 * n_workers
+    place = FileFolder(folder.folder.absolute())
+    with kept_by_workers(client, partial(_make_part, fitter, place)) as name:
+        yield partial(executor.submit, call_kept, name), 2 * n_workers
 
 
 def _make_part(fitter, folder, name, table, options):
