@@ -6,8 +6,9 @@ import astropy.units as u
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
+from miricigale.sed.cells import edges_around
 from miricigale.sed.presets import red_dot_axes
-from miricigale.sed.spectrum import SED, edges_around
+from miricigale.sed.spectrum import SED
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
 from miricigale.utils.options import check_names, check_that

@@ -9,7 +9,6 @@ import numpy as np
 from astropy.constants import c
 from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
-from scipy.integrate import cumulative_trapezoid
 
 from miricigale.filters import FilterSet, as_filter
 from miricigale.filters.spectra import spectrum_arrays
@@ -66,36 +65,6 @@ def distance(redshift, cosmology):
     z = floats(redshift)
     far = cosmology.luminosity_distance(np.where(z > 0, z, 1.0)).to_value(u.m)
     return np.where(z > 0, far, (10.0 * u.pc).to_value(u.m))
-
-
-def edges_around(points):
-    """Return the edges of cells around points: half way to the neighbors, the outermost at the points."""
-    middle = 0.5 * (points[1:] + points[:-1])
-    return np.concatenate([points[:1], middle, points[-1:]])
-
-
-def cell_means(x, y, edges):
-    """
-    Compute the mean of a function in cells, so that narrow lines keep their light.
-
-    Parameters
-    ----------
-    x, y : `~numpy.ndarray`, shape (n,)
-        Points of the function, x increasing, which straight lines join.
-    edges : `~numpy.ndarray`, shape (m + 1,)
-        Edges of the cells, increasing, within the range of x.
-
-    Returns
-    -------
-    means : `~numpy.ndarray`, shape (m,)
-    """
-    width = np.diff(x)
-    integral = cumulative_trapezoid(y, x, initial=0.0)
-    step = np.clip(np.searchsorted(x, edges, side="right") - 1, 0, width.size - 1)
-    slope = (y[step + 1] - y[step]) / width[step]
-    beyond = edges - x[step]
-    at_edges = integral[step] + beyond * (y[step] + 0.5 * slope * beyond)
-    return np.diff(at_edges) / np.diff(edges)
 
 
 def _with_unit(column, parse):

@@ -15,7 +15,7 @@ from miricigale.pages.browser import (
     source_pages,
 )
 from miricigale.plotting.axes import MEASURED
-from miricigale.sed.spectrum import cell_means
+from miricigale.sed.cells import cell_means
 from miricigale.utils.named_values import places
 from miricigale.utils.units import FNU, WAVE
 

@@ -17,7 +17,7 @@ from miricigale.pages.browser import (
     source_pages,
 )
 from miricigale.plotting.cutouts import Cutouts
-from miricigale.sed.spectrum import cell_means
+from miricigale.sed.cells import cell_means
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE, ab_magnitude
 from miricigale.workflow.engine.stage import stage
