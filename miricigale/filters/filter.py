@@ -235,10 +235,11 @@ class Filter(Frozen, Interactive):
             is_wave = not isinstance(text, str) or re.match(r"\s*[\d.]+\s*[A-Za-zµ]", text)
             wave = None
             if is_wave:
-                # an A alone is no ampere here
-                wave = u.Quantity(
-                    re.sub(r"([\d.]\s*)A$", r"\1AA", text) if isinstance(text, str) else text
-                )
+                wave = text
+                if isinstance(text, str):
+                    # an A alone is no ampere here
+                    wave = re.sub(r"([\d.]\s*)A$", r"\1AA", text)
+                wave = u.Quantity(wave)
         except (TypeError, ValueError):
             wave = None
         if wave is None:
