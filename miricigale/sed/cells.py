@@ -5,7 +5,19 @@ from scipy.integrate import cumulative_trapezoid
 
 
 def edges_around(points):
-    """Return the edges of cells around points: half way to the neighbors, the outermost at the points."""
+    """
+    Compute the edges of cells around points: half way to the neighbors, the outermost at the points.
+
+    Parameters
+    ----------
+    points : `~numpy.ndarray`, shape (n,)
+        Increasing values, of at least one point.
+
+    Returns
+    -------
+    edges : `~numpy.ndarray`, shape (n + 1,)
+        In the unit of the points.
+    """
     middle = 0.5 * (points[1:] + points[:-1])
     return np.concatenate([points[:1], middle, points[-1:]])
 
