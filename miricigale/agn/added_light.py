@@ -4,6 +4,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.evaluation import agn_fraction
+from miricigale.fitting.data.nuclei import CORRELATION, IS_LIMIT, NUCLEUS
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
@@ -67,6 +68,19 @@ class NoiseCurve:
         return np.interp(flux + light, self.flux, self.error) / before
 
 
+def nucleus_noise_curves(nuclei):
+    """Make the `NoiseCurve` of each column ``<band>_nucleus`` of the nuclei of a catalog: dict by column."""
+    curves = {}
+    for name in nuclei.colnames:
+        if not name.endswith(NUCLEUS):
+            continue
+        measured = _Measured.of_column(nuclei, name)
+        curves[name] = NoiseCurve.of_band(
+            np.where(measured.is_flux, measured.flux, np.nan), measured.error
+        )
+    return curves
+
+
 def add_light(photometry, light, *, curves, seed):
     """
     Add light to the photometry of objects, with the noise that it has.
@@ -75,14 +89,18 @@ def add_light(photometry, light, *, curves, seed):
     which the variance grows. Without light a flux and its error stay as they are, and so do upper limits and
     missing fluxes.
 
+    The light is a point in the center. Where the nucleus of an object was measured beside its smooth light, all of
+    the light is in the nucleus too, and the noise of both fluxes has their correlation.
+
     Parameters
     ----------
     photometry : `~astropy.table.QTable`
         ``id``, and for each band flux and error ``<band>_err``; where ``<band>_limit`` is true it is a limit.
+        Of bands with fluxes of nuclei ``<band>_nucleus``, ``..._err``, ``..._corr`` and ``..._limit``.
     light : dict of str to `~astropy.units.Quantity`, shape (n,)
         Light of each object by band.
     curves : dict of str to `NoiseCurve`
-        By band; see `NoiseCurve.of_band`.
+        By band, and by the column ``<band>_nucleus`` of nuclei; see `NoiseCurve.of_band`.
     seed : int or `~numpy.random.Generator`
         Every object has its own stream, by its id.
 
@@ -107,19 +125,58 @@ def add_light(photometry, light, *, curves, seed):
         agn_flux = to_array(agn_flux, FNU, "light", ndim=1)
         wanted = f"finite and 0 or more in {band}"
         check_that(are_not_negative(agn_flux), "light", wanted, "others")
-        flux = to_array(table[band], FNU, band)
-        error = to_array(table[error_column(band)], FNU, error_column(band))
-        changed = np.isfinite(flux) & np.isfinite(error) & (error > 0) & (agn_flux > 0)
-        if f"{band}_limit" in table.colnames:
-            changed &= ~np.asarray(table[f"{band}_limit"], bool)
-        ratio = np.ones(len(table))
-        if changed.any():
-            ratio[changed] = curves[band].ratio(flux[changed], agn_flux[changed])
+        total = _Measured.of_column(table, band)
         noise = [stream(seed, "agn", "noise", band, str(key)).standard_normal() for key in ids]
-        wider = error * np.sqrt(np.maximum(ratio**2 - 1.0, 0.0))
-        table[band] = np.where(changed, flux + agn_flux + wider * np.array(noise), flux) * FNU
-        table[error_column(band)] = np.where(changed, error * ratio, error) * FNU
+        noise = np.array(noise)
+        total_ratio = total.error_ratio(agn_flux, curves.get(band))
+        total.add(table, band, agn_flux, total_ratio, noise)
+        name = band + NUCLEUS
+        if name not in table.colnames:
+            continue
+        nucleus = _Measured.of_column(table, name)
+        correlation = np.nan_to_num(np.asarray(table[name + CORRELATION], float))
+        own = [stream(seed, "agn", "noise", name, str(key)).standard_normal() for key in ids]
+        noise = correlation * noise + np.sqrt(1.0 - correlation**2) * np.array(own)
+        ratio = nucleus.error_ratio(agn_flux, curves.get(name))
+        nucleus.add(table, name, agn_flux, ratio, noise)
+        # covariances add up: that of the measurement and that of the added noise
+        added = np.sqrt((total_ratio**2 - 1.0) * (ratio**2 - 1.0))
+        table[name + CORRELATION] = correlation * (1.0 + added) / (total_ratio * ratio)
     return table
+
+
+@value_class
+class _Measured:
+    """Fluxes of a column in uJy with their errors; ``is_flux`` where there is one that is no upper limit."""
+
+    flux: np.ndarray
+    error: np.ndarray
+    is_flux: np.ndarray
+
+    @classmethod
+    def of_column(cls, table, name):
+        """Of the column of this name, its errors and limits."""
+        flux = to_array(table[name], FNU, name)
+        error = to_array(table[error_column(name)], FNU, error_column(name))
+        is_flux = np.isfinite(flux) & np.isfinite(error) & (error > 0)
+        if name + IS_LIMIT in table.colnames:
+            is_flux &= ~np.asarray(table[name + IS_LIMIT], bool)
+        return cls(flux, error, is_flux)
+
+    def error_ratio(self, light, curve):
+        """Errors with light, (n,), over those without, by the `NoiseCurve`: 1 where nothing changes."""
+        ratio = np.ones(light.size)
+        changed = self.is_flux & (light > 0)
+        if changed.any():
+            ratio[changed] = curve.ratio(self.flux[changed], light[changed])
+        return ratio
+
+    def add(self, table, name, light, ratio, noise):
+        """Put fluxes with light and noise, whose standard deviation is 1 in ``noise``, into the column."""
+        changed = self.is_flux & (light > 0)
+        wider = self.error * np.sqrt(ratio**2 - 1.0)
+        table[name] = np.where(changed, self.flux + light + wider * noise, self.flux) * FNU
+        table[error_column(name)] = np.where(changed, self.error * ratio, self.error) * FNU
 
 
 def draw_agn_parameters(axes, n, rng):

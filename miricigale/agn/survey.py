@@ -6,15 +6,22 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, hstack
 
-from miricigale.agn.added_light import NoiseCurve, add_light, agn_light, draw_agn_parameters
+from miricigale.agn.added_light import (
+    NoiseCurve,
+    add_light,
+    agn_light,
+    draw_agn_parameters,
+    nucleus_noise_curves,
+)
 from miricigale.agn.numbers import FLOOR, SampleNumbers, prior_table
 from miricigale.agn.shares import draw_shares
 from miricigale.evaluation import classify
 from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.fitting import AGNBins
 from miricigale.fitting.catalogs.catalog_calibration import measured_calibration
+from miricigale.fitting.catalogs.catalog_rows import read_catalog_nuclei
 from miricigale.fitting.catalogs.classes import fit_classes
 from miricigale.utils.exceptions import FitWarning, OtherResultsError, argument_error, warn
 from miricigale.utils.files import replacing
@@ -187,18 +194,17 @@ class AGNSurvey:
         Raises
         ------
         ValueError
-            If models between nodes are left out (``interpolate=0``), fluxes of nuclei are to be fitted (injected
-            AGN have none), the models have no AGN fraction, or nothing was fitted.
+            If models between nodes are left out (``interpolate=0``), the models have no AGN fraction, or nothing
+            was fitted.
         `~miricigale.utils.exceptions.OtherResultsError`
             If the folder has fits of another catalog, of other settings or of other injected AGN.
         """
         output = Path(output)
         check_that(options.get("interpolate", 1), "interpolate", "above 0 for numbers of AGN", 0)
-        check_that(not options.get("nuclei"), "nuclei", "False for numbers of AGN", True)
         fits = fit_classes(path, output / "fits", agn_bins=self.bins, **options)
         sample = _Sample.of_fits(fits, self.bins, self.limit)
         check_that(sample.used.any(), "path", "a catalog of which objects can be fitted", "none")
-        injected = self._inject(fits, sample, output, options)
+        injected = self._inject(path, fits, sample, output, options)
         result = self._result(sample, injected)
         output.mkdir(parents=True, exist_ok=True)
         result.write(output, overwrite=True)
@@ -209,7 +215,7 @@ class AGNSurvey:
 
     # ------------------------------------------------------------------- injection
 
-    def _inject(self, fits, sample, output, options):
+    def _inject(self, path, fits, sample, output, options):
         """Table of injected AGN and what was fitted of them."""
         results = fits["galaxy"]
         texts = declared("miricigale.agn", "columns.toml")["injected"]
@@ -219,7 +225,7 @@ class AGNSurvey:
             for name in texts:
                 columns[name] = np.zeros(0)
             return described_columns(columns, texts)
-        photometry, truth = self._photometry(results, truth, options.get("redshift"))
+        photometry, truth = self._photometry(path, results, truth, options)
         catalog = output / "injected.fits"
         _write_injected(photometry, catalog, resume=options.get("resume", True))
         fit_options = without(options, _OF_CATALOG)
@@ -270,7 +276,7 @@ class AGNSurvey:
         rows = np.array(chosen)
         return {"row": rows, "log_luminosity": np.array(luminosity), "rng": rng}
 
-    def _photometry(self, results, truth, redshift):
+    def _photometry(self, path, results, truth, options):
         """Photometry of the hosts with AGN, and what is known of the AGN: two tables."""
         hosts = results[truth["row"]]
         bands = list(hosts.fitted_filters)
@@ -284,6 +290,15 @@ class AGNSurvey:
             table[band] = flux[:, j] * FNU
             table[error_column(band)] = error[:, j] * FNU
             table[f"{band}_limit"] = hosts.limit[:, columns[j]]
+        curves = _noise_curves(results, bands, points)
+        if options.get("nuclei"):
+            of_catalog = {}
+            for name in _OF_CATALOG:
+                of_catalog[name] = options.get(name)
+            nuclei = read_catalog_nuclei(path, bands, **of_catalog)
+            curves |= nucleus_noise_curves(nuclei)
+            table = hstack([table, nuclei[truth["row"]]])
+        redshift = options.get("redshift")
         if isinstance(redshift, str):
             table[redshift] = hosts.best["redshift"].value
         luminosity = (10.0 ** truth["log_luminosity"] * u.erg / u.s).to(LUMINOSITY)
@@ -295,7 +310,6 @@ class AGNSurvey:
         usable = np.all([np.isfinite(light[band]) for band in bands], axis=0)
         for j, band in enumerate(bands):
             light[band] = np.where(usable, light[band].to_value(FNU) / points[j], 0.0) * FNU
-        curves = _noise_curves(results, bands, points)
         table = add_light(table, light, curves=curves, seed=self.seed)
         truth_table = QTable({"host": hosts.ids, "redshift": hosts.best["redshift"].value})
         truth_table["log_luminosity"] = truth["log_luminosity"]

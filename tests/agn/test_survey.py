@@ -116,6 +116,39 @@ def test_light_brings_the_noise_of_sources_as_bright():
     assert flux.std() == pytest.approx(np.sqrt(0.5**2 - 0.1**2), rel=0.05)
 
 
+def test_nuclei_get_all_of_the_light_with_correlated_noise():
+    n = 20000
+    band, name = "miri.f770w", "miri.f770w_nucleus"
+    table = QTable({"id": np.arange(n)})
+    table[band] = np.full(n, 3.0) * u.uJy
+    table[f"{band}_err"] = np.full(n, 0.3) * u.uJy
+    table[name] = np.full(n, 1.0) * u.uJy
+    table[f"{name}_err"] = np.full(n, 0.2) * u.uJy
+    table[f"{name}_corr"] = np.full(n, -0.6)
+    table[f"{name}_limit"] = np.arange(n) == 0
+    table[name][1] = np.nan
+    curves = {
+        band: NoiseCurve(np.array([3.0, 7.0]), np.array([0.3, 0.6])),
+        name: NoiseCurve(np.array([1.0, 5.0]), np.array([0.1, 0.3])),
+    }
+    bright = add_light(table, {band: np.full(n, 4.0) * u.uJy}, curves=curves, seed=3)
+    # an upper limit and a nucleus that was not measured stay what they are
+    assert bright[name][0].value == 1.0
+    assert np.isnan(bright[name][1])
+    np.testing.assert_allclose(bright[f"{name}_err"].value[:2], 0.2)
+    # the same covariance with the total, whose error is twice as large
+    np.testing.assert_allclose(bright[f"{name}_corr"][:2], -0.3)
+    total = bright[band].value[2:]
+    point = bright[name].value[2:]
+    assert total.mean() == pytest.approx(7.0, abs=0.02)
+    assert point.mean() == pytest.approx(5.0, abs=0.02)
+    np.testing.assert_allclose(bright[f"{name}_err"].value[2:], 0.6)
+    # what is stated is the noise that was there and that which was added
+    stated = bright[f"{name}_corr"][2] * 0.6 * 0.6
+    assert stated == pytest.approx(-0.6 * 0.3 * 0.2 + np.cov(total, point)[0, 1], abs=0.005)
+    assert np.corrcoef(total, point)[0, 1] == pytest.approx(-0.6, abs=0.02)
+
+
 def test_noise_curve_is_that_of_the_catalog():
     flux = np.linspace(0.0, 100.0, 2001)
     curve = NoiseCurve.of_band(flux, 1.0 + 0.1 * flux)
@@ -215,6 +248,41 @@ def test_workers_and_a_second_call_change_no_byte(result, run):
         assert words in page
 
 
+def test_injected_agn_are_in_the_nuclei_that_were_measured(model, truth, photometry, tmp_path):
+    host = truth.copy()
+    host["frac_agn"] = 0.0
+    host_light = model.fluxes(host, BANDS)
+    light = model.fluxes(truth, BANDS)
+    bands = BANDS[3:5]
+    table = photometry.copy()
+    table.meta = {}
+    for band in bands:
+        table[f"{band}_flux_point"] = light[band] - host_light[band]
+        table[f"{band}_flux_point_err"] = 0.5 * table[f"{band}_err"]
+    catalog = tmp_path / "catalog.fits"
+    table.write(catalog)
+    survey = AGNSurvey(
+        20 * u.arcmin**2, redshift=(0.5, 1.5), log_luminosity=(43.5, 44.5), n_injections=6, seed=2
+    )
+    options = OPTIONS | {"models": lambda _: (model, AXES), "nuclei": True}
+    result = survey.run(catalog, tmp_path / "agn", **options)
+    injected = QTable.read(tmp_path / "agn" / "injected.fits")
+    rows = np.searchsorted(table["id"], result.injected["host"])
+    for band in bands:
+        added = injected[band].value - table[band].value[rows]
+        in_nucleus = injected[f"{band}_nucleus"].value - table[f"{band}_flux_point"].value[rows]
+        error = np.hypot(injected[f"{band}_err"].value, injected[f"{band}_nucleus_err"].value)
+        assert np.all(np.abs(added - in_nucleus) < 4.0 * error)
+        assert np.all(in_nucleus > 0)
+    fit = FitResults.read(next((tmp_path / "agn" / "injected").glob("part-*.fits")))
+    assert fit.meta["fit"]["nuclei"] == bands
+    # AGN of known fraction are measured: their points are 0 in the galaxies
+    good = result.injected["frac_agn"] < 0.85
+    apart = result.injected["frac_agn_fitted"] - result.injected["frac_agn"]
+    assert good.sum() >= 3
+    assert np.all(np.abs(apart[good]) < 0.1)
+
+
 def test_other_injections_replace_nothing(photometry, tmp_path):
     path = tmp_path / "injected.fits"
     photometry = photometry.copy()
@@ -240,7 +308,6 @@ def test_refusals(run, tmp_path):
     refuses("log10 of luminosities", AGNSurvey, area, log_luminosity=(1e44, 1e45))
     refuses("'n_injections' must be", AGNSurvey, area, n_injections=-1)
     survey = AGNSurvey(area)
-    refuses("'nuclei' must be False", survey.run, "no.fits", tmp_path, nuclei=True)
     refuses("'interpolate' must be above 0", survey.run, "no.fits", tmp_path, interpolate=0)
 
 

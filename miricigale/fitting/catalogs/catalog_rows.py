@@ -3,10 +3,13 @@
 import dataclasses
 
 import astropy.units as u
+from astropy.table import vstack
 
 from miricigale.filters import CatalogMap
 from miricigale.filters.catalog_files import CountedRows, MappedRows, as_catalog_map
 from miricigale.filters.photometry_table import band_columns, unit_of_fluxes
+from miricigale.fitting.data.likelihood import flux_columns
+from miricigale.fitting.data.nuclei import NucleusColumns, nucleus_columns, nucleus_table
 from miricigale.utils.row_files import open_rows
 
 
@@ -60,3 +63,30 @@ def give_units(table, fluxes, unit):
     for name in fluxes.intersection(table.colnames):
         if table[name].unit is None:
             table[name].unit = unit
+
+
+def read_catalog_nuclei(path, bands, *, hdu=None, catalog_map=None, flux_unit=None):
+    """
+    Read the fluxes of nuclei of a catalog in a file.
+
+    Parameters
+    ----------
+    path, hdu, catalog_map, flux_unit
+        As for `~miricigale.fitting.fit_catalog`.
+    bands : list of str
+        Bands whose nuclei are read, by our names.
+
+    Returns
+    -------
+    nuclei : `~astropy.table.QTable`
+        A row for each row of the file; see `~miricigale.fitting.data.nuclei.nucleus_table`.
+    """
+    rows = open_catalog(path, hdu=hdu, catalog_map=catalog_map, flux_unit=flux_unit)
+    columns = NucleusColumns.of_table(rows.colnames, bands)
+    fluxes = set(flux_columns(nucleus_columns(rows.colnames)))
+    pieces = []
+    for i in range(rows.n_chunks):
+        table = rows.chunk(i)
+        give_units(table, fluxes, flux_unit)
+        pieces.append(nucleus_table(table, columns))
+    return vstack(pieces)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.filters.band_names import find_filter
 from miricigale.filters.photometry_table import unit_of_fluxes
@@ -15,7 +16,10 @@ from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, flux_unit
 
-_CORRELATION = "_corr"
+#: Ends of the names of columns of `nucleus_table`: of the flux, its correlation and its mark as an upper limit.
+NUCLEUS = "_nucleus"
+CORRELATION = "_corr"
+IS_LIMIT = "_limit"
 #: Values of a nucleus in `read_nuclei`.
 FLUX, SIGMA, COVARIANCE, LIMIT = range(4)
 
@@ -176,16 +180,16 @@ def read_nuclei(table, columns, data, reader):
     values = np.zeros((n, len(columns.bands), 4))
     values[:, :, SIGMA] = np.inf
     left_out = np.zeros(n, bool)
-    for j, (band, column) in enumerate(zip(columns.bands, columns.columns, strict=True)):
+    measured = nucleus_table(table, columns)
+    for j, band in enumerate(columns.bands):
         i = reader.bands.index(band)
         point = reader.zero_point.get(band, 1.0)
         factor = point * reader.error_factor.get(band, 1.0)
-        flux = point * _fluxes(table, column)
-        error = factor * _fluxes(table, error_column(column))
-        correlation = np.zeros(n)
-        if column + _CORRELATION in table.colnames:
-            correlation = _numbers(table, column + _CORRELATION)
-        limited = limits(table, column)
+        name = band + NUCLEUS
+        flux = point * measured[name].value
+        error = factor * measured[error_column(name)].value
+        correlation = measured[name + CORRELATION]
+        limited = measured[name + IS_LIMIT]
         # no point was fitted where both are missing
         present = np.isfinite(flux) | np.isfinite(error)
         usable = np.isfinite(flux) & np.isfinite(error) & (error > 0) & data.used[:, i]
@@ -202,6 +206,43 @@ def read_nuclei(table, columns, data, reader):
         values[:, j, COVARIANCE] = np.where(paired, covariance, 0.0)
         values[:, j, LIMIT] = usable & limited
     return values, left_out
+
+
+def nucleus_table(table, columns):
+    """
+    Read the columns of nuclei as they are, under one name for each band.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        The catalog.
+    columns : `NucleusColumns`
+        Its columns of nuclei.
+
+    Returns
+    -------
+    nuclei : `~astropy.table.QTable`
+        Of each band: ``<band>_nucleus`` and ``<band>_nucleus_err`` in uJy, NaN where missing,
+        ``<band>_nucleus_corr``, 0 without that column, and ``<band>_nucleus_limit``, true of upper limits.
+
+    Raises
+    ------
+    ValueError
+        If a column holds something else than numbers.
+    `~astropy.units.UnitsError`
+        If a flux has no unit of flux density, or a correlation has a unit.
+    """
+    nuclei = QTable()
+    for band, column in zip(columns.bands, columns.columns, strict=True):
+        name = band + NUCLEUS
+        nuclei[name] = _fluxes(table, column) * FNU
+        nuclei[error_column(name)] = _fluxes(table, error_column(column)) * FNU
+        correlation = np.zeros(len(table))
+        if column + CORRELATION in table.colnames:
+            correlation = _numbers(table, column + CORRELATION)
+        nuclei[name + CORRELATION] = correlation
+        nuclei[name + IS_LIMIT] = limits(table, column)
+    return nuclei
 
 
 def _fluxes(table, name):
