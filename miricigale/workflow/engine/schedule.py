@@ -177,69 +177,99 @@ def run_tasks(tasks, *, places, n_threads, wait_for=None, report=None):
     `~miricigale.utils.exceptions.DataError`
         If a process of an executor died, or four places were lost over one task.
     """
-    waiting = _Queue(list(tasks))
-    running = {}
-    error = None
-    # concurrent.futures.wait holds locks of all futures, and keeps them if it is interrupted
-    done = queue.SimpleQueue()
-    deaths = collections.Counter()
+    run = _Run(_Queue(list(tasks)), n_threads, wait_for, report)
     while True:
         machines = places()
-        for future, (task, place) in list(running.items()):
-            if place not in machines and not future.done():
-                future.cancel()
-                del running[future]
-                deaths[task] += 1
-                if deaths[task] == _DEATHS:
-                    msg = (
-                        f"{_DEATHS} workers died over {task.title}, the last at {place}; was there too little "
-                        "memory? What is finished stands: the same command resumes it"
-                    )
-                    raise DataError(msg)
-                log.warning("%s is lost; %s is done again by another worker", place, task.title)
-                waiting.put_back(task)
-        task = None
-        if error is None and len(running) < n_threads:
-            place, memory = _roomiest(machines, running.values())
-            task = waiting.take(memory)
+        run.take_back_lost(machines)
+        task, place = run.next_task(machines)
         if task is not None:
-            slots = min(n_threads, sum(machine.slots for machine in machines.values()))
-            together = min(slots, len(running) + waiting.n_ready + 1)
-            threads = min(machines[place].n_threads, max(1, n_threads // together))
-            try:
-                future = task.begin(machines[place].submit, threads)
-            except BrokenExecutor as err:
-                raise _died(task) from err
-            if future is None:
-                waiting.complete(task)
-            else:
-                running[future] = task, place
-                future.add_done_callback(done.put)
-                if report is not None:
-                    report([begun.title for begun, _ in running.values()])
-        elif running:
-            try:
-                future = done.get(timeout=wait_for)
-            except queue.Empty:
-                continue
-            task, _ = running.pop(future, (None, None))
-            if task is None:
-                continue
-            failure = future.exception()
-            if isinstance(failure, BrokenExecutor):
-                raise _died(task) from failure
-            if failure is None:
-                task.finish(future.result())
-                waiting.complete(task)
-            error = error or failure
-        elif error is not None:
-            raise error
-        elif waiting.n_ready:
+            run.begin(task, place, machines)
+        elif run.running:
+            run.finish_next()
+        elif run.error is not None:
+            raise run.error
+        elif run.waiting.n_ready:
             log.warning("there are no workers any more: waiting for some")
             while not places():
                 time.sleep(wait_for)
         else:
             return
+
+
+class _Run:
+    """Tasks that wait, and those that run: ``running`` has the task of each future, and the name of its place."""
+
+    def __init__(self, waiting, n_threads, wait_for, report):
+        self.waiting = waiting
+        self.running = {}
+        #: the first that a task raised; nothing begins after it
+        self.error = None
+        self._n_threads = n_threads
+        self._wait_for = wait_for
+        self._report = report
+        # concurrent.futures.wait holds locks of all futures, and keeps them if it is interrupted
+        self._done = queue.SimpleQueue()
+        self._deaths = collections.Counter()
+
+    def take_back_lost(self, machines):
+        """Let tasks wait again that ran at places which are there no more."""
+        for future, (task, place) in list(self.running.items()):
+            if place in machines or future.done():
+                continue
+            future.cancel()
+            del self.running[future]
+            self._deaths[task] += 1
+            if self._deaths[task] == _DEATHS:
+                msg = (
+                    f"{_DEATHS} workers died over {task.title}, the last at {place}; was there too little "
+                    "memory? What is finished stands: the same command resumes it"
+                )
+                raise DataError(msg)
+            log.warning("%s is lost; %s is done again by another worker", place, task.title)
+            self.waiting.put_back(task)
+
+    def next_task(self, machines):
+        """Take the task that begins now and the name of its place; None and None if none does."""
+        if self.error is not None or len(self.running) >= self._n_threads:
+            return None, None
+        place, memory = _roomiest(machines, self.running.values())
+        return self.waiting.take(memory), place
+
+    def begin(self, task, place, machines):
+        """Begin a task, with its share of the threads."""
+        slots = min(self._n_threads, sum(machine.slots for machine in machines.values()))
+        together = min(slots, len(self.running) + self.waiting.n_ready + 1)
+        n_threads = min(machines[place].n_threads, max(1, self._n_threads // together))
+        try:
+            future = task.begin(machines[place].submit, n_threads)
+        except BrokenExecutor as err:
+            raise _died(task) from err
+        if future is None:
+            self.waiting.complete(task)
+            return
+        self.running[future] = task, place
+        future.add_done_callback(self._done.put)
+        if self._report is not None:
+            self._report([begun.title for begun, _ in self.running.values()])
+
+    def finish_next(self):
+        """Wait for a task to end, but no longer than until places are to be asked for again."""
+        try:
+            future = self._done.get(timeout=self._wait_for)
+        except queue.Empty:
+            return
+        if future not in self.running:
+            # of a place that was lost
+            return
+        task, _ = self.running.pop(future)
+        failure = future.exception()
+        if isinstance(failure, BrokenExecutor):
+            raise _died(task) from failure
+        if failure is not None:
+            self.error = self.error or failure
+            return
+        task.finish(future.result())
+        self.waiting.complete(task)
 
 
 def _roomiest(places, running):
