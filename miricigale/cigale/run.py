@@ -15,6 +15,7 @@ from miricigale.utils.named_values import convert_values, without
 from miricigale.utils.options import check_choice
 from miricigale.utils.outputs import check_output
 from miricigale.utils.tables import error_column
+from miricigale.utils.values import value_class
 
 
 def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
@@ -68,67 +69,36 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     if config["parameters_file"]:
         raise config_error(path, "has lists of models (parameters_file), which are not read")
     try:
-        modules = config["sed_modules_params"]
-        columns = config["bands"]
         chain = read_modules(
-            config["sed_modules"], modules, folder=path.parent, libraries=libraries
+            config["sed_modules"],
+            config["sed_modules_params"],
+            folder=path.parent,
+            libraries=libraries,
         )
-        bands, lost = band_filters(dict.fromkeys(map(_without_error, columns)), names)
-        fitted = set(bands.values())
-        others = dict.fromkeys(band for band in analysis["bands"] if band not in fitted)
-        predicted, lost_predictions = band_filters(others, names)
+        bands = _RunBands.of_config(config, names, has_xray=bool(chain.xray))
     except (ConfigError, ValueError) as err:
         raise config_error(path, f"cannot be used: {err}") from err
-    # bands of X-rays, which only the module of X-rays fills
-    hard = {name for name in bands | predicted if xray_energies(name) and name not in names}
-    dark = set()
-    if not chain.xray:
-        dark = hard
-        bands = without(bands, dark)
-        predicted = without(predicted, dark)
-    if not bands:
-        raise config_error(path, f"has no band that is known here, of {', '.join(lost) or 'none'}")
-    for band in bands.values():
-        if band not in columns:
-            raise config_error(path, f"has {error_column(band)} among the bands, and not {band}")
-    computed = {entry[0] for entry in cigale_names(chain.modules).values()}
-    if chain.xray and not hard:
+    bands.check(path)
+    computed = _computed_variables(chain, bands)
+    if chain.xray and not bands.hard:
         chain.left_out.append(f"{chain.modules['xray']} (no band of it)")
-    if dark or not hard:
-        computed -= {"xray.alpha_ox", "xray.agn_Lx_2to10keV", "agn.intrin_Lnu_2500A_30deg"}
-    variables = analysis["variables"]
-    unknown = [f"band {name}" for name in dict.fromkeys(lost + lost_predictions)]
-    if unknown:
-        # the last one says what to do
-        unknown[-1] += f" (no filter here: {GIVE_FILTER})"
-    left_out = []
-    for entry in chain.left_out:
-        is_module = "." not in entry and " " not in entry
-        left_out.append(f"module {entry}" if is_module else entry)
-    for name in sorted(dark):
-        left_out.append(f"band {name} (no module xray)")
-    left_out += unknown
-    for name in variables:
-        if name not in computed:
-            left_out.append(f"variable {name}")
-    for name in config["properties"]:
-        if not name.endswith("_err"):
-            left_out.append(f"property {name}")
-    chain.left_out[:] = left_out
-    all_bands = (bands | predicted).values()
-    extended = [name for name in all_bands if name.endswith("_ext") and name not in names]
+    chain.left_out[:] = _all_left_out(chain, bands, config, computed)
+    extended = bands.extended(names)
     if extended:
         chain.differs.append(f"bands {', '.join(extended)}: curves of point sources")
     flag = analysis["lim_flag"]
     if flag == "noscaling":
         chain.differs.append("lim_flag noscaling: upper limits act on the scale too, as with full")
+    data_file = None
+    if config["data_file"]:
+        data_file = path.parent / config["data_file"]
     setup = CigaleSetup(
         path=path,
-        data_file=path.parent / config["data_file"] if config["data_file"] else None,
-        bands=bands,
-        predicted=without(predicted, bands),
-        columns=tuple(name for name in columns if _without_error(name) in bands.values()),
-        variables=tuple(name for name in variables if name in computed),
+        data_file=data_file,
+        bands=bands.fitted,
+        predicted=without(bands.predicted, bands.fitted),
+        columns=bands.fitted_columns(),
+        variables=tuple(name for name in analysis["variables"] if name in computed),
         additional_error=config["additionalerror"],
         limits=LIMIT_FLAGS[flag] != "none",
         redshift_decimals=analysis["redshift_decimals"],
@@ -143,6 +113,100 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     if text:
         warn(f"{path}:\n{text}", CatalogWarning)
     return setup
+
+
+@value_class
+class _RunBands:
+    """
+    Bands of a run of CIGALE.
+
+    ``columns`` are those of the configuration. ``fitted`` and ``predicted`` are dicts of our names to CIGALE's;
+    ``lost`` and ``lost_predictions`` have CIGALE's names of which there is no filter. ``hard`` are all bands of
+    X-rays, and ``dark`` those without the module that fills them.
+    """
+
+    columns: list
+    fitted: dict
+    predicted: dict
+    lost: list
+    lost_predictions: list
+    hard: set
+    dark: set
+
+    @classmethod
+    def of_config(cls, config, names, *, has_xray):
+        """Of a configuration, with filters ``names`` that were given."""
+        columns = config["bands"]
+        fitted, lost = band_filters(dict.fromkeys(map(_without_error, columns)), names)
+        in_catalog = set(fitted.values())
+        others = [band for band in config["analysis_params"]["bands"] if band not in in_catalog]
+        predicted, lost_predictions = band_filters(dict.fromkeys(others), names)
+        hard = set()
+        for name in fitted | predicted:
+            if xray_energies(name) and name not in names:
+                hard.add(name)
+        dark = set()
+        if not has_xray:
+            dark = hard
+        return cls(
+            columns=columns,
+            fitted=without(fitted, dark),
+            predicted=without(predicted, dark),
+            lost=lost,
+            lost_predictions=lost_predictions,
+            hard=hard,
+            dark=dark,
+        )
+
+    def check(self, path):
+        """Refuse a run without a band that can be fitted, or with the errors of a band alone."""
+        if not self.fitted:
+            names = ", ".join(self.lost) or "none"
+            raise config_error(path, f"has no band that is known here, of {names}")
+        for band in self.fitted.values():
+            if band not in self.columns:
+                text = f"has {error_column(band)} among the bands, and not {band}"
+                raise config_error(path, text)
+
+    def fitted_columns(self):
+        """List the columns of the catalog that belong to bands that are fitted: tuple of str."""
+        fitted = set(self.fitted.values())
+        return tuple(name for name in self.columns if _without_error(name) in fitted)
+
+    def extended(self, names):
+        """List CIGALE's bands for extended sources, for which there are curves of points alone."""
+        all_bands = (self.fitted | self.predicted).values()
+        return [name for name in all_bands if name.endswith("_ext") and name not in names]
+
+
+def _computed_variables(chain, bands):
+    """CIGALE's names of the quantities that are computed for these modules and bands: set of str."""
+    computed = {entry[0] for entry in cigale_names(chain.modules).values()}
+    if bands.dark or not bands.hard:
+        computed -= {"xray.alpha_ox", "xray.agn_Lx_2to10keV", "agn.intrin_Lnu_2500A_30deg"}
+    return computed
+
+
+def _all_left_out(chain, bands, config, computed):
+    """Name each module, band, variable and property that is left out, with the reason: list of str."""
+    left_out = []
+    for entry in chain.left_out:
+        is_module = "." not in entry and " " not in entry
+        left_out.append(f"module {entry}" if is_module else entry)
+    for name in sorted(bands.dark):
+        left_out.append(f"band {name} (no module xray)")
+    unknown = [f"band {name}" for name in dict.fromkeys(bands.lost + bands.lost_predictions)]
+    if unknown:
+        # the last one says what to do
+        unknown[-1] += f" (no filter here: {GIVE_FILTER})"
+    left_out += unknown
+    for name in config["analysis_params"]["variables"]:
+        if name not in computed:
+            left_out.append(f"variable {name}")
+    for name in config["properties"]:
+        if not name.endswith("_err"):
+            left_out.append(f"property {name}")
+    return left_out
 
 
 def _without_error(column):
