@@ -22,6 +22,9 @@ _LYMAN = 0.0912  # um
 _LIGHT = 299792458.0  # m/s
 _KEV_UM = (const.h * const.c).to_value(u.keV * u.um)
 _XRAY_WAVE = _KEV_UM / np.geomspace(*SPAN[::-1], 1000)  # um
+#: Ages of stars, and kinds of light of the gas that they ionize.
+_AGES = ("old", "young")
+_GAS_LIGHT = ("lines", "continuum")
 _AGN_COLUMNS = {"torus": "torus", "polar": "polar_dust", "disk": "disk"}
 
 
@@ -75,40 +78,16 @@ def best_model_table(
     values = model.values(parameters)
     spectra = model.evaluate(**parameters)
     chain = model.chain
-    mass = values["mass"]
     derived = {name: quantity.value for name, quantity in spectra.derived.items()}
     stars, quantities = _stars(model, values)
-    parts = {f"stellar.{age}": stars[age] for age in ("old", "young")}
-    gas = model.component("nebular") is not None
-    escaping = np.where(chain.wave < _LYMAN, values.get("f_esc", 1.0), 1.0)
-    for kind in ("absorption", "lines", "continuum") if gas else ():
-        for age in ("old", "young"):
-            if kind == "absorption":
-                light = stars[age] * (escaping - 1.0)
-            else:
-                light = stars[kind, age]
-            parts[f"nebular.{kind}_{age}"] = light
-    young, old, of_gas = chain.factors(chain.key(values, "attenuation"))
-    factor = {"young": young, "old": old}
-    for age in ("old", "young"):
-        parts[f"attenuation.stellar.{age}"] = stars[age] * escaping * (factor[age] - 1.0)
-    for kind in ("lines", "continuum") if gas else ():
-        for age in ("old", "young"):
-            through = of_gas
-            if of_gas is None:
-                through = factor[age]
-            parts[f"attenuation.nebular.{kind}_{age}"] = stars[kind, age] * (through - 1.0)
-    parts = {name: mass * light for name, light in parts.items()}
+    parts = {}
+    for name, light in _galaxy_parts(chain, values, stars).items():
+        parts[name] = values["mass"] * light
     parts["dust"] = derived["dust_luminosity"] * chain.dust(chain.key(values, "dust"))
     if model.has_agn:
-        nucleus = chain.agn(values)
-        power = derived["agn_power"]
-        for name, theirs in _AGN_COLUMNS.items():
-            light = power * getattr(nucleus, name)
-            parts[f"agn.SKIRTOR2016_{theirs}"] = light
-            quantities[AGN_PARTS[name][1]] = float(chain.weights @ light)
-        disk = derived["accretion_power"] * disk_2500(chain, model.component("agn"), values)
-        quantities["agn.intrin_Lnu_2500A_30deg"] = disk
+        agn_parts, agn_quantities = _agn(model, values, derived)
+        parts |= agn_parts
+        quantities |= agn_quantities
     total = sum(parts.values())
     parts["igm"] = total * (chain.sky(values) - 1.0)
     quantities |= _attenuation(chain, parts, bands)
@@ -121,21 +100,75 @@ def best_model_table(
         parts |= {name: np.pad(light, (0, chain.wave.size)) for name, light in bright.items()}
         quantities |= xray_columns
     z = values["redshift"]
-    far = float(distance(z, model.cosmology) if far is None else far.to_value(u.m))
+    if far is None:
+        source_distance = float(distance(z, model.cosmology))
+    else:
+        source_distance = float(far.to_value(u.m))
+    for ours, (theirs, _, scale) in cigale_names(modules).items():
+        if ours in derived:
+            quantities[theirs] = scale * derived[ours]
+        elif ours in values:
+            quantities[theirs] = scale * values[ours]
+    quantities["universe.age"] = model.cosmology.age(z).to_value(u.Myr)
+    quantities["universe.luminosity_distance"] = source_distance
+    table = _observed_table(wave, parts, z, source_distance)
+    table.meta.update({name: float(value) for name, value in sorted(quantities.items())})
+    return table
+
+
+def _galaxy_parts(chain, values, stars):
+    """Light of stars and gas and what dust takes of it, W/um for a solar mass formed: dict by CIGALE's names."""
+    parts = {f"stellar.{age}": stars[age] for age in _AGES}
+    has_gas = ("lines", "old") in stars
+    escaping = np.where(chain.wave < _LYMAN, values.get("f_esc", 1.0), 1.0)
+    young, old, of_gas = chain.factors(chain.key(values, "attenuation"))
+    factor = {"young": young, "old": old}
+    if has_gas:
+        for age in _AGES:
+            parts[f"nebular.absorption_{age}"] = stars[age] * (escaping - 1.0)
+        for kind in _GAS_LIGHT:
+            for age in _AGES:
+                parts[f"nebular.{kind}_{age}"] = stars[kind, age]
+    for age in _AGES:
+        parts[f"attenuation.stellar.{age}"] = stars[age] * escaping * (factor[age] - 1.0)
+    if has_gas:
+        for kind in _GAS_LIGHT:
+            for age in _AGES:
+                through = of_gas
+                if of_gas is None:
+                    through = factor[age]
+                parts[f"attenuation.nebular.{kind}_{age}"] = stars[kind, age] * (through - 1.0)
+    return parts
+
+
+def _agn(model, values, derived):
+    """Light of the parts of an AGN in W/um, and its quantities: two dicts by CIGALE's names."""
+    chain = model.chain
+    nucleus = chain.agn(values)
+    parts = {}
+    quantities = {}
+    for name, theirs in _AGN_COLUMNS.items():
+        light = derived["agn_power"] * getattr(nucleus, name)
+        parts[f"agn.SKIRTOR2016_{theirs}"] = light
+        quantities[AGN_PARTS[name][1]] = float(chain.weights @ light)
+    disk = derived["accretion_power"] * disk_2500(chain, model.component("agn"), values)
+    quantities["agn.intrin_Lnu_2500A_30deg"] = disk
+    return parts, quantities
+
+
+def _observed_table(wave, parts, redshift, source_distance):
+    """Table of parts in W/um at wavelengths in um, both at rest, as observed from a distance in m."""
     table = Table()
-    table["wavelength"] = wave * (1.0 + z) * 1e3 * u.nm
-    luminosity = sum(parts.values()) / (1.0 + z) * 1e-3  # W/nm of observed wavelength
-    fnu = luminosity * 1e9 * (table["wavelength"] * 1e-9) ** 2 / (_LIGHT * 4.0 * np.pi * far**2)
+    table["wavelength"] = wave * (1.0 + redshift) * 1e3 * u.nm
+    # W/um at rest to W/nm of observed wavelength
+    to_observed = 1e-3 / (1.0 + redshift)
+    luminosity = sum(parts.values()) * to_observed
+    sphere = 4.0 * np.pi * source_distance**2
+    fnu = luminosity * 1e9 * (table["wavelength"] * 1e-9) ** 2 / (_LIGHT * sphere)
     table["Fnu"] = np.asarray(fnu) * 1e29 * u.mJy
     table["L_lambda_total"] = luminosity * u.W / u.nm
     for name, light in parts.items():
-        table[name] = light / (1.0 + z) * 1e-3 * u.W / u.nm
-    for ours, (theirs, _, scale) in cigale_names(modules).items():
-        if ours in derived or ours in values:
-            quantities[theirs] = scale * (derived[ours] if ours in derived else values[ours])
-    quantities["universe.age"] = model.cosmology.age(z).to_value(u.Myr)
-    quantities["universe.luminosity_distance"] = far
-    table.meta.update({name: float(value) for name, value in sorted(quantities.items())})
+        table[name] = light * to_observed * u.W / u.nm
     return table
 
 
