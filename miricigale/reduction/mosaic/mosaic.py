@@ -340,75 +340,103 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     else:
         weights = [floats(weight) for weight in weights]
         weights = [np.where(np.isnan(weight), 0.0, weight) for weight in weights]
-    # drizzle works in float32: weights near one
-    medians = [np.median(w[w > 0]) for w in weights if np.any(w > 0)]
-    unit_weight = 1.0
-    if medians:
-        unit_weight = float(np.median(medians))
-
-    sink = Drizzle(
-        kernel="square", fillval="NAN", fillval2="NAN", out_shape=shape, disable_ctx=True
-    )
-    n_images = np.zeros(shape, np.uint8)
-    before = np.zeros(shape, np.float32)
+    unit_weight = _typical_weight(weights)
     variances = list(variances) or [{}] * len(images)
-    names = [
-        name for name in PLANES[:3] if all(name in image_variances for image_variances in variances)
-    ]
-    for im, image_variances, weight, (x, y) in zip(
+    names = []
+    for name in PLANES[:3]:
+        if all(name in image_variances for image_variances in variances):
+            names.append(name)
+    grid = _DrizzledGrid(wcs, shape, pixfrac)
+    for im, image_variances, weight, pixel_map in zip(
         images, variances, weights, pixel_maps, strict=True
     ):
-        nowhere = ~(np.isfinite(x) & np.isfinite(y))
-        if nowhere.all():
-            continue
-        if nowhere.any():
-            x = _filled(x, nowhere)
-            y = _filled(y, nowhere)
-        # an image of many may reach a small part of the grid
-        part = extent_of((x, y), shape)
-        weight = np.where(plain_mask(im) | nowhere, 0.0, np.asarray(weight) / unit_weight)
-        weight = weight.astype(np.float32)
-        if part is None or not weight.any():
-            continue
-        parts = [np.square(np.asarray(sigma(im), float))]
-        parts += [floats(image_variances[name]) for name in names]
-        parts = [np.where(weight > 0, plane, 0.0).astype(np.float32) for plane in parts]
-        add_image(sink, im, weight, (x, y), wcs, pixfrac, data2=parts)
-        touched = sink.out_wht[part] > before[part]
-        _check_covered(touched, (x, y), weight > 0, shape, pixfrac)
-        n_images[part] += touched
-        before[part] = sink.out_wht[part]
-
-    if n_images.any():
-        data = sink.out_img
-        parts = sink.out_img2
-        weight = sink.out_wht
-    else:
-        data = np.full(shape, np.nan, np.float32)
-        parts = [data] * (1 + len(names))
-        weight = np.zeros(shape, np.float32)
+        planes = [np.square(np.asarray(sigma(im), float))]
+        planes += [floats(image_variances[name]) for name in names]
+        grid.add(im, weight / unit_weight, pixel_map, planes)
+    data, weight, parts = grid.planes(1 + len(names))
     covered = (weight > 0) & np.isfinite(data)
-    flags = np.where(covered, 0, int(DQ.NON_SCIENCE | DQ.DO_NOT_USE))
-    ratio = _scale(wcs) / float(np.mean([_scale(im.wcs) for im in images]))
-    before_drizzle = float(np.mean([ImageFacts.of(im).noise_correction for im in images]))
-    # an exposure without any usable pixel was not long
-    pairs = zip(images, weights, strict=True)
-    alive = [im for im, weight in pairs if np.any((np.asarray(weight) > 0) & ~plain_mask(im))]
-    meta = _meta(alive or images) | {
-        "pixfrac": float(pixfrac),
-        "pixel_scale": _scale(wcs) * 3600,
-        "noise_correction": noise_correction(pixfrac, ratio) * before_drizzle,
-    }
     out = flagged_image(
         np.where(covered, data, np.nan),
         images[0].unit,
         error=np.sqrt(np.where(covered, parts[0], np.nan)),
-        flags=flags,
+        flags=np.where(covered, 0, int(DQ.NON_SCIENCE | DQ.DO_NOT_USE)),
         wcs=wcs,
-        meta=meta,
+        meta=_drizzled_meta(images, weights, wcs, pixfrac),
     )
     weight = (weight * np.float32(unit_weight)).astype(np.float32)
-    return Mosaic(out, weight, n_images, dict(zip(names, parts[1:], strict=True)))
+    return Mosaic(out, weight, grid.n_images, dict(zip(names, parts[1:], strict=True)))
+
+
+def _typical_weight(weights):
+    """Median weight of images: drizzle works in float32, with weights that are near one."""
+    medians = []
+    for weight in weights:
+        is_used = weight > 0
+        if np.any(is_used):
+            medians.append(np.median(weight[is_used]))
+    if not medians:
+        return 1.0
+    return float(np.median(medians))
+
+
+class _DrizzledGrid:
+    """Pixels of a grid of the shape (ny, nx), onto which images are drizzled one after the other."""
+
+    def __init__(self, wcs, shape, pixfrac):
+        self._wcs = wcs
+        self._shape = shape
+        self._pixfrac = pixfrac
+        self._sink = Drizzle(
+            kernel="square", fillval="NAN", fillval2="NAN", out_shape=shape, disable_ctx=True
+        )
+        self._weight_before = np.zeros(shape, np.float32)
+        #: images that reach each pixel
+        self.n_images = np.zeros(shape, np.uint8)
+
+    def add(self, image, weight, pixel_map, planes):
+        """Add an image with its weights, the places (x, y) of its pixels and the variances ``planes``."""
+        x, y = pixel_map
+        nowhere = ~(np.isfinite(x) & np.isfinite(y))
+        if nowhere.all():
+            return
+        if nowhere.any():
+            x = _filled(x, nowhere)
+            y = _filled(y, nowhere)
+        # an image of many may reach a small part of the grid
+        part = extent_of((x, y), self._shape)
+        weight = np.where(plain_mask(image) | nowhere, 0.0, weight).astype(np.float32)
+        if part is None or not weight.any():
+            return
+        planes = [np.where(weight > 0, plane, 0.0).astype(np.float32) for plane in planes]
+        add_image(self._sink, image, weight, (x, y), self._wcs, self._pixfrac, data2=planes)
+        weight_now = self._sink.out_wht[part]
+        touched = weight_now > self._weight_before[part]
+        _check_covered(touched, (x, y), weight > 0, self._shape, self._pixfrac)
+        self.n_images[part] += touched
+        self._weight_before[part] = weight_now
+
+    def planes(self, n_variances):
+        """Mean, weight and so many variances of each pixel; NaN and no weight where nothing was added."""
+        if self.n_images.any():
+            return self._sink.out_img, self._sink.out_wht, self._sink.out_img2
+        data = np.full(self._shape, np.nan, np.float32)
+        return data, np.zeros(self._shape, np.float32), [data] * n_variances
+
+
+def _drizzled_meta(images, weights, wcs, pixfrac):
+    """What the images say of themselves, put together, and what drizzling does to their noise."""
+    alive = []
+    for im, weight in zip(images, weights, strict=True):
+        # an exposure without any usable pixel was not long
+        if np.any((weight > 0) & ~plain_mask(im)):
+            alive.append(im)
+    ratio = _scale(wcs) / float(np.mean([_scale(im.wcs) for im in images]))
+    before_drizzle = float(np.mean([ImageFacts.of(im).noise_correction for im in images]))
+    return _meta(alive or images) | {
+        "pixfrac": float(pixfrac),
+        "pixel_scale": _scale(wcs) * 3600,
+        "noise_correction": noise_correction(pixfrac, ratio) * before_drizzle,
+    }
 
 
 def _check_covered(touched, pixel_map, weighted, shape, pixfrac):
@@ -503,13 +531,24 @@ def _meta(images):
     for key in ("pa_aper", "dither", "background", "background_error", "background_flags"):
         if all(key in m for m in metas):
             meta[key] = [m[key] for m in metas]
-    if any(words := [m.get("keywords", {}) for m in metas]):
-        shared = {k: card for k, card in words[0].items() if all(w.get(k) == card for w in words)}
-        # its pixels are others
-        meta["keywords"] = {k: card for k, card in shared.items() if not k.startswith("PIXAR")}
+    keywords = _shared_keywords([m.get("keywords", {}) for m in metas])
+    if keywords is not None:
+        meta["keywords"] = keywords
     done = frozenset.intersection(*(ExposureHistory.of(im).steps for im in images))
     meta["steps"] = sorted(done | {"resample"})
     for key in metas[0]:
         if key not in meta and all(m.get(key) == metas[0][key] for m in metas):
             meta[key] = metas[0][key]
     return meta
+
+
+def _shared_keywords(of_images):
+    """Cards that all images have alike, without the area of their pixels; None if none has any."""
+    if not any(of_images):
+        return None
+    shared = {}
+    for key, card in of_images[0].items():
+        is_shared = all(keywords.get(key) == card for keywords in of_images)
+        if is_shared and not key.startswith("PIXAR"):
+            shared[key] = card
+    return shared
