@@ -84,10 +84,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
     result : `~miricigale.reduction.ReductionResult`
     """
     check_that(images, "images", "at least one image", "none")
-    if align is not None:
-        if isinstance(align, str) and align != "dithers":
-            raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))
-        images, _ = align_images(images, None if isinstance(align, str) else align)
+    images = _aligned(images, align)
     if wcs is None:
         wcs = own_grid(images, pixel_scale)
     wcs = as_wcs(wcs)
@@ -95,29 +92,31 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
     if reducer.mosaics.outlier_threshold is not None and len(images) < 3:
         number = "a single dither" if len(images) == 1 else "two dithers"
         notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
+    has_backgrounds = len(backgrounds) == len(images)
     if reducer.background.method == "dithers":
-        if len(images) >= 3 and len(backgrounds) == len(images):
-            unsubtracted = [
-                restored(im, b.level) for im, b in zip(images, backgrounds, strict=True)
-            ]
+        if len(images) >= 3 and has_backgrounds:
+            unsubtracted = []
+            for image, background in zip(images, backgrounds, strict=True):
+                unsubtracted.append(restored(image, background.level))
             images, backgrounds = subtract_dithers(reducer, unsubtracted, backgrounds, wcs)
         else:
             notes.append("backgrounds are those of single exposures: it takes three and theirs")
-    doubts = [b for b in backgrounds if not b.trusted]
+    doubts = [background for background in backgrounds if not background.trusted]
     if doubts:
         doubt = f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted"
         notes.append(f"{doubt} ({_reasons(doubts)})")
-    unsubtracted = []
-    if len(backgrounds) == len(images):
-        unsubtracted = [im.data + b.level for im, b in zip(images, backgrounds, strict=True)]
+    with_background = []
+    if has_backgrounds:
+        for image, background in zip(images, backgrounds, strict=True):
+            with_background.append(image.data + background.level)
     drizzled, images = drizzle(reducer.mosaics, images, wcs, planes)
     mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
     subtracted = mosaic_background.level
-    if unsubtracted:
+    if has_backgrounds:
         # of the exposures too, and what brought them to one level
-        removed = [
-            with_data(im, data - im.data) for im, data in zip(images, unsubtracted, strict=True)
-        ]
+        removed = []
+        for image, data in zip(images, with_background, strict=True):
+            removed.append(with_data(image, data - image.data))
         levels = drizzle_images(removed, wcs, pixfrac=reducer.mosaics.pixfrac).image
         subtracted = subtracted + np.where(levels.mask, 0, levels.data)
     if not mosaic_background.trusted:
@@ -128,17 +127,30 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
         mosaic.meta[f"mosaic_{key}"] = mosaic.meta.pop(key, None)
         if key in drizzled.image.meta:
             mosaic.meta[key] = drizzled.image.meta[key]
-    products = (
-        tuple(rates),
-        tuple(images),
-        tuple(backgrounds),
-        mosaic,
-        drizzled.weight,
-        drizzled.n_images,
-    )
     return ReductionResult(
-        *products, mosaic_background, subtracted, tuple(notes), drizzled.variances
+        rates=tuple(rates),
+        images=tuple(images),
+        backgrounds=tuple(backgrounds),
+        mosaic=mosaic,
+        weight=drizzled.weight,
+        n_images=drizzled.n_images,
+        mosaic_background=mosaic_background,
+        subtracted=subtracted,
+        notes=tuple(notes),
+        variances=drizzled.variances,
     )
+
+
+def _aligned(images, align):
+    """Images aligned with sources at positions, or with each other; as they are if ``align`` is None."""
+    if align is None:
+        return images
+    if isinstance(align, str):
+        if align != "dithers":
+            raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))
+        align = None
+    aligned, _ = align_images(images, align)
+    return aligned
 
 
 def _reasons(backgrounds):

@@ -159,35 +159,61 @@ def read_images(path):
         flags = _flags(hdus, shape, path)
         if "MASK" in hdus:
             flags |= np.where(_plane(hdus, "MASK", shape, path) != 0, int(DQ.DO_NOT_USE), 0)
-    if error is not None and not np.any(np.isfinite(error) & (error > 0)):
-        refused = "has no error in ERR, which is nowhere finite and above 0"
-        if not any(name in planes for name in _VARIANCES):
+    error = _usable_error(error, planes, path)
+    if len(shape) == 2:
+        mask = False
+        if "WHT" in planes:
+            mask = ~(planes["WHT"] > 0)
+        image = flagged_image(data, unit, error=error, flags=flags, wcs=wcs, meta=meta, mask=mask)
+        return [ImageFile(image, planes, header)]
+    return _integrations(data, unit, error, flags, wcs, meta, planes, header)
+
+
+def _usable_error(error, planes, path):
+    """Error of ERR, or of the variances where ERR is missing or nowhere finite and above 0; None without any."""
+    parts = [planes[name] for name in _VARIANCES if name in planes]
+    if error is not None:
+        if np.any(np.isfinite(error) & (error > 0)):
+            return error
+        if not parts:
             hint = "mend it"
             if "WHT" in planes:
                 hint = "photometry.read_mosaic takes the errors of WHT"
-            raise data_error(path, f"{refused}, and no variances: {hint}")
-        error = None
-    if error is None and (parts := [planes[name] for name in _VARIANCES if name in planes]):
-        error = np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
-    out = []
-    for number in range(shape[0]) if len(shape) == 3 else (...,):
-        integration = flagged_image(
+            refused = "has no error in ERR, which is nowhere finite and above 0, and no variances"
+            raise data_error(path, f"{refused}: {hint}")
+    if not parts:
+        return None
+    return np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
+
+
+def _integrations(data, unit, error, flags, wcs, meta, planes, header):
+    """`ImageFile` of each integration of arrays whose first axis has these."""
+    files = []
+    for number in range(len(data)):
+        error_of = None
+        if error is not None:
+            error_of = error[number]
+        mask = False
+        if "WHT" in planes:
+            mask = ~(planes["WHT"][number] > 0)
+        image = flagged_image(
             data[number],
             unit,
-            error=None if error is None else error[number],
+            error=error_of,
             flags=flags[number],
             wcs=wcs,
-            meta=meta if number is ... else {**meta, "integration": number},
-            mask=~(planes["WHT"][number] > 0) if "WHT" in planes else False,
+            meta={**meta, "integration": number},
+            mask=mask,
         )
-        part = {}
+        own_planes = {}
         for name, plane in planes.items():
-            if name == "CON" or plane.shape != shape:
-                part[name] = plane
+            # maps and counts are those of all integrations
+            if name == "CON" or plane.shape != data.shape:
+                own_planes[name] = plane
             else:
-                part[name] = plane[number]
-        out.append(ImageFile(integration, part, header))
-    return out
+                own_planes[name] = plane[number]
+        files.append(ImageFile(image, own_planes, header))
+    return files
 
 
 def open_exposure(path):
