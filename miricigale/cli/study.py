@@ -78,6 +78,12 @@ def _show_cost(config, folder, until, again):
     return 0
 
 
+#: Columns of a comparison of plans that are printed.
+_COMPARED = [
+    "plan", "time", "z_scatter", "z_outliers", "frac_scatter", "completeness", "purity", "n_agn", "merit",
+]  # fmt: skip
+
+
 def plan(args):
     """Tabulate exposures, or compare plans."""
     values = _key_values(args, "plan")
@@ -88,15 +94,7 @@ def plan(args):
 
         plan_table(quick=args.quick).pprint_all()
         return 0
-    if args.quick:
-        msg = "--quick is of the table of the CEERS exposures, which has no other option"
-        raise ValueError(msg)
-    if args.time is not None and args.depth is not None:
-        msg = "wanted are --time or --depth, not both"
-        raise ValueError(msg)
-    if args.hours is not None and args.depth is not None:
-        msg = "wanted are --hours or --depth, not both"
-        raise ValueError(msg)
+    _check_plan_options(args)
     from miricigale.planning import load_plan, write_plan
     from miricigale.utils.outputs import check_output
     from miricigale.utils.parallel import threads
@@ -126,15 +124,24 @@ def plan(args):
             overwrite=args.overwrite,
             progress_bar=args.progress_bar,
         )
-    names = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter"]
-    names += ["completeness", "purity", "n_agn", "merit"]
-    table = comparison[names]
+    table = comparison[_COMPARED]
     for name in table.colnames[1:]:
         table[name].info.format = ".3g"
     table.pprint_all()
     print(comparison.meta["answer"])
     print(f"done in {time.monotonic() - begin:.0f} s; page: {folder / 'plan.html'}")
     return 0
+
+
+def _check_plan_options(args):
+    """Refuse options of `plan` that contradict each other."""
+    if args.quick:
+        msg = "--quick is of the table of the CEERS exposures, which has no other option"
+        raise ValueError(msg)
+    for option, value in (("--time", args.time), ("--hours", args.hours)):
+        if value is not None and args.depth is not None:
+            msg = f"wanted are {option} or --depth, not both"
+            raise ValueError(msg)
 
 
 def _bands_of(args, values):

@@ -37,6 +37,8 @@ _ABOUT_COLUMNS = re.compile(rf"{_WAVE_WORD.pattern}|\bin\b|\bunits?\b", re.IGNOR
 _DETECTOR = re.compile(r"detector[\s_]*(?:type)?\s*[:=\t ]\s*(energy|photon|[01])\b", re.IGNORECASE)
 #: Keywords of tables that say it, in lower case and without underscores.
 _DETECTOR_KEYWORDS = ("detectortype", "detector", "dettype")
+#: The same in files of CIGALE, as a comment of its own.
+_KINDS = ("photon", "energy")
 _ENERGY = re.compile(r"\s*(?:0$|energy\b)", re.IGNORECASE)
 #: Names of columns of the throughput.
 _THROUGHPUT = re.compile(
@@ -209,42 +211,60 @@ def _parameters(path):
 
 
 def _of_text(path, unit):
+    comments, rows = _text_rows(path)
+    try:
+        data = _two_columns(rows)
+    except ValueError:
+        raise data_error(path, "is no filter: it has not two columns of numbers") from None
+    # as in CIGALE's files, which are in Angstrom
+    kinds = [text.lower() for text in comments[:3] if text.lower() in _KINDS]
+    if unit is None:
+        if kinds:
+            unit = _unit_beside_kind(comments, path)
+        else:
+            unit = unit_of_comments(comments, path)
+    name = path.stem
+    if kinds and comments[0].lower() not in kinds:
+        name = comments[0]
+    wave, throughput = data.T
+    if any(_PERCENT.search(text) for text in comments):
+        throughput = throughput / 100
+    return wave * u.Unit(unit), throughput, _counts_energy(comments, kinds), name, {}
+
+
+def _text_rows(path):
+    """Comments of a text file, and the words of its rows of numbers."""
     unpacked_size(path)
     try:
         with packed_open(path) as stream:
             lines = stream.read().decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise data_error(path, f"cannot be read as a filter: {err}") from None
-    lines = [line.strip() for line in lines]
-    lines = [line for line in lines if line]
-    comments = [line.lstrip("# ").strip() for line in lines if line.startswith("#")]
+    comments = []
     rows = []
     for line in lines:
-        if not line.startswith("#"):
+        line = line.strip()
+        if line.startswith("#"):
+            comments.append(line.lstrip("# ").strip())
+        elif line:
             problem = f"has commas within its numbers, such as {line[:40]!r}: write points"
             check_data(not _DECIMAL_COMMA.match(line), path, problem)
             rows.append(line.partition("#")[0].replace(",", " ").split())
-    if len(rows) > 2 and not (len(rows[0]) > 1 and all(map(_is_number, rows[0][:2]))):
-        # names of columns without a mark, or what LePhare has there: a number of rows and a name
-        comments.append(" ".join(rows.pop(0)))
-    try:
-        data = _two_columns(rows)
-    except ValueError:
-        raise data_error(path, "is no filter: it has not two columns of numbers") from None
-    # as in CIGALE's files, which are in Angstrom
-    kinds = [text.lower() for text in comments[:3] if text.lower() in ("photon", "energy")]
-    named = kinds and comments[0].lower() not in kinds
-    if unit is None:
-        if kinds:
-            unit = _unit_beside_kind(comments, path)
-        else:
-            unit = unit_of_comments(comments, path)
-    said = _DETECTOR.search("\n".join(comments))
-    energy = kinds[:1] == ["energy"] or (said is not None and _ENERGY.match(said[1]) is not None)
-    wave, throughput = data.T
-    if any(_PERCENT.search(text) for text in comments):
-        throughput = throughput / 100
-    return wave * u.Unit(unit), throughput, energy, comments[0] if named else path.stem, {}
+    if len(rows) > 2:
+        first = rows[0]
+        has_numbers = len(first) > 1 and all(map(_is_number, first[:2]))
+        if not has_numbers:
+            # names of columns without a mark, or what LePhare has there: a number of rows and a name
+            comments.append(" ".join(rows.pop(0)))
+    return comments, rows
+
+
+def _counts_energy(comments, kinds):
+    """Whether a curve is of a detector that counts energy, by the first of CIGALE's kinds or another comment."""
+    if kinds and kinds[0] == "energy":
+        return True
+    stated = _DETECTOR.search("\n".join(comments))
+    return stated is not None and _ENERGY.match(stated[1]) is not None
 
 
 def _unit_beside_kind(comments, path):

@@ -309,21 +309,31 @@ def _our_names(colnames, bands, argument):
     columns |= _matched(linear, colnames, bands, argument)
     magnitudes = _matched(logarithmic, colnames, bands, argument)
     for band in bands:
-        error = error_column(band)
-        complete = band in columns and error in columns
-        if band not in magnitudes or complete or (band in columns and error not in magnitudes):
-            continue
-        columns[band] = magnitudes[band]
-        if error in magnitudes:
-            columns[error] = magnitudes[error]
+        if _magnitude_counts(band, columns, magnitudes):
+            columns[band] = magnitudes[band]
+            error = error_column(band)
+            if error in magnitudes:
+                columns[error] = magnitudes[error]
     for theirs in colnames:
-        band = theirs.endswith(_LIMIT) and _band_of(theirs.removesuffix(_LIMIT), bands)
+        if not theirs.endswith(_LIMIT):
+            continue
+        band = _band_of(theirs.removesuffix(_LIMIT), bands)
         if band in bands and f"{band}{_LIMIT}" not in colnames:
             columns[f"{band}{_LIMIT}"] = theirs
     ambiguous = [name for name in colnames if name.lower() in _ALONE]
     if len(bands) == len(ambiguous) == 1 and bands[0] not in columns:
         columns[bands[0]] = ambiguous[0]
     return columns
+
+
+def _magnitude_counts(band, columns, magnitudes):
+    """Whether the magnitude of a band is taken: without a flux, or with an error that the flux has not."""
+    if band not in magnitudes:
+        return False
+    if band not in columns:
+        return True
+    error = error_column(band)
+    return error not in columns and error in magnitudes
 
 
 def _matched(names, colnames, bands, argument):

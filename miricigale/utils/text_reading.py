@@ -37,64 +37,77 @@ _DS9 = re.compile(rb"# *Region file format: *DS9|^(?:global |fk5|icrs|image)\b",
 def read_text(path, form, id_names):
     """Table of a text file or another one that astropy reads by itself."""
     if form.startswith("ascii"):
-        start = first_bytes(path)
-        if _DS9.search(start[:_PIECE]):
-            return region_table(path)
-        if start.lstrip()[:1] in (b"{", b"["):
-            raise ValueError("it is JSON, and wanted are columns of text")
-        source = str(path)
-        options = {"format": form}
-        if form == "ascii.no_header":
-            options["names"] = names_in_comments(start.decode("utf-8", "replace"))
-        n_comments = 0
-        if form == "ascii.csv":
-            options["delimiter"], n_comments = csv_layout(path)
-        if n_comments or start.startswith(BOM) or is_zip(path):
-            # a mark at the start is no part of the first name, and of archives astropy reads no text
-            with packed_open(path) as stream:
-                source = stream.read().decode("utf-8-sig").splitlines()[n_comments:]
-        units = {}
-        if form == "ascii.csv":
-            source = without_comments(source, path, options["delimiter"])
-            source, units = plain_rows(source, path, options["delimiter"])
-            if options["delimiter"] == "\t":
-                source = commas_for_tabs(source, path)
-                options["delimiter"] = ","
-        with warnings.catch_warnings():
-            # what 64 bits do not hold is read as text
-            warnings.filterwarnings("ignore", "OverflowError converting to IntType", AstropyWarning)
-            table = Table.read(source, **options)
-        if form != "ascii.ecsv":
-            names = [name for name in table.colnames if name in id_names or is_id_name(name)]
-            if WRITTEN_INDEX in table.colnames:
-                names.append(WRITTEN_INDEX)
-            for name, unit in units.items():
-                table[name].unit = unit
-            _numbers_among_words(table, names)
-            _ids_as_written(table, path, source, options, names)
-            _unmark_first_name(table)
-            first = table.colnames[0] if table.colnames else None
-            if first and is_written_index(first, table.colnames, table[first]):
-                table.rename_column(first, "id")
-        return table
+        return _read_ascii(path, form, id_names)
     if is_zip(path):
         msg = f"of {form} in a zip archive: unpack it first"
         raise ValueError(msg)
     if form == "votable":
-        document = votable.parse(path)
-        _check_status(document, path)
-        tables = list(document.iter_tables())
-        if len(tables) > 1:
-            names = ", ".join(str(table.name or table.ID or i) for i, table in enumerate(tables))
-            msg = f"it has {len(tables)} tables ({names}): write one of them to a file of its own"
-            raise ValueError(msg)
-        if len(tables) == 1:
-            check_names_differ([field.name for field in tables[0].fields])
-        # names are what users see; astropy takes the IDs of fields
-        table = Table.read(document, format=form, use_names_over_ids=True)
-        table.meta.update(_own_meta(tables))
-        return table
+        return _read_votable(path)
     return Table.read(path, format=form)
+
+
+def _read_ascii(path, form, id_names):
+    """Table of columns of text, in one of astropy's formats ``ascii.*``."""
+    start = first_bytes(path)
+    if _DS9.search(start[:_PIECE]):
+        return region_table(path)
+    if start.lstrip()[:1] in (b"{", b"["):
+        raise ValueError("it is JSON, and wanted are columns of text")
+    source = str(path)
+    options = {"format": form}
+    if form == "ascii.no_header":
+        options["names"] = names_in_comments(start.decode("utf-8", "replace"))
+    n_comments = 0
+    if form == "ascii.csv":
+        options["delimiter"], n_comments = csv_layout(path)
+    if n_comments or start.startswith(BOM) or is_zip(path):
+        # a mark at the start is no part of the first name, and of archives astropy reads no text
+        with packed_open(path) as stream:
+            source = stream.read().decode("utf-8-sig").splitlines()[n_comments:]
+    units = {}
+    if form == "ascii.csv":
+        source = without_comments(source, path, options["delimiter"])
+        source, units = plain_rows(source, path, options["delimiter"])
+        if options["delimiter"] == "\t":
+            source = commas_for_tabs(source, path)
+            options["delimiter"] = ","
+    with warnings.catch_warnings():
+        # what 64 bits do not hold is read as text
+        warnings.filterwarnings("ignore", "OverflowError converting to IntType", AstropyWarning)
+        table = Table.read(source, **options)
+    if form == "ascii.ecsv":
+        # which states types and units itself
+        return table
+    for name, unit in units.items():
+        table[name].unit = unit
+    id_columns = [name for name in table.colnames if name in id_names or is_id_name(name)]
+    if WRITTEN_INDEX in table.colnames:
+        id_columns.append(WRITTEN_INDEX)
+    _numbers_among_words(table, id_columns)
+    _ids_as_written(table, path, source, options, id_columns)
+    _unmark_first_name(table)
+    if table.colnames:
+        first = table.colnames[0]
+        if is_written_index(first, table.colnames, table[first]):
+            table.rename_column(first, "id")
+    return table
+
+
+def _read_votable(path):
+    """Table of a VOTable that has one."""
+    document = votable.parse(path)
+    _check_status(document, path)
+    tables = list(document.iter_tables())
+    if len(tables) > 1:
+        names = ", ".join(str(table.name or table.ID or i) for i, table in enumerate(tables))
+        msg = f"it has {len(tables)} tables ({names}): write one of them to a file of its own"
+        raise ValueError(msg)
+    if len(tables) == 1:
+        check_names_differ([field.name for field in tables[0].fields])
+    # names are what users see; astropy takes the IDs of fields
+    table = Table.read(document, format="votable", use_names_over_ids=True)
+    table.meta.update(_own_meta(tables))
+    return table
 
 
 def _own_meta(tables):
