@@ -169,6 +169,17 @@ class Parts:
         table.meta.clear()
         return table
 
+    def columns(self, name, *, rows=None):
+        """Arrays of the columns of a table of plain numbers and text, or of these rows of it, by name; copies."""
+        data = self._hdus[name].data
+        if rows is not None:
+            data = data[rows]
+        arrays = {}
+        for column in data.names:
+            array = np.asarray(data[column])
+            arrays[column] = array.astype(array.dtype.newbyteorder("="))
+        return arrays
+
 
 def native(array):
     """Array in the byte order of the machine; the same one where it is."""

@@ -67,14 +67,12 @@ def read_results(path, *, rows=None):
     mapped = rows is not None
     with open_parts(path, (_RESULTS,), wanted="fit results", memmap=mapped) as parts:
         text = parts.text
-        table = parts.table("RESULTS", rows=rows)
+        arrays = parts.columns("RESULTS", rows=rows)
+        n = len(arrays["ids"])
         columns = {}
         for name, shape in text["shapes"].items():
-            if name in table.colnames:
-                full = native(table[name])
-            else:
-                full = np.zeros(0)
-            columns[name] = full.reshape(len(table), *shape)
+            # columns without elements are not in the file
+            columns[name] = arrays.get(name, np.zeros(0)).reshape(n, *shape)
         values = {name: tuple(text[name]) for name in _TUPLES}
         values |= subset(text, _FACTS) | {name: {} for name in _DICTS}
         for key, array in columns.items():
