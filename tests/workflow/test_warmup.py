@@ -41,6 +41,8 @@ for k, name in enumerate(names):
     table[f"{name}_err"] = [0.1, 0.2, 0.3] * u.uJy
 fitter = BayesFitter(SEDModel.yang2021(), names, axes=SEDModel.yang2021_axes("quick"))
 fitter.fit(table)
+axes = {name: values[:2] for name, values in SEDModel.yang2021_axes("quick").items()}
+BayesFitter(SEDModel.yang2021().grid(axes, names)).fit(table)
 SEDModel.yang2021().evaluate(redshift=1.0, frac_agn=0.3)
 """
 
@@ -62,7 +64,7 @@ def python(code, folder, environment=None):
 
 @pytest.mark.slow
 def test_a_fit_after_its_job_compiles_nothing(tmp_path):
-    """Whatever a fit calls the job has called: every signature, one of each kernel, none of the limits."""
+    """What fits of a model and of a grid call the job has called: one signature of each kernel, none of limits."""
     shown = "\nimport json\nprint(json.dumps(kernels('fitting') | kernels('sed')))"
     of_job, of_fit = (
         json.loads(python(code + shown, tmp_path).splitlines()[-1]) for code in (FIT, REAL)

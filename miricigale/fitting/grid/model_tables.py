@@ -279,6 +279,8 @@ class ModelTables:
             agn, agn_columns = self._agn(light, lines)
         place = self.place
         universe = self.model.cosmology.age(light.redshift).to_value(u.Gyr)
+        # of a type with the ages of grids: kernels are compiled once
+        universe = np.ascontiguousarray(universe)
         parts = _core.Light(
             stars=stars,
             burst=burst,
