@@ -135,11 +135,12 @@ def test_one_hit_costs_one_difference_of_its_pixel():
     detector, image = Detector.miri_imager().without(CosmicRays), sky_of(exposure, 5.0)
     charge = detector.collect(image, exposure, seed=1)
     full = charge.limit(65535.0 - miri_detector().bias)
-    places = np.array([[10, 5, 20], [30, 20, 20], [40, 50, 50]])
+    # of the type that cosmic rays have, for which the kernel is compiled
+    places = np.array([[10, 5, 20], [30, 20, 20], [40, 50, 50]], np.int32)
     electrons = np.array([2e4, 0.7 * full, 0.7 * full])
     reducer = Reducer(ramps=RampSettings(neighbor_threshold=None))
     for n, used in ((1, (28, 29)), (3, (28, 18))):
-        hits = {"hits": places[:, :n], "hit_electrons": electrons[:n]}
+        hits = {"hits": places[:, :n].copy(), "hit_electrons": electrons[:n]}
         fit = reducer.fit_groups(dataclasses.replace(charge, **hits))
         assert (fit.n_used[30, 40], fit.n_used[20, 50]) == used
 
