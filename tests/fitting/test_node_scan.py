@@ -12,7 +12,8 @@ from miricigale.sed import SEDModel
 BANDS = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "miri.f770w"]
 AXES = {
     "redshift": np.linspace(0.3, 1.5, 9),
-    "age": [1.0, 3.0],
+    # at most redshifts the universe is younger than the last
+    "age": [1.0, 3.0, 9.0],
     "ebv": [0.1, 0.3, 0.5],
     "tau97": [3.0, 7.0],
     "frac_agn": [0.0, 0.2, 0.5, 0.8],
