@@ -3,7 +3,9 @@
 import astropy.units as u
 
 from miricigale.depth.noise import ExposureNoise
+from miricigale.instrument import Exposure
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
+from miricigale.utils.options import check_that
 
 
 def saturation_flux(exposure, *, background=None, psf=None, detector=None):
@@ -27,6 +29,11 @@ def saturation_flux(exposure, *, background=None, psf=None, detector=None):
     flux : `~astropy.units.Quantity`
         In uJy; 0 if the sky alone fills the well.
 
+    Raises
+    ------
+    ValueError
+        If it is no exposure.
+
     Examples
     --------
     >>> from miricigale.depth import saturation_flux
@@ -35,6 +42,8 @@ def saturation_flux(exposure, *, background=None, psf=None, detector=None):
     >>> print(f"{saturation_flux(exposure).to('mJy'):.1f}")
     0.6 mJy
     """
+    wanted = "an Exposure, such as Exposure('F770W', n_groups=30)"
+    check_that(isinstance(exposure, Exposure), "exposure", wanted, repr(exposure))
     noise = ExposureNoise(
         filter=exposure.filter,
         background=background,

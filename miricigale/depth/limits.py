@@ -19,6 +19,8 @@ from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, scalar, to_a
 
 # positions of the source's center within the pixel, per axis, over which is averaged
 _PHASES = (np.arange(4) + 0.5) / 4 - 0.5
+#: Exposure time to which limits refer unless another is given.
+_TIME = 1e4 * u.s
 
 
 def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
@@ -229,7 +231,7 @@ def _check_well(noise):
 
 def sensitivity(
     filter,
-    time=1e4 * u.s,
+    time=None,
     *,
     n_sigma=5.0,
     method="fit",
@@ -246,10 +248,11 @@ def sensitivity(
 
     Parameters
     ----------
-    filter : str or list of str
-        One of `~miricigale.instrument.imager_filters`, or several.
+    filter : str, list of str or `~miricigale.instrument.Exposure`
+        One of `~miricigale.instrument.imager_filters`, or several; or an exposure, whose filter, time, groups,
+        readout and subarray are taken.
     time : `~astropy.units.Quantity`, optional
-        Total exposure time, all dithers.
+        Total exposure time, all dithers, 10 ks by default; not with an exposure.
     n_sigma : float, optional
         Flux over its error.
     method : {"fit", "aperture"}, optional
@@ -292,6 +295,15 @@ def sensitivity(
         more = {"method": method, "excess": excess, "residual": residual, "n_dithers": n_dithers}
         limits = [sensitivity(one, time, n_sigma=n_sigma, **more, **options) for one in filter]
         return u.Quantity(limits)
+    if isinstance(filter, Exposure):
+        exposure = filter
+        check_that(time is None, "time", "left out with an exposure", time)
+        filter = exposure.filter
+        time = exposure.exposure_time
+        for name in ("n_groups", "readout", "subarray"):
+            options.setdefault(name, getattr(exposure, name))
+    if time is None:
+        time = _TIME
     check_choice(method, "method", ("fit", "aperture"))
     unused = {"fit": ("aperture", "annulus", "correlation"), "aperture": ("size", "mosaic")}
     for name in unused[method]:

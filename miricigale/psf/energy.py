@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 from miricigale.instrument import imager_filters, psf_fwhm
 from miricigale.psf import _core
+from miricigale.psf.by_filter import exposure_psf
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import enclosed_light, instrument_psf
 from miricigale.utils.options import check_choice, check_that
@@ -16,14 +17,21 @@ from miricigale.utils.tables import described_rows
 from miricigale.utils.units import ANGLE, scalar
 
 
+def _psf_or_model(psf):
+    """Return a PSF that states its pixel, or the model of the filter that is named."""
+    if isinstance(psf, str):
+        return exposure_psf(psf)
+    return instrument_psf(psf)
+
+
 def encircled_energy(psf, radius, *, pixel_scale=None):
     """
     Fraction of a point source's light inside circles around the center.
 
     Parameters
     ----------
-    psf : `~photutils.psf.ImagePSF`
-        A PSF with the meta of `~miricigale.psf.make_psf`.
+    psf : `~photutils.psf.ImagePSF` or str
+        A PSF with the meta of `~miricigale.psf.make_psf`; or a filter, whose model for a single exposure is taken.
     radius : `~astropy.units.Quantity`
         Scalar or array of radii.
     pixel_scale : `~astropy.units.Quantity`, optional
@@ -48,7 +56,7 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
     >>> encircled_energy(psf, [0.15, 0.3, 0.6] * u.arcsec).round(3)
     array([0.499, 0.937, 1.   ])
     """
-    psf = instrument_psf(psf)
+    psf = _psf_or_model(psf)
     data = psf.data
     if pixel_scale is not None:
         scale = scalar(pixel_scale, ANGLE, "pixel_scale")
@@ -65,8 +73,8 @@ def radius_of_encircled_energy(psf, fraction):
 
     Parameters
     ----------
-    psf : `~photutils.psf.ImagePSF`
-        A PSF with the meta of `~miricigale.psf.make_psf`.
+    psf : `~photutils.psf.ImagePSF` or str
+        A PSF with the meta of `~miricigale.psf.make_psf`; or a filter, whose model for a single exposure is taken.
     fraction : float
         Of all light, between 0 and 1.
 
@@ -88,7 +96,7 @@ def radius_of_encircled_energy(psf, fraction):
     >>> print(f"{radius_of_encircled_energy(psf, 0.5):.3f}")
     0.150 arcsec
     """
-    psf = instrument_psf(psf)
+    psf = _psf_or_model(psf)
     cells = np.arange(0.0, psf.half_width / psf.cell, 0.25)
     x, y = psf.origin
     sums = _core.radial_sums(psf.data, x, y, cells) / psf.n_cells**2
@@ -107,8 +115,8 @@ def fwhm(psf, *, method="half_maximum"):
 
     Parameters
     ----------
-    psf : `~photutils.psf.ImagePSF`
-        A PSF with the meta of `~miricigale.psf.make_psf`.
+    psf : `~photutils.psf.ImagePSF` or str
+        A PSF with the meta of `~miricigale.psf.make_psf`; or a filter, whose model for a single exposure is taken.
     method : {"half_maximum", "gaussian"}, optional
         Where the azimuthal mean falls to a half (the attribute ``fwhm``), or that of a round
         Gaussian fitted out to 0.75 FWHM, the usual way to measure stars. The core of a
@@ -132,7 +140,7 @@ def fwhm(psf, *, method="half_maximum"):
     >>> print(f"{fwhm(psf):.3f}, {fwhm(psf, method='gaussian'):.3f}")
     0.300 arcsec, 0.300 arcsec
     """
-    psf = instrument_psf(psf)
+    psf = _psf_or_model(psf)
     check_choice(method, "method", ("half_maximum", "gaussian"))
     if method == "half_maximum":
         return psf.fwhm

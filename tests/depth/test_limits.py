@@ -27,6 +27,7 @@ from miricigale.depth.noise import ExposureNoise, noise_power, ramp_variance
 from miricigale.detector import BadPixels, CosmicRays, Detector, Residual
 from miricigale.instrument import (
     DetectorProperties,
+    Exposure,
     background_level,
     imager_filters,
     photmjsr,
@@ -315,6 +316,15 @@ def test_unknown_names_list_the_known():
     # frames of 2.775 s
     wanted = "'time' must be at least one integration of 10 groups, 27.75 s, got 10"
     refuses(wanted, sensitivity, NAME, 10 * u.s, n_groups=10)
+
+
+@pytest.mark.parametrize("method", ["fit", "aperture"])
+def test_an_exposure_has_the_limit_of_its_filter_time_and_groups(method):
+    exposure = Exposure(NAME, n_groups=40, n_integrations=3, subarray="BRIGHTSKY")
+    form = {"n_groups": 40, "subarray": "BRIGHTSKY", "method": method}
+    limit = sensitivity(NAME, exposure.exposure_time, **form)
+    assert_quantity_allclose(sensitivity(exposure, method=method), limit)
+    refuses("'time' must be left out with an exposure", sensitivity, exposure, 1 * u.h)
 
 
 def test_several_filters_have_a_limit_each():

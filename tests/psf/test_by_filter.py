@@ -9,10 +9,13 @@ from miricigale.psf import (
     checked_psf,
     encircled_energy,
     filter_psf,
+    fwhm,
     gaussian_psf,
+    hst_psf,
     make_psf,
     miri_psf,
     psf_image,
+    radius_of_encircled_energy,
 )
 from miricigale.utils.exceptions import MiricigaleWarning
 
@@ -44,6 +47,14 @@ def test_models_stand_on_the_sky_by_name(name):
     assert "drizzle" in psf.includes
     with pytest.raises(KeyError, match=r"no model PSF for the filter 'miri\.f771w'; known: miri"):
         filter_psf("miri.f771w", pixel_scale=PIXEL)
+
+
+def test_widths_and_energies_take_the_name_of_a_filter():
+    for name, psf in (("F770W", miri_psf("F770W")), ("F160W", hst_psf("F160W"))):
+        assert fwhm(name) == psf.fwhm
+        assert encircled_energy(name, 0.3 * u.arcsec) == encircled_energy(psf, 0.3 * u.arcsec)
+        assert radius_of_encircled_energy(name, 0.5) == radius_of_encircled_energy(psf, 0.5)
+    refuses("no model PSF for the filter 'F771W'", fwhm, "F771W", error=KeyError)
 
 
 def test_the_light_beyond_the_grid_is_that_of_the_model(mosaic):
