@@ -5,6 +5,6 @@ Spectral energy distributions: what galaxies and AGN send out, as components in 
 that the grid fitter uses; the links of the chain stand in `miricigale.sed.components`.
 """
 
-import lazy_loader
+from miricigale.utils.lazy_modules import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -9,7 +9,7 @@ from miricigale.refdata import Registry, locate
 from miricigale.refdata.lookup import fingerprint_of
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.caching import cached
-from miricigale.utils.exceptions import ConfigError, config_error
+from miricigale.utils.exceptions import ConfigError, argument_error, config_error
 from miricigale.utils.named_values import subset, without
 from miricigale.utils.options import check_that
 
@@ -275,6 +275,9 @@ class Component:
 
 def in_order(components):
     """Components of a model in the order of their roles: what is lacking or there twice is refused."""
+    if isinstance(components, (str, Mapping)):
+        wanted = "a list of components or names (SEDModel.from_dict takes tables of them)"
+        raise argument_error("components", wanted, type(components).__name__)
     components = [named_component(one) if isinstance(one, str) else one for one in components]
     for one in components:
         wanted = "Component instances or names"

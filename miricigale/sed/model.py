@@ -20,7 +20,7 @@ from miricigale.utils.exceptions import argument_error, config_error, unknown_na
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.named_values import without_none
-from miricigale.utils.options import check_names, check_that
+from miricigale.utils.options import check_that
 from miricigale.utils.units import WAVE
 
 
@@ -401,7 +401,7 @@ class SEDModel(Interactive):
         """
         parameters = tables.by_our_names(parameters, self._parameters, short=True)
         parameters = tables.with_mass_formed(self, parameters)
-        check_names(parameters, "parameter", self._parameters)
+        tables.check_parameters(parameters, self)
         for name, value in parameters.items():
             wanted = "one number (fluxes() takes several models)"
             check_that(np.ndim(value) == 0, name, wanted, f"shape {np.shape(value)}")
@@ -509,8 +509,7 @@ class SEDModel(Interactive):
         table, filters = tables.named_first(table, filters, parameters, "table")
         if parameters:
             parameters = tables.by_our_names(parameters, self._parameters, short=True)
-            known = [*self._parameters, tables.LIVING_MASS]
-            check_names(parameters, "parameter", known)
+            tables.check_parameters(parameters, self)
             table = tables.parameter_table(parameters)
         for name, value in (("table", table), ("filters", filters)):
             check_that(value is not None, name, "given, or parameters by name", "None")

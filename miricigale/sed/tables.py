@@ -10,23 +10,35 @@ from astropy.table import QTable, Table
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
 from miricigale.sed.chain import SIX, SKY, STELLAR, distinct
+from miricigale.sed.component import COMPONENTS
 from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import SED, distance
 from miricigale.utils.caching import cached
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn
 from miricigale.utils.named_values import convert_values, rows_of
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import Flags, as_table, described_table
 from miricigale.utils.units import FNU, WAVE
 
-#: Names of parameters that are usual elsewhere, with ours.
+#: Names of parameters that are usual elsewhere, with ours; and those that have other meanings in tables.
 _OTHER_NAMES = {"z": "redshift", "fracAGN": "frac_agn"}
+_OTHER_ARGUMENTS = {
+    "zred": "redshift",
+    "f_agn": "frac_agn",
+    "fagn": "frac_agn",
+    "agn_fraction": "frac_agn",
+    "E_BV": "ebv",
+    "ebmv": "ebv",
+    "E_BVs_young": "ebv",
+    "E_BVs_old_factor": "ebv_factor",
+    "mass_formed": "mass",
+}
 #: Mass of living stars, in place of the mass formed that models have as their parameter.
 LIVING_MASS = "stellar_mass"
 #: Names of the logarithm of a mass in lower case.
-_LOG_MASSES = ("log_mass", "logmass", "lmass", "log_m")
+_LOG_MASSES = ("log_mass", "logmass", "lmass", "log_m", "massformed", "log_massformed")
 
 BLOCK = 64  # rows worked out together: their spectra fit into the processor's cache
 
@@ -105,7 +117,13 @@ def by_our_names(values, known=(), *, short=False):
         See `plain_mass`.
     """
     names = values.colnames if isinstance(values, Table) else list(values)
-    others = {theirs: (ours, "") for theirs, ours in _OTHER_NAMES.items()}
+    usual_names = _OTHER_NAMES
+    if short:
+        usual_names = _OTHER_NAMES | _OTHER_ARGUMENTS
+    others = {}
+    for theirs, ours in usual_names.items():
+        if theirs not in known:
+            others[theirs] = (ours, "")
     our_names = (*known, LIVING_MASS)
     for theirs, meaning in _cigale_parameters(our_names, short=short).items():
         if theirs not in known:
@@ -146,6 +164,60 @@ def _cigale_parameters(known, short):
         if counts[bare] == 1:
             without_module[bare] = meaning
     return meanings | without_module
+
+
+def check_parameters(names, model):
+    """
+    Refuse the first of some names that is no parameter of a model.
+
+    Raises
+    ------
+    KeyError
+        Whose message says which components have such a parameter, and what stands in their place in the model; or
+        what to write in place of a name of other programs; or lists the parameters.
+    """
+    known = [*model.parameters, LIVING_MASS]
+    for name in names:
+        if name in known:
+            continue
+        sentences = declared("miricigale.sed", "parameter_hints.toml")["sentences"]
+        if name in sentences:
+            msg = f"no parameter {name!r}; {sentences[name]}"
+            raise KeyError(msg)
+        ours, owners = _components_with(name)
+        if owners:
+            raise _parameter_of_others(name, ours, owners, model)
+        check_names([name], "parameter", known)
+
+
+def _components_with(name):
+    """Return our name of a parameter, or of CIGALE's with or without module, and the components that have it."""
+    owners = {}
+    for component in COMPONENTS.names():
+        for ours in COMPONENTS.get(component).declared():
+            owners.setdefault(ours, []).append(component)
+    if name in owners:
+        return name, owners[name]
+    ours, _ = _cigale_parameters(tuple(owners), short=True).get(name, (name, ""))
+    return ours, owners.get(ours, [])
+
+
+def _parameter_of_others(name, ours, owners, model):
+    """Make the `KeyError` of a parameter that other components have than those of the model."""
+    own_name = ""
+    if ours != name:
+        own_name = f" (here {ours!r})"
+    roles = {COMPONENTS.metadata(owner)["role"] for owner in owners}
+    in_place = []
+    for component in model.components:
+        if component.role in roles:
+            names = ", ".join(component.parameters) or "no parameters"
+            in_place.append(f"{component.name} ({names})")
+    has = "no such component"
+    if in_place:
+        has = " and ".join(in_place)
+    msg = f"no parameter {name!r} in this model: it is of {' and '.join(owners)}{own_name}; the model has {has}"
+    return KeyError(msg)
 
 
 def named_first(values, filters, named, argument):

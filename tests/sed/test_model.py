@@ -128,7 +128,8 @@ def test_model_without_agn_has_no_agn_numbers():
     model = SEDModel.yang2021(agn=False)
     assert "accretion_power" not in model.derived(age=1.0)
     assert "frac_agn" not in model.parameters
-    refuses(r"no parameter 'frac_agn'; known: .*ebv", model.evaluate, error=KeyError, frac_agn=0.2)
+    owners = "it is of parametric_torus and skirtor2016; the model has no such component"
+    refuses(f"'frac_agn' in this model: {owners}", model.evaluate, error=KeyError, frac_agn=0.2)
 
 
 def test_meta_says_which_libraries(model):
@@ -212,13 +213,26 @@ def test_logarithms_of_masses_by_name_and_unit(model, filters):
     refuses("'log_mass' must be in dex", model.evaluate, log_mass=10 * u.Msun, error=u.UnitsError)
 
 
+def test_components_are_a_list():
+    for components in ("delayed", {"redshift": 1.0}):
+        refuses("'components' must be a list of components or names", SEDModel, components)
+
+
 def test_parameters_have_their_names_of_cigale_too(model, filters):
     """Numbers without a unit are in CIGALE's, ages in Myr; columns of a table need the name with its module."""
     wanted = model.evaluate(redshift=1.0, tau=2.0, age=3.0, frac_agn=0.2)
     names = {"sfh.tau_main": 2000.0, "sfh.age_main": 3.0 * u.Gyr, "agn.fracAGN": 0.2}
     for parameters in (names, {"tau_main": 2000.0, "age_main": 3000.0, "fracAGN": 0.2}):
         assert model.evaluate(redshift=1.0, **parameters).parameters == wanted.parameters
-    refuses("no parameter 'E_BV_lines'", model.evaluate, E_BV_lines=0.3, error=KeyError)
+    message = r"'E_BV_lines' in this model: .* modified_starburst \(here 'ebv_lines'\).* calzetti \(ebv,"
+    refuses(message, model.evaluate, E_BV_lines=0.3, error=KeyError)
+    refuses(message, model.fluxes, filters, redshift=[1.0], E_BV_lines=0.3, error=KeyError)
+    starburst = SEDModel(["sfhdelayed", "bc03", "dustatt_modified_starburst"])
+    assert starburst.evaluate(redshift=1.0, E_BV_lines=0.3).parameters["ebv_lines"].value == 0.3
+    refuses("no parameter 'Av'; .* ebv", model.evaluate, Av=1.0, error=KeyError)
+    refuses("no parameter 'spin'; known: age, ", model.evaluate, spin=1.0, error=KeyError)
+    zred = model.evaluate(zred=1.0, massformed=10.0, E_BVs_young=0.2)
+    assert zred.parameters == model.evaluate(redshift=1.0, mass=1e10, ebv=0.2).parameters
     rows = {"redshift": [1.0, 1.0], "tau": [1.0, 2.0]}
     flux = model.fluxes(rows, filters)
     theirs = {"redshift": [1.0, 1.0], "sfh.tau_main": [1000.0, 2000.0]}
