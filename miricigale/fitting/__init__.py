@@ -6,6 +6,6 @@ models, and returns `FitResults`, posteriors of all parameters and derived quant
 models drawn from them, `mock_analysis` and `leave_out` show how far they can be trusted.
 """
 
-import lazy_loader
+from miricigale.utils.lazy_modules import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

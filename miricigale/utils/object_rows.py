@@ -1,5 +1,6 @@
 """Frozen classes that hold a row for each object of a catalog: slices, rows by id, joins."""
 
+import functools
 import numbers
 from dataclasses import fields
 from functools import cached_property
@@ -15,6 +16,40 @@ from miricigale.utils.options import check_that
 #: Types of fields: an array whose first axis is the objects, and a dict of such.
 PerObject = Annotated[np.ndarray, "per object"]
 PerObjectDict = Annotated[dict, "per object"]
+
+
+def of_id(method):
+    """
+    Let a method of a single object take an id first where there are several: ``results.plot_sed(id)``.
+
+    Parameters
+    ----------
+    method : callable
+        Of a subclass of `ObjectRows`.
+
+    Returns
+    -------
+    method : callable
+        The same for a single object. For several its first argument is the id, without which, or with one that is
+        not there, it raises `TypeError` or `KeyError`.
+    """
+    name = method.__name__
+
+    @functools.wraps(method)
+    def method_of_id(rows, *args, **kwargs):
+        if rows.isscalar:
+            return method(rows, *args, **kwargs)
+        usage = f"{name} is of a single object: results.{name}(id), or results[0].{name}() by row"
+        if not args or np.ndim(args[0]) > 0:
+            raise TypeError(usage)
+        try:
+            result = rows.loc[args[0]]
+        except KeyError as err:
+            msg = f"{err.args[0]}; {usage}"
+            raise KeyError(msg) from None
+        return method(result, *args[1:], **kwargs)
+
+    return method_of_id
 
 
 def _frozen(array, copy):

@@ -278,9 +278,11 @@ def test_curves_of_ones_own_stand_among_names():
     assert {"stellar", "dust", "best model"} <= set(labels)
     plt.close("all")
     # the best history forms the best mass
-    line = results[0].plot_sfh().lines[0]
+    line = results.plot_sfh("a").lines[0]
     steps = np.diff(line.get_xdata())[0] * 1e9
     assert_allclose(np.sum(line.get_ydata()) * steps, results[0].best["mass"].value, rtol=0.01)
     plt.close("all")
+    assert_allclose(results.best_sed("a").fnu.value, results[0].best_sed().fnu.value)
+    assert results.best_sed("a", redshift=1.0).redshift == 1.0
     for name, band in ((box, "box"), ("F160W", "wfc3.f160w")):
         assert leave_out(fitter, photometry, [name]).bands == (band,)

@@ -108,6 +108,18 @@ def test_a_corner_plot_has_each_parameter_and_each_pair(results, figure):
     refuses("plot_corner is of a single object", results.plot_corner, error=TypeError)
 
 
+def test_methods_of_an_object_take_its_id_first(results, figure):
+    key = results.ids[results.fitted][0]
+    for name in ("plot_sed", "plot_sfh", "plot_pdf", "plot_pdf2d", "best_sed"):
+        usage = rf"{name} is of a single object: results.{name}\(id\), or results\[0\].{name}"
+        refuses(usage, getattr(results, name), error=TypeError)
+        refuses(usage, getattr(results, name), [key], error=TypeError)
+        refuses(rf"no object with the id 'x'.*{usage}", getattr(results, name), "x", error=KeyError)
+    ax = results.plot_pdf(key, "redshift", figure.add_subplot())
+    assert ax.get_xlabel() == "redshift"
+    assert ax.has_data()
+
+
 def test_a_corner_plot_of_draws_has_any_quantity(fitter, photometry, results, figure):
     samples = fitter.sample(photometry, 400, seed=1)
     key = results.ids[results.fitted][0]

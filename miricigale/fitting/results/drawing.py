@@ -78,7 +78,7 @@ def best_sed(results, model=None, **changes):
         If no model is known or the object was not fitted.
     """
     if model is None:
-        model = results._one("best_sed").model
+        model = results.model
     check_that(model is not None, "model", "an SEDModel (these results know none)", "None")
     sed = model.evaluate(**best_parameters(results, model) | changes)
     if results.distance is None or not np.isfinite(results.distance) or "redshift" in changes:
@@ -121,7 +121,6 @@ def plot_sed(results, ax=None, *, model=None, filters=None, components=False, **
     from miricigale.plotting.axes import plain_text
     from miricigale.plotting.posteriors import plot_sed_fit
 
-    results._one("plot_sed")
     if filters is None:
         filters = fitted_curves(results)
     order = places(results.filters, filters.names)
@@ -159,7 +158,7 @@ def plot_pdf(results, name, ax=None, **kwargs):
     from miricigale.plotting.axes import plain_text
     from miricigale.plotting.posteriors import plot_pdf
 
-    edges, weights = results._one("plot_pdf").distribution(name)
+    edges, weights = results.distribution(name)
     kwargs.setdefault("label", plain_text(name))
     if results.extensive(name):
         kwargs.setdefault("log", bool(edges.value[0] > 0))
@@ -172,7 +171,7 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
 
     if "frac_agn" in (x, y) and "frac_agn" not in results.axes:
         raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
-    weights = results._one("plot_pdf2d").joint_pdf(x, y)
+    weights = results.joint_pdf(x, y)
     kwargs.setdefault("labels", (labeled(x, results.unit(x)), labeled(y, results.unit(y))))
     # edges around the nodes: there an absent component has a cell that can be seen
     x_edges = cell_edges(results.axes[x].values, results.axes[x].bounds)
@@ -180,14 +179,12 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
     return plot_pdf_2d(x_edges, y_edges, weights, ax=ax, **kwargs)
 
 
-def plot_corner(results, key=None, names=None, *, truths=None, figure=None):
+def plot_corner(results, names=None, *, truths=None, figure=None):
     """
     Draw the posteriors of several parameters of an object, each and in pairs.
 
     Parameters
     ----------
-    key : object, optional
-        Id of the object; not of results of a single one.
     names : list of str, optional
         Parameters whose joint posteriors there are (``pairs`` of the fit, or redshift and AGN fraction); all of
         them by default. `Samples.plot_corner` draws any, from draws.
@@ -207,11 +204,7 @@ def plot_corner(results, key=None, names=None, *, truths=None, figure=None):
     """
     from miricigale.plotting.corner import plot_corner
 
-    if key is None:
-        result = results
-    else:
-        result = results.loc[key]
-    result = result._one("plot_corner")._fitted_one()
+    result = results._fitted_one()
     if names is None:
         names = _with_joint_posteriors(result)
     names = [result._named(name) for name in names]

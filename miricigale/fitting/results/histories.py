@@ -89,7 +89,7 @@ def plot_sfh_band(samples, key, ax=None, *, levels=LEVELS, **kwargs):
     return plot_history(table["lookback"], bands, ax=ax, **kwargs)
 
 
-def plot_best_sfh(results, ax=None, *, model=None, **kwargs):
+def plot_sfh(results, ax=None, *, model=None, **kwargs):
     """
     Draw the star-formation history of the best model of a single object.
 
@@ -116,7 +116,6 @@ def plot_best_sfh(results, ax=None, *, model=None, **kwargs):
     from miricigale.fitting.results.drawing import best_parameters
     from miricigale.plotting.posteriors import plot_history
 
-    result = results._one("plot_sfh")
     if model is None:
         model = results.model
     component = None
@@ -124,7 +123,7 @@ def plot_best_sfh(results, ax=None, *, model=None, **kwargs):
         component = model.component("sfh")
     if component is None:
         raise argument_error("model", "given where results were read from a file", "None")
-    best = best_parameters(result, model)
+    best = best_parameters(results, model)
     values = default_values(component.parameters)
     values |= {name: float(best[name].value) for name in values if name in best}
     lookback = (np.arange(_STEPS) + 0.5) / _STEPS * values["age"]

@@ -23,7 +23,7 @@ from miricigale.fitting.results.percentile_columns import LEVELS
 from miricigale.fitting.results.sample_flags import worst_bands
 from miricigale.fitting.results.table_columns import FIELDS, ODDS, OUTLIER, TEXTS
 from miricigale.utils.file_formats import read_write
-from miricigale.utils.object_rows import PerObject, PerObjectDict
+from miricigale.utils.object_rows import PerObject, PerObjectDict, of_id
 from miricigale.utils.options import check_names
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.units import FNU
@@ -43,7 +43,7 @@ class FitResults(FitRows):
     Made by `BayesFitter.fit`; every array is read-only, and NaN for objects that could not be
     fitted. ``results[0]``, ``results[rows]`` and ``results.loc[id]`` are of this class too: of a single object
     the arrays have no axis of objects (shapes below without ``n``), and only a single object has spectra and
-    plots.
+    plots. With several, the id comes first: ``results.plot_sed(id)``, ``results.plot_pdf(id, "redshift")``.
 
     Parameters
     ----------
@@ -549,19 +549,12 @@ class FitResults(FitRows):
                 columns[column] = (array[:, self.filters.index(name)] * FNU, text)
         return described_table(columns, dict(self.meta))
 
-    def _one(self, method):
-        """Refuse several objects where a single one is needed."""
-        if not self.isscalar:
-            msg = f"{method} is of a single object: results[0].{method}() or results.loc[id].{method}()"
-            raise TypeError(msg)
-        return self
-
     samples = drawing.samples
     to_arviz = inference_data.of_results
-    best_sed = drawing.best_sed
-    plot_sed = drawing.plot_sed
-    plot_pdf = drawing.plot_pdf
-    plot_pdf2d = drawing.plot_pdf2d
-    plot_corner = drawing.plot_corner
+    best_sed = of_id(drawing.best_sed)
+    plot_sed = of_id(drawing.plot_sed)
+    plot_pdf = of_id(drawing.plot_pdf)
+    plot_pdf2d = of_id(drawing.plot_pdf2d)
+    plot_corner = of_id(drawing.plot_corner)
     plot_redshift = drawing.plot_redshift
-    plot_sfh = histories.plot_best_sfh
+    plot_sfh = of_id(histories.plot_sfh)
