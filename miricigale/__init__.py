@@ -7,7 +7,7 @@ The seven classes `Filter`, `SEDModel`, `Scene`, `Detector`, `Reducer`,
 are the subpackages, so that ``import miricigale`` opens no file and compiles nothing.
 """
 
-import lazy_loader
+from miricigale.utils.lazy_modules import attach_stub
 
 try:
     from miricigale._version import __version__
@@ -16,5 +16,5 @@ except ImportError:  # a source tree that was never built
 
 __citation__ = "See CITATION.cff; the method repeats Yang et al. 2021, ApJ 908, 144."
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
 __all__ = ["__citation__", "__version__", *__all__]

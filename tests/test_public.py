@@ -4,6 +4,7 @@ import copy
 import importlib
 import pickle
 import pkgutil
+import re
 
 import astropy.units as u
 import numpy as np
@@ -14,6 +15,7 @@ from astropy.table import QTable
 
 import miricigale
 from miricigale.detector import Dark
+from miricigale.utils.package_tables import declared
 
 SUBPACKAGES = [
     item.name
@@ -37,9 +39,40 @@ def test_the_classes_of_the_package_import_from_it():
 
     for cls in (ErrorModel, FitResults, MatchingKernel, ModelGrid, Ramp):
         assert cls.__name__ in dir(miricigale)
-    with pytest.raises(AttributeError, match="No miricigale attribute FitResult") as caught:
+    message = "module 'miricigale' has no attribute 'FitResult'; did you mean 'FitResults'"
+    with pytest.raises(AttributeError, match=message) as caught:
         miricigale.FitResult  # noqa: B018
     assert caught.value.name == "FitResult"
+
+
+def test_names_that_a_subpackage_lacks_end_in_what_to_write():
+    from miricigale import depth, psf
+
+    for module, name, hint in (
+        (depth, "sensitivty", r"did you mean 'sensitivity'\?"),
+        (depth, "limiting_magnitude", r"miricigale.depth.sensitivity\('F770W', 1 \* u.hour\) is"),
+        (depth, "detect_sources", r"did you mean 'miricigale.photometry.detect_sources'\?"),
+        (psf, "PSF", r"miricigale.psf.miri_psf\('F770W'\)"),
+        (miricigale, "aperture_photometry", "did you mean 'miricigale.photometry.aperture_photom"),
+        (miricigale.cigale, "xyzzy", "it has CigaleSetup, best_model_table, "),
+    ):
+        with pytest.raises(AttributeError, match=f"no attribute '{name}'; {hint}") as caught:
+            getattr(module, name)
+        assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    with pytest.raises(ImportError):
+        from miricigale import Filtr  # noqa: F401
+    assert not hasattr(miricigale, "__wrapped__")
+
+
+def test_hints_of_subpackages_name_what_there_is():
+    sentences = declared("miricigale.utils", "module_hints.toml")["sentences"]
+    for sentence in sentences.values():
+        for path in re.findall(r"miricigale((?:\.\w+)+)", sentence):
+            value = miricigale
+            for part in path[1:].split("."):
+                value = getattr(value, part)
+        for name in re.findall(r"\b(?:[A-Z][a-z]+[A-Z]\w+|Exposure|Reducer)\b", sentence):
+            assert name in miricigale.__all__ or f".{name}" in sentence, name
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,6 @@ Numbers of AGN in a survey, with a selection function.
 hierarchical sum over posteriors from which the numbers are.
 """
 
-import lazy_loader
+from miricigale.utils.lazy_modules import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

@@ -1,5 +1,5 @@
 """From ramps to calibrated images and mosaics: the `Reducer` and its steps."""
 
-import lazy_loader
+from miricigale.utils.lazy_modules import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

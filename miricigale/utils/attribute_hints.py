@@ -75,10 +75,10 @@ def attribute_hint(cls, name, names):
     close = difflib.get_close_matches(name, public, n=1, cutoff=0.75)
     if close:
         return f"did you mean {close[0]!r}?"
-    near = _sharing_words(name, public)
+    near = names_sharing_words(name, public)
     if near:
         return f"did you mean {' or '.join(map(repr, near[:_MAX_NAMES]))}?"
-    near = _sharing_words(name, sentences)
+    near = names_sharing_words(name, sentences)
     if near:
         return sentences[near[0]]
     if len(public) <= _MAX_LISTED:
@@ -86,7 +86,7 @@ def attribute_hint(cls, name, names):
     return ""
 
 
-def _sharing_words(name, candidates):
+def names_sharing_words(name, candidates):
     """Return the names that share most words with a name, the shortest first; none if no word is shared."""
     wanted = _words(name)
     shared = {candidate: len(wanted & _words(candidate)) for candidate in candidates}

@@ -13,6 +13,6 @@ Effects act on blocks of full rows. What a row gets does not depend on the block
 threads changes a result, and a detector of any size needs little memory.
 """
 
-import lazy_loader
+from miricigale.utils.lazy_modules import attach_stub
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)
