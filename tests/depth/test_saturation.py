@@ -41,5 +41,5 @@ def test_a_point_source_of_the_saturation_flux_fills_the_well_by_the_last_group(
     # half the integration: more than twice the flux, as the sky takes its part of the well
     shorter = exposure.replace(n_groups=exposure.n_groups // 2)
     assert saturation_flux(shorter) > 2 * flux
-    with pytest.raises(ValueError, match="'exposure' must be an Exposure, .* got 'F770W'"):
+    with pytest.raises(ValueError, match=r"'exposure' must be an Exposure, .* got 'F770W'"):
         saturation_flux("F770W")

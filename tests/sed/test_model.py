@@ -224,7 +224,9 @@ def test_parameters_have_their_names_of_cigale_too(model, filters):
     names = {"sfh.tau_main": 2000.0, "sfh.age_main": 3.0 * u.Gyr, "agn.fracAGN": 0.2}
     for parameters in (names, {"tau_main": 2000.0, "age_main": 3000.0, "fracAGN": 0.2}):
         assert model.evaluate(redshift=1.0, **parameters).parameters == wanted.parameters
-    message = r"'E_BV_lines' in this model: .* modified_starburst \(here 'ebv_lines'\).* calzetti \(ebv,"
+    message = (
+        r"'E_BV_lines' in this model: .* modified_starburst \(here 'ebv_lines'\).* calzetti \(ebv,"
+    )
     refuses(message, model.evaluate, E_BV_lines=0.3, error=KeyError)
     refuses(message, model.fluxes, filters, redshift=[1.0], E_BV_lines=0.3, error=KeyError)
     starburst = SEDModel(["sfhdelayed", "bc03", "dustatt_modified_starburst"])
