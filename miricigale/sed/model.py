@@ -420,12 +420,14 @@ class SEDModel(Interactive):
         check_that(out["age"] <= limit, "age", wanted, out["age"])
         return out
 
-    def evaluate(self, **parameters):
+    def evaluate(self, values=None, /, **parameters):
         """
         The spectrum of one model.
 
         Parameters
         ----------
+        values : dict, optional
+            Parameters by name, in place of keywords or beside them.
         **parameters
             Any of `parameters`, as quantities or numbers in their units; or parameters of CIGALE, such as
             ``tau_main`` or ``sfh.tau_main``, whose numbers are in CIGALE's units (Myr). ``mass`` is the mass
@@ -451,6 +453,12 @@ class SEDModel(Interactive):
         >>> print(f"{sed.derived['sfr_100myr']:.2f}")
         5.79 solMass / yr
         """
+        if values is not None:
+            wanted = "a dict of parameters by name"
+            check_that(isinstance(values, Mapping), "values", wanted, repr(values))
+            twice = sorted(set(values) & set(parameters))
+            check_that(not twice, "values", "without those given by keyword", twice)
+            parameters = dict(values) | parameters
         return tables.spectra(self, self.values(parameters))
 
     __call__ = evaluate

@@ -97,7 +97,10 @@ def module_hint(module, name):
     if not suggestions:
         suggestions = _names_elsewhere(name)
     if not suggestions:
-        suggestions = names_sharing_words(name, here)
+        # the subject of the subpackage stands in most of its names
+        subject = module.rpartition(".")[2]
+        words = [word for word in name.split("_") if word.lower() != subject]
+        suggestions = names_sharing_words("_".join(words), here)
     if not suggestions:
         if len(here) > _MAX_LISTED:
             return ""

@@ -120,6 +120,16 @@ def test_methods_of_an_object_take_its_id_first(results, figure):
     assert ax.has_data()
 
 
+def test_columns_of_a_parameter_are_attributes(results):
+    table = results.to_table()
+    for name in ("redshift_p16", "redshift_mean", "frac_agn_best", "mass_p84"):
+        assert_allclose(getattr(results, name), table[name])
+        assert_allclose(getattr(results[0], name), table[name][0])
+    assert_allclose(results.mass_err, results.std("mass"))
+    assert not hasattr(results, "mood_p16")
+    assert not hasattr(results, "redshift_p17")
+
+
 def test_a_corner_plot_of_draws_has_any_quantity(fitter, photometry, results, figure):
     samples = fitter.sample(photometry, 400, seed=1)
     key = results.ids[results.fitted][0]

@@ -213,6 +213,15 @@ def test_logarithms_of_masses_by_name_and_unit(model, filters):
     refuses("'log_mass' must be in dex", model.evaluate, log_mass=10 * u.Msun, error=u.UnitsError)
 
 
+def test_parameters_stand_in_a_dict_too(model):
+    wanted = model.evaluate(redshift=1.0, age=2.0)
+    for sed in (model.evaluate({"z": 1.0, "age": 2.0}), model({"redshift": 1.0}, age=2.0)):
+        assert sed.parameters == wanted.parameters
+        assert_allclose(sed.fnu.value, wanted.fnu.value)
+    refuses("'values' must be a dict of parameters by name, got 1.0", model.evaluate, 1.0)
+    refuses("'values' must be without those given by k", model.evaluate, {"age": 1.0}, age=2.0)
+
+
 def test_components_are_a_list():
     for components in ("delayed", {"redshift": 1.0}):
         refuses("'components' must be a list of components or names", SEDModel, components)

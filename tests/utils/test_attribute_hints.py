@@ -1,12 +1,12 @@
 """Names that other packages use: each is an attribute here, or ends in a sentence with the right one."""
 
-import importlib
+import operator
 import re
 
 import pytest
 
 import miricigale
-from miricigale import Filter, SEDModel
+from miricigale import Filter, SEDModel, photometry
 from miricigale.utils.attribute_hints import attribute_hint
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.package_tables import declared
@@ -14,13 +14,19 @@ from miricigale.utils.package_tables import declared
 HINTS = {k: v for k, v in declared("miricigale.utils", "hints.toml").items() if k != "words"}
 OTHER_NAMES = declared("miricigale.utils", "other_names.toml")
 
+
+def class_of(name):
+    """Return a class of the package by name, or of photometry."""
+    return getattr(miricigale, name, None) or getattr(photometry, name)
+
+
 #: Classes that sentences may name.
 PUBLIC = set(miricigale.__all__)
 
 
 @pytest.mark.parametrize("name", HINTS)
 def test_sentences_name_what_there_is(name):
-    cls = getattr(miricigale, name)
+    cls = class_of(name)
     assert issubclass(cls, Interactive)
     for wrong, sentence in HINTS[name].items():
         assert wrong not in dir(cls), f"{name}.{wrong} is an attribute"
@@ -31,20 +37,21 @@ def test_sentences_name_what_there_is(name):
             sentence
         )
         for path in re.findall(r"miricigale((?:\.\w+)+)", sentence):
-            module, _, function = f"miricigale{path}".rpartition(".")
-            assert hasattr(importlib.import_module(module), function), path
+            operator.attrgetter(path[1:])(miricigale)
 
 
-@pytest.mark.parametrize("name", [n for n in OTHER_NAMES if hasattr(miricigale, n)])
+@pytest.mark.parametrize(
+    "name", [n for n in OTHER_NAMES if hasattr(miricigale, n) or hasattr(photometry, n)]
+)
 def test_other_names_are_of_attributes(name):
-    cls = getattr(miricigale, name)
+    cls = class_of(name)
     fields = getattr(cls, "__dataclass_fields__", {})
     for other, ours in OTHER_NAMES[name].items():
         assert other not in set(dir(cls)) | set(fields), other
         first = ours.removesuffix("()").partition(".")[0]
         # of fitters and results some are set, or found among the quantities, of an instance
         own = {"BayesFitter": {"filters"}, "FitResults": {"redshift"}, "Ramp": {"exposure"}}
-        own["SEDModel"] = {"components"}
+        own["SEDModel"] = {"components", "cosmology"}
         own["Ramp"] |= {"pixel_dq", "group_dq"}
         assert first in set(dir(cls)) | set(fields) | own.get(name, set()), (other, ours)
 

@@ -317,8 +317,17 @@ class FitResults(FitRows):
 
     def _value(self, name):
         # copies that are not complete have no axes yet
-        if "axes" in self.__dict__ and name in self.parameters:
+        if "axes" not in self.__dict__:
+            return None
+        if name in self.parameters:
             return self.median(name)
+        parameter, _, suffix = name.rpartition("_")
+        if parameter in self.parameters and suffix == "err":
+            return self.std(parameter)
+        if parameter in self.parameters and suffix in TEXTS["parameter"]:
+            # a column of the table, such as redshift_p16
+            column = self.to_table()[name]
+            return column[0] if self.isscalar else column
         return None
 
     def _value_names(self):

@@ -361,17 +361,6 @@ class ForcedPhotometryResult(Tabular):
         errors = self.flux_err.value[rows]
         return float(self.covariance[rows[0], rows[1]] / np.prod(errors))
 
-    _other_names: ClassVar[dict] = {
-        "ids": "id",
-        "residual": "residual_image",
-        "model": "model_image",
-        "fluxes": "flux",
-        "errors": "flux_err",
-        "flux_error": "flux_err",
-        "mag": "magnitude",
-        "table": "to_table()",
-    }
-
     @property
     def magnitude(self):
         """AB magnitudes, `~astropy.units.Magnitude`; NaN where the flux is not positive."""
