@@ -102,8 +102,11 @@ def plan(args):
     if args.time is not None:
         # depths of the file would count in place of times
         values["exposures.depth"] = []
-    if args.bands is not None:
-        values |= _bands_of(args, values)
+    bands = args.bands
+    if bands is None and args.config is None:
+        bands = _bands_of_sets(args.sets)
+    if bands is not None:
+        values |= _keys_of_bands(args, bands, values)
     if args.position is not None:
         values["background.ra"], values["background.dec"] = args.position
     config = load_plan(args.config, overrides=_settings(args, values))
@@ -144,12 +147,27 @@ def _check_plan_options(args):
             raise ValueError(msg)
 
 
-def _bands_of(args, values):
+def _bands_of_sets(sets):
+    """List the bands that stand in sets of them; None without sets, or where one is ``all``."""
+    if not sets or "all" in sets:
+        return None
+    labels = []
+    for words in sets:
+        labels += [label.strip() for label in words.split(",") if label.strip()]
+    return labels
+
+
+def _keys_of_bands(args, bands, values):
     """Return keys of the bands that were asked for: those that nothing else gives as in the CEERS exposures."""
     from miricigale.instrument.published_tables import imager_filter
     from miricigale.planning.config import ExposureSection
 
-    names = [imager_filter(name) for name in args.bands]
+    for label in bands:
+        if "," in label:
+            hint = "--sets compares sets: --sets F770W,F1000W F1500W"
+            msg = f"--bands are separated by spaces, got {label!r}; {hint}"
+            raise ValueError(msg)
+    names = list(dict.fromkeys(imager_filter(label) for label in bands))
     keys = {"exposures.bands": names}
     if args.config is None and not {"exposures.time", "exposures.depth"} & set(values):
         times = ExposureSection(bands=tuple(names)).by_band("time")

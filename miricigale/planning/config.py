@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from miricigale.depth.fitted import EXCESS
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
+from miricigale.instrument.published_tables import imager_filter
 from miricigale.workflow.analysis_sections import FitBasics
 from miricigale.workflow.background import check_levels
 from miricigale.workflow.earlier import EarlierKey
@@ -353,10 +354,12 @@ class PlanConfig(Configuration):
         """Bands of one of the ``sets``, in order of wavelength."""
         if name == "all":
             return self.exposures.bands
-        bands = [band.strip() for band in name.split(",") if band.strip()]
-        bands = [band if band.startswith("miri.") else f"miri.{band}" for band in bands]
-        order = imager_filters()
-        return tuple(sorted(bands, key=lambda band: order.index(band) if band in order else -1))
+        labels = [label.strip() for label in name.split(",") if label.strip()]
+        try:
+            bands = {imager_filter(label) for label in labels}
+        except KeyError as err:
+            self.check(False, "exposures.sets", f"has {err.args[0]}")
+        return tuple(sorted(bands, key=imager_filters().index))
 
 
 def load_plan(path=None, *, overrides=None):

@@ -26,6 +26,7 @@ def test_what_cannot_be_planned_is_named(values, message):
 def test_sets_are_in_order_of_wavelength_by_any_name():
     config = PlanConfig()
     assert config.set_bands("f1500w, miri.f770w") == ("miri.f770w", "miri.f1500w")
+    assert config.set_bands("F770W,JWST/MIRI.F1000W") == ("miri.f770w", "miri.f1000w")
     assert config.set_bands("all") == config.exposures.bands
 
 

@@ -234,6 +234,11 @@ def test_plans_of_bands_are_exposed_as_in_ceers(capsys):
     assert "exposed as in CEERS: 4662 s, 1665 s" in told.err
     told = command(capsys, "plan", "--set", "exposures.pointings=3", "--print-config")
     assert "pointings = 3" in told.out
+    # sets alone name the bands
+    told = command(capsys, "plan", "--sets", "F770W,F2100W", "f770w", "--print-config")
+    assert 'bands = ["miri.f770w", "miri.f2100w"]' in told.out
+    told = command(capsys, "plan", "--sets", "all", "F770W", "--print-config")
+    assert "miri.f1280w" in told.out
 
 
 @pytest.mark.slow

@@ -226,7 +226,11 @@ def errors_and_priors(fitter):
         parts.append(f"errors times {min(factors):.2g} to {max(factors):.2g}")
     if "outliers" in settings:
         parts.append(f"{_span(settings['outliers'].values())} % of fluxes wrong")
-    parts.append(f"priors of {', '.join(_priors(fitter)) or 'nothing'}")
+    names = _priors(fitter)
+    if names:
+        parts.append(f"priors of {', '.join(names)}")
+    else:
+        parts.append("all nodes equally likely")
     return "; ".join(parts)
 
 
