@@ -63,6 +63,15 @@ def test_position_angle_of_the_columns(roll):
     assert_allclose(FIELD.separation(up).arcsec, 0.111336, atol=2e-6)
 
 
+def test_columns_turn_over_the_field_as_the_page_says():
+    exposure = Exposure("F770W", n_groups=10, pointing=FIELD, roll=ROLL)
+    x, y = map(np.ravel, np.meshgrid(np.linspace(359, 1031, 13), np.linspace(2, 1020, 13)))
+    low, high = (exposure.wcs.pixel_to_world(x, y + step) for step in (-1, 1))
+    turn = (low.position_angle(high) - exposure.pa_aper).wrap_at("180d").deg
+    assert turn.min() == pytest.approx(-0.17, abs=0.01)
+    assert turn.max() == pytest.approx(0.47, abs=0.01)
+
+
 def test_parity_is_that_of_the_sky():
     # north up: +x points west
     x, y = aperture("FULL").reference
