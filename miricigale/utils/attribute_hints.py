@@ -8,6 +8,12 @@ from miricigale.utils.package_tables import declared
 #: Most names that a message suggests, and most that it lists if none is near.
 _MAX_NAMES = 4
 _MAX_LISTED = 40
+#: Likeness of two spellings of a name, from 0 to 1: slips of a letter or two, not other words beside a common one.
+_ALIKE = 0.82
+#: Key of the sentence of a class for any other name.
+_OTHERWISE = "_"
+#: Words of names that say nothing of what is meant.
+_EMPTY_WORDS = {"to", "from", "get", "set", "is", "has", "by", "of", "at", "as", "my", "the", "all"}
 
 
 class UnknownAttributeError(AttributeError):
@@ -57,7 +63,7 @@ def attribute_hint(cls, name, names):
     -------
     hint : str
         The sentence that ``hints.toml`` has for it, else the name that is spelled alike, those that share most
-        words with it, or all that a class with few has; empty without any.
+        words with it, what the class says in general, or all that a class with few has; empty without any.
 
     Examples
     --------
@@ -72,7 +78,7 @@ def attribute_hint(cls, name, names):
     if name in sentences:
         return sentences[name]
     public = [candidate for candidate in names if not candidate.startswith("_")]
-    close = difflib.get_close_matches(name, public, n=1, cutoff=0.75)
+    close = difflib.get_close_matches(name, public, n=1, cutoff=_ALIKE)
     if close:
         return f"did you mean {close[0]!r}?"
     near = names_sharing_words(name, public)
@@ -81,6 +87,8 @@ def attribute_hint(cls, name, names):
     near = names_sharing_words(name, sentences)
     if near:
         return sentences[near[0]]
+    if _OTHERWISE in sentences:
+        return sentences[_OTHERWISE]
     if len(public) <= _MAX_LISTED:
         return f"it has {', '.join(public)}"
     return ""
@@ -99,7 +107,8 @@ def names_sharing_words(name, candidates):
 def _words(name):
     """Words of a name, each as the first one of those of the same meaning."""
     same = _same_words()
-    return {same.get(word, word) for word in name.lower().split("_") if len(word) > 1}
+    words = [word for word in name.lower().split("_") if len(word) > 1 or word in same]
+    return {same.get(word, word) for word in words if word not in _EMPTY_WORDS}
 
 
 @cached

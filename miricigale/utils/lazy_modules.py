@@ -12,8 +12,6 @@ from miricigale.utils.package_tables import declared
 _PACKAGE = "miricigale"
 #: Most names that a message suggests.
 _MAX_NAMES = 3
-#: Most names that it lists if none is near.
-_MAX_LISTED = 40
 
 
 class UnknownModuleAttributeError(AttributeError):
@@ -78,7 +76,7 @@ def module_hint(module, name):
     -------
     hint : str
         The sentence that ``module_hints.toml`` has for the name; else where another subpackage has it, or the
-        names here that are spelled alike or share words with it; else all that a small subpackage has. Empty
+        names here that are spelled alike or share words with it; else what the subpackage has in general. Empty
         without any of these, and for private names.
 
     Examples
@@ -93,7 +91,7 @@ def module_hint(module, name):
     if name in sentences:
         return sentences[name]
     here = importlib.import_module(module).__all__
-    suggestions = difflib.get_close_matches(name, here, n=1, cutoff=0.75)
+    suggestions = difflib.get_close_matches(name, here, n=1, cutoff=0.82)
     if not suggestions:
         suggestions = _names_elsewhere(name)
     if not suggestions:
@@ -102,9 +100,8 @@ def module_hint(module, name):
         words = [word for word in name.split("_") if word.lower() != subject]
         suggestions = names_sharing_words("_".join(words), here)
     if not suggestions:
-        if len(here) > _MAX_LISTED:
-            return ""
-        return f"it has {', '.join(here)}"
+        general = declared("miricigale.utils", "module_hints.toml")["subpackages"]
+        return general.get(module.rpartition(".")[2], "")
     return f"did you mean {' or '.join(map(repr, suggestions[:_MAX_NAMES]))}?"
 
 
