@@ -193,6 +193,10 @@ class Filter(Frozen, Interactive):
             if cameras:
                 msg = f"no filter {name!r} without its camera: {', '.join(cameras)}"
                 raise KeyError(msg)
+            camera = f"{name}".lower()
+            if any(known.startswith(f"{camera}.") for known in FILTERS.names()):
+                msg = f"no filter {name!r}, which is a camera: FilterSet('{camera}.*') has its filters"
+                raise KeyError(msg)
             raise unknown_name("filter", name, FILTERS.names())
         return _from_name(full_name or str(name))
 
