@@ -359,3 +359,23 @@ def test_weighted_summaries_are_those_of_repeated_draws():
     expected = np.interp(want[1][middle], np.sort(value), np.arange(400))
     assert_allclose(place, expected, atol=1.5)
     assert quantiles.size == DERIVED_LEVELS.size
+
+
+def test_places_go_where_they_are_inefficient():
+    """What lacks an effective number gets as many places as its efficiency asks for."""
+    # of the second group one weight in 100 counts
+    n = np.array([2000, 1000])
+    weight = np.concatenate([np.ones(n[0]), np.zeros(n[1])])
+    weight[n[0] :: 100] = 10.0
+    group = np.repeat([0, 1], n)
+    sets = _core.make_group_sets([[0], [1]])
+    wanted = np.empty(2)
+    limits = 600.0, 30.0, 1e-3
+    effective, enough = _core.allocate_places(
+        weight, group, sets, *limits, np.empty((3, 2)), wanted
+    )
+    assert effective == pytest.approx(weight.sum() ** 2 / np.sum(weight**2))
+    # 10 effective places of 1000 are too few
+    assert not enough
+    assert wanted[1] == pytest.approx(30.0 / 0.01, rel=0.1)
+    assert wanted[0] < n[0]

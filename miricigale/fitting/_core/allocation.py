@@ -10,8 +10,11 @@ from miricigale.utils.compilation import KERNEL, njit
 #: ``group``, int64, flat.
 GroupSets = namedtuple("GroupSets", "start group")
 
-#: Smallest efficiency, effective over number of places, that is believed of few places.
-_MIN_RATE = 0.05
+#: Places with an effective number of 1 that are added to those of a group for its efficiency, effective over number
+#: of places: few of its own say little.
+_N_EXPECTED = 20.0
+#: Smallest efficiency that is believed.
+_MIN_RATE = 0.01
 #: Weight above which a set of groups has to have an effective number of its own.
 _MIN_COUNTED_WEIGHT = 0.02
 #: Smallest part of the places in each group that has weight.
@@ -81,7 +84,7 @@ def allocate_places(weight, group, sets, goal, least_each, min_weight, sums, wan
     cost = 0.0
     for j in range(n_groups):
         group_effective = of_weight[j] * of_weight[j] / max(of_square[j], 1e-300)
-        rate[j] = min(max(group_effective / max(count[j], 1.0), _MIN_RATE), 1.0)
+        rate[j] = max((group_effective + 1.0) / (count[j] + _N_EXPECTED), _MIN_RATE)
         wanted[j] = of_weight[j] / total / np.sqrt(rate[j])
         cost += wanted[j]
     for j in range(n_groups):

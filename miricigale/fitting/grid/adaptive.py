@@ -51,6 +51,10 @@ _MIN_RESULT_PLACES = 2048
 _MIN_PURSUED = 0.01
 #: Share of the places that it has until its shape is found.
 _PURSUED_SHARE = 0.06
+#: Effective number of its places above which its shape is seen.
+_SEEN = 10
+#: Weight of a label below which it is pursued no more after the rounds of labels that are not.
+_MIN_PURSUED_WEIGHT = 1e-3
 #: Smallest number of places that parts are fitted to.
 _MIN_FITTED_PLACES = 20
 #: Share of a mixture that is divided evenly among the labels, whatever their weight.
@@ -239,8 +243,11 @@ class AdaptiveSampler:
                 return None
             n_flat = min(_MAX_FLAT, _FLAT_EACH * len(mixtures))
             places = self._places(n_flat)
+            is_long = turn + 1 >= _ADAPTING_ROUNDS
+            if self.pursued.any():
+                self._end_pursuit(sample, is_long=is_long)
             share = self._pursuing(sample.wanted)
-            good = sample.effective >= _FIRST_GOAL * self.wanted or turn + 1 >= _ADAPTING_ROUNDS
+            good = sample.effective >= _FIRST_GOAL * self.wanted or is_long
             if good and not self.pursued.any():
                 break
             parts = self._fit(places)
@@ -327,6 +334,15 @@ class AdaptiveSampler:
         """Raise the shares of labels whose shape is still to be found, whatever their weight."""
         min_share = _PURSUED_SHARE * share.sum()
         return np.where(self.pursued, np.maximum(share, min_share), share)
+
+    def _end_pursuit(self, sample, *, is_long):
+        """Pursue labels no more that have been seen, and after long those without weight."""
+        group = self._groups(self.label[sample.rows], self.peak[sample.rows])
+        share = np.bincount(group, sample.weight, minlength=self.n_groups)
+        square = np.bincount(group, np.square(sample.weight), minlength=self.n_groups)
+        self.pursued &= np.square(share) < _SEEN * square
+        if is_long:
+            self.pursued &= share > _MIN_PURSUED_WEIGHT * share.sum()
 
     def _weigh(self, rows):
         """Weigh places by the posterior over the density of the proposal; None if none is possible."""
