@@ -10,8 +10,8 @@ from miricigale.utils.compilation import KERNEL, njit
 #: ``group``, int64, flat.
 GroupSets = namedtuple("GroupSets", "start group")
 
-#: Places with an effective number of 1 that are added to those of a group for its efficiency, effective over number
-#: of places: few of its own say little.
+#: Places with an effective number of 1 that are added to those of a group for its efficiency, the effective number
+#: over that of places: few of its own say little.
 _N_EXPECTED = 20.0
 #: Smallest efficiency that is believed.
 _MIN_RATE = 0.01

@@ -77,6 +77,8 @@ _N_MOVED = 768
 _MIN_MOVED = 48
 #: Weight of labels and peaks below which none are.
 _MIN_MOVED_WEIGHT = 1e-3
+#: Distance of labels by which places are sorted, beyond all scores.
+_APART = 1e6
 #: Weight of the models that are left out of results.
 _LEFT_OUT = 1e-4
 #: Largest number of models that results are of.
@@ -363,7 +365,7 @@ class AdaptiveSampler:
         score = np.empty((size, self.score.shape[1]))
         _core.propose(self.labels, mixture, choice[new], normal[new], spread[new], label, score)
         # by redshift, so that models that lie near each other in memory are met together
-        order = np.lexsort((score[:, 0], label))
+        order = np.argsort(_APART * label + score[:, 0])
         label = label[order]
         score = score[order]
         self.label[new] = label

@@ -3,7 +3,6 @@
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
 from miricigale.fitting import _core
 from miricigale.fitting.grid.grid import GridEngine, ObjectOnNodes, Start
@@ -172,7 +171,7 @@ class NodeScan(Frozen):
             # the evidence is that of a prior of redshift with the sum that it had
             rows = slice(scan.first, scan.first + len(change))
             change = change - self._sums[rows]
-            log_norm = float(logsumexp(prior) - logsumexp(prior + change))
+            log_norm = float(np.logaddexp.reduce(prior) - np.logaddexp.reduce(prior + change))
         # likelihoods of mixtures have no constant
         zero = 0.0
         if scan.wrong is None:

@@ -68,18 +68,20 @@ def _weighted_summary(value, weight, with_log):
     total = weight.sum()
     if not total > 0:
         return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
-    weight = weight / total
+    order = np.argsort(value)
+    value = value[order]
+    weight = weight[order] / total
     mean = np.sum(weight * value)
     std = np.sqrt(np.sum(weight * np.square(value - mean)))
-    lit = value > 0
+    upto = np.cumsum(weight)
     log = np.nan
-    if with_log and np.any(lit):
-        log = np.sum(weight[lit] * np.log10(value[lit])) / weight[lit].sum()
-    order = np.argsort(value, kind="stable")
-    weight = weight[order]
+    # values above 0 are the last ones
+    first = np.searchsorted(value, 0.0, "right")
+    if with_log and first < value.size:
+        lit = weight[first:]
+        log = np.sum(lit * np.log10(value[first:])) / lit.sum()
     # a value stands for half of its weight on either side
-    place = np.cumsum(weight) - 0.5 * weight
-    return np.array([mean, std, log]), np.interp(DERIVED_LEVELS, place, value[order])
+    return np.array([mean, std, log]), np.interp(DERIVED_LEVELS, upto - 0.5 * weight, value)
 
 
 def put_draws(results, new, i, values):
