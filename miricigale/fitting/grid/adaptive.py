@@ -32,7 +32,7 @@ _MIN_MAX_PLACES = 1 << 14
 #: Largest number of rounds whose places mixtures are fitted to before results are collected.
 _ADAPTING_ROUNDS = 6
 #: The same where labels are pursued.
-_PURSUING_ROUNDS = 16
+_PURSUING_ROUNDS = 9
 #: Effective number, over that wanted in all, at which these rounds end.
 _FIRST_GOAL = 0.3
 #: Number of places after which a mixture is judged; it doubles each time.
