@@ -27,8 +27,10 @@ from miricigale.fitting._core.importance import (
     add_local_parts,
     add_widest,
     evaluate_places,
+    fit_groups,
     fit_parts,
     flatten,
+    mean_and_cov,
     propose,
 )
 from miricigale.fitting._core.interpolation import (

@@ -410,6 +410,108 @@ def fit_parts(
                 part_weight[j, i] *= weight[i] / sums[i]
 
 
+@njit(**KERNEL)
+def fit_groups(
+    labels,
+    parts,
+    groups,
+    order,
+    rounds,
+    wide,
+    wide_share,
+    y,
+    weight,
+    prior_mean,
+    prior_cov,
+    scratch,
+):
+    """
+    Fit parts of a mixture to the points of each of several groups; see `fit_parts`.
+
+    Parameters
+    ----------
+    labels, parts : `Labels`, `Parts`
+        Parts are filled; their shares and those of the wide ones sum to 1 in each group.
+    groups : `~numpy.ndarray` of int, shape (n_groups, 5)
+        Label of each group, first of its points in ``order`` and the one after its last, first part, and number of
+        parts to fit, after which the wide one comes.
+    order : `~numpy.ndarray` of int, shape (n,)
+        Points by group.
+    rounds : int
+        Rounds of each fit.
+    wide, wide_share : float
+        What widths are multiplied by in the end, and share of the wide part.
+    y, weight : `~numpy.ndarray`, shapes (n, n_axes) and (n,)
+        Scores of the points, and weights; those of weight 0 do not count.
+    prior_mean, prior_cov : `~numpy.ndarray`, shapes (n_groups, n_axes) and (n_groups, n_axes, n_axes)
+        Mean and covariance of all axes that those of few points are drawn to.
+    scratch : tuple of `~numpy.ndarray`
+        Shapes (n_axes + 2, n), (n_parts + 1, n), (n_axes, n_axes), (n_parts,), (n, n_axes) and (n,).
+    """
+    coordinate, part_weight, cov, of_part, own_y, own_weight = scratch
+    for j in range(len(groups)):
+        first = groups[j, 3]
+        n_fitted = groups[j, 4]
+        n = 0
+        for k in range(groups[j, 1], groups[j, 2]):
+            i = order[k]
+            if weight[i] > 0.0:
+                own_weight[n] = weight[i]
+                for c in range(y.shape[1]):
+                    own_y[n, c] = y[i, c]
+                n += 1
+        fit_parts(
+            labels,
+            parts,
+            first,
+            groups[j, 0],
+            n_fitted,
+            rounds,
+            wide,
+            own_y[:n],
+            own_weight[:n],
+            prior_mean[j],
+            prior_cov[j],
+            (coordinate, part_weight, cov, of_part),
+        )
+        for p in range(first, first + n_fitted):
+            parts.share[p] *= 1.0 - wide_share
+        parts.share[first + n_fitted] = wide_share
+
+
+@njit(**KERNEL)
+def mean_and_cov(y, weight, mean, cov):
+    """
+    Compute mean and covariance of points with weights.
+
+    Parameters
+    ----------
+    y, weight : `~numpy.ndarray`, shapes (n, n_axes) and (n,)
+        Points, and weights that are not all 0.
+    mean, cov : `~numpy.ndarray`, shapes (n_axes,) and (n_axes, n_axes)
+        Get them.
+    """
+    n_axes = len(mean)
+    mean[:] = 0.0
+    cov[:] = 0.0
+    total = 0.0
+    for i in range(len(weight)):
+        w = weight[i]
+        if w > 0.0:
+            total += w
+            for a in range(n_axes):
+                mean[a] += w * y[i, a]
+    for a in range(n_axes):
+        mean[a] /= total
+    for i in range(len(weight)):
+        w = weight[i] / total
+        if w > 0.0:
+            for a in range(n_axes):
+                part = w * (y[i, a] - mean[a])
+                for b in range(n_axes):
+                    cov[a, b] += part * (y[i, b] - mean[b])
+
+
 @njit(**PART)
 def _farthest_of(distance, n, n_near):
     """Return a distance within which ``n_near`` of n points are, or a few more."""

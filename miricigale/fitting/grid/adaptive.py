@@ -29,6 +29,8 @@ _MAX_ROUND_SIZE = 1024
 _MAX_PLACES_EACH = 80
 #: Smallest value of the largest number of places of an object.
 _MIN_MAX_PLACES = 1 << 14
+#: Number of places that there is memory for to begin with; most objects need no more.
+_SIZE_TO_BEGIN = 1 << 13
 #: Largest number of rounds whose places mixtures are fitted to before results are collected.
 _ADAPTING_ROUNDS = 6
 #: The same where labels are pursued.
@@ -168,12 +170,13 @@ class AdaptiveSampler:
         max_places = max(max_places, self.n_rounds * ROUND_SIZE + _N_TRIAL)
         self.max_places = max_places
         self.points = quasi_random(n_axes, int(np.ceil(np.log2(max_places))), scramble)
-        self.label = np.empty(max_places, np.int64)
-        self.score = np.empty((max_places, n_axes))
-        self.place = np.empty((max_places, n_axes))
-        self.evaluated = np.empty((max_places, 5))
-        self.peak = np.zeros(max_places, np.int64)
-        self.density = np.zeros(max_places)
+        size = _SIZE_TO_BEGIN
+        self.label = np.empty(size, np.int64)
+        self.score = np.empty((size, n_axes))
+        self.place = np.empty((size, n_axes))
+        self.evaluated = np.empty((size, 5))
+        self.peak = np.zeros(size, np.int64)
+        self.density = np.zeros(size)
         self.scratch = np.empty((n_axes + 2, _MAX_ROUND_SIZE))
         self.n_fitted = _MAX_FLAT
         self.n = 0
@@ -264,13 +267,14 @@ class AdaptiveSampler:
         """
         first = self.n
         total = np.zeros(self.n_groups)
-        density = np.zeros((len(self.peaks), self.max_places))
+        density = np.zeros((len(self.peaks), len(self.label)))
         missing = share
         while self.max_places - self.n >= ROUND_SIZE:
             size = int(np.clip(missing.sum(), ROUND_SIZE, _MAX_ROUND_SIZE)) & ~127
             size = min(size, self.max_places - self.n)
             guarded = parts.possible(self._guarded(missing))
             ends = self._add_round(parts.shared(guarded), size)
+            density = _with_columns(density, len(self.label))
             self._add_density(parts.kernel, ends, density, parts.group % len(self.peaks))
             total += size * guarded
             rows = slice(first, self.n)
@@ -359,6 +363,7 @@ class AdaptiveSampler:
 
     def _add_round(self, mixture, size):
         """Draw places of a mixture and evaluate them; returned are their ends for `_core.add_density`."""
+        self._reserve(self.n + size)
         new = slice(self.n, self.n + size)
         choice, _, normal, spread = self.points
         label = np.empty(size, np.int64)
@@ -377,6 +382,20 @@ class AdaptiveSampler:
         ends = self.n + np.searchsorted(label, np.arange(len(self.labels.n_active) + 1))[None]
         self.n += size
         return ends
+
+    def _reserve(self, n):
+        """Make memory for n places."""
+        size = len(self.label)
+        if n <= size:
+            return
+        size = max(2 * size, n)
+        for name in ("label", "score", "place", "evaluated", "peak", "density"):
+            values = getattr(self, name)
+            larger = np.empty((size, *values.shape[1:]), values.dtype)
+            larger[: self.n] = values[: self.n]
+            setattr(self, name, larger)
+        # without borders all are in one peak
+        self.peak[self.n :] = 0
 
     def _add_density(self, parts, ends, density, column=None):
         """Add densities of parts of a mixture at blocks of places to columns of others, or to one."""
@@ -520,3 +539,13 @@ class AdaptiveSampler:
         return self._placed(
             place, evaluated, np.concatenate(weight), uniform, sample, converged=False
         )
+
+
+def _with_columns(table, n):
+    """Return a table with n columns, of which those that it does not have are 0."""
+    n_rows, n_columns = table.shape
+    if n_columns >= n:
+        return table
+    larger = np.zeros((n_rows, n))
+    larger[:, :n_columns] = table
+    return larger

@@ -145,9 +145,8 @@ def fit_mixture(labels, n_peaks, places, n_local):
     for each_peak, (mean, cov) in moments.items():
         wide = all_wide[peak == each_peak]
         _core.add_widest(labels, parts, wide, mean, _WIDE_SQUARE * cov, scratch)
+    _fit_groups(labels, parts, groups, places, moments)
     for group in groups:
-        if group.n_fitted:
-            _fit_group(labels, parts, group, places, moments[group.peak])
         if group.n_local:
             _add_local_parts(labels, parts, group, places)
     return FittedParts(parts, index)
@@ -197,7 +196,7 @@ def _moments_of_peaks(places):
     n_axes = places.score.shape[1]
     global_mean, global_cov = _mean_and_cov(places.score, places.flat)
     moments = {}
-    peaks = np.unique(places.peak[places.flat > 0])
+    peaks = np.flatnonzero(np.bincount(places.peak, places.flat))
     if peaks.size == 1:
         return {peaks[0]: (global_mean, global_cov)}
     for peak in peaks:
@@ -210,34 +209,32 @@ def _moments_of_peaks(places):
     return moments
 
 
-def _fit_group(labels, parts, group, places, moments):
-    """Fit parts to the places of a group, and let its wide one have a share."""
+def _fit_groups(labels, parts, groups, places, moments):
+    """Fit parts to the places of groups, and let their wide ones have a share."""
+    fitted = [group for group in groups if group.n_fitted]
+    order = np.concatenate([group.rows for group in fitted])
+    ends = np.cumsum([group.rows.size for group in fitted])
+    table = np.empty((len(fitted), 5), np.int64)
+    table[:, 0] = [group.label for group in fitted]
+    table[:, 1] = ends - [group.rows.size for group in fitted]
+    table[:, 2] = ends
+    table[:, 3] = [group.first for group in fitted]
+    table[:, 4] = [group.n_fitted for group in fitted]
+    prior_mean = np.array([moments[group.peak][0] for group in fitted])
+    prior_cov = np.array([moments[group.peak][1] for group in fitted])
+    n = len(order)
     n_axes = places.score.shape[1]
-    rows = group.rows[places.flat[group.rows] > 0]
-    n = group.n_fitted
     scratch = (
-        np.empty((n_axes + 2, rows.size)),
-        np.empty((n + 1, rows.size)),
+        np.empty((n_axes + 2, n)),
+        np.empty((_MAX_PARTS + 1, n)),
         np.empty((n_axes, n_axes)),
+        np.empty(_MAX_PARTS),
+        np.empty((n, n_axes)),
         np.empty(n),
     )
-    mean, cov = moments
-    _core.fit_parts(
-        labels,
-        parts,
-        group.first,
-        group.label,
-        n,
-        _FIT_ROUNDS,
-        _WIDER,
-        places.score[rows],
-        places.flat[rows],
-        mean,
-        cov,
-        scratch,
-    )
-    parts.share[group.first : group.wide] *= 1.0 - _WIDE_SHARE
-    parts.share[group.wide] = _WIDE_SHARE
+    shape = (_FIT_ROUNDS, _WIDER, _WIDE_SHARE)
+    points = (places.score, places.flat, prior_mean, prior_cov)
+    _core.fit_groups(labels, parts, table, order, *shape, *points, scratch)
 
 
 def _add_local_parts(labels, parts, group, places):
@@ -261,11 +258,11 @@ def _add_local_parts(labels, parts, group, places):
 
 def _mean_and_cov(score, weight):
     """Compute mean and covariance of places with weights."""
-    weight = weight / weight.sum()
-    mean = weight @ score
-    deviation = score - mean
-    cov = (deviation * weight[:, None]).T @ deviation + 1e-6 * np.eye(score.shape[1])
-    return mean, cov
+    n_axes = score.shape[1]
+    mean = np.empty(n_axes)
+    cov = np.empty((n_axes, n_axes))
+    _core.mean_and_cov(score, weight, mean, cov)
+    return mean, cov + 1e-6 * np.eye(n_axes)
 
 
 def _effective_number(weight):
