@@ -122,3 +122,29 @@ def test_sampled_stamps_are_splines_times_the_area_of_the_pixel():
         value = np.einsum("ni,nj,ji->n", *weights, coefficients[which[k]])
         wanted = 1 + amplitude[k] * value * np.abs(xu * yv - xv * yu).ravel()
         assert_allclose(out[start[k] : start[k + 1]], wanted, rtol=1e-10, atol=1e-12)
+
+
+def test_grids_along_each_other_are_sampled_as_grids_that_are_turned():
+    """A turn too small to be seen takes the general way; stamps reach beyond the coefficients."""
+    rng = np.random.default_rng(1)
+    coefficients = rng.normal(size=(2, 31, 37)).astype(np.float32)
+    box = np.array([[98, 97, 40, 44], [105, 108, 9, 12]])
+    start = np.array([0, 40 * 44, 40 * 44 + 9 * 12])
+    center = np.array([[118.2, 117.7], [112.4, 110.0]])
+    poly = np.zeros((2, 2, 6))
+    poly[:, 0, :2] = [[17.3, 0.9], [18.0, 1.0]]
+    poly[:, 1, 0] = 15.6
+    poly[:, 1, 2] = [1.1, 1.0]
+    # a slope of the scale is no turn
+    poly[:, 0, 3] = poly[:, 1, 5] = 1e-3
+    which, amplitude = np.array([1, 0]), np.array([2.0, 0.5])
+    stamps = []
+    for turn in (0.0, 1e-9, 1e-7):
+        poly[:, 0, 2] = turn
+        out = np.zeros(start[-1])
+        sample_stamps(coefficients, which, amplitude, center, poly, box, start, out)
+        stamps.append(out)
+    straight, nearly, turned = stamps
+    assert np.count_nonzero(straight[: start[1]]) < start[1]
+    assert_allclose(nearly, straight, atol=1e-6)
+    assert_allclose(turned, straight, atol=1e-4)

@@ -74,6 +74,63 @@ def _quintic(position, node, weight):
         weight[5, i] = t**5 / 120.0
 
 
+#: Fine pixels by which rows and columns of the image may be bent or turned and still count as those of the fine grid.
+_STRAIGHT = 1e-6
+
+
+@njit()
+def _is_straight(px, py, center, box):
+    """Return whether x on the fine grid follows from x on a stamp alone, and y from y."""
+    u = max(abs(box[1] - center[0]), abs(box[1] + box[3] - center[0]))
+    v = max(abs(box[0] - center[1]), abs(box[0] + box[2] - center[1]))
+    bent_x = abs(px[2]) * v + abs(px[4]) * u * v + abs(px[5]) * v * v
+    bent_y = abs(py[1]) * u + abs(py[4]) * u * v + abs(py[3]) * u * u
+    return max(bent_x, bent_y) < _STRAIGHT
+
+
+@njit(fastmath={"reassoc", "contract"})
+def _sample_straight(image, amplitude, center, px, py, box, out):
+    """Add what `sample_stamps` adds where the map is straight: sums over rows first, then over columns."""
+    h, w = image.shape
+    ny, nx = box[2:]
+    fx = np.empty(nx)
+    fy = np.empty(ny)
+    for m in range(nx):
+        u = box[1] + m - center[0]
+        fx[m] = px[0] + px[1] * u + px[3] * u * u
+    for k in range(ny):
+        v = box[0] + k - center[1]
+        fy[k] = py[0] + py[2] * v + py[5] * v * v
+    ix = np.empty(nx, np.int64)
+    iy = np.empty(ny, np.int64)
+    wx = np.empty((6, nx))
+    wy = np.empty((6, ny))
+    _quintic(fx, ix, wx)
+    _quintic(fy, iy, wy)
+    area = np.empty(nx)
+    for m in range(nx):
+        area[m] = amplitude * (px[1] + 2 * px[3] * (box[1] + m - center[0]))
+        # the first node of six, in a row with zeros beyond the rim as far as nodes may be
+        ix[m] = min(max(ix[m] + 4, 0), w + 6)
+    row = np.zeros(w + 12)
+    for k in range(ny):
+        row[:] = 0.0
+        first_row = iy[k] - 2
+        for j in range(max(-first_row, 0), min(h - first_row, 6)):
+            weight = wy[j, k]
+            nodes = image[first_row + j]
+            for i in range(w):
+                row[6 + i] += weight * nodes[i]
+        slope_y = py[2] + 2 * py[5] * (box[0] + k - center[1])
+        line = out[k * nx : k * nx + nx]
+        for m in range(nx):
+            first = ix[m]
+            value = wx[0, m] * row[first] + wx[1, m] * row[first + 1] + wx[2, m] * row[first + 2]
+            value += wx[3, m] * row[first + 3] + wx[4, m] * row[first + 4]
+            value += wx[5, m] * row[first + 5]
+            line[m] += value * abs(area[m] * slope_y)
+
+
 @njit()
 def sample_stamps(coefficients, fine_stamp, amplitude, center, poly, box, start, out):
     """
@@ -112,6 +169,11 @@ def sample_stamps(coefficients, fine_stamp, amplitude, center, poly, box, start,
         py = poly[k, 1]
         nx = box[k, 3]
         n = start[k]
+        if _is_straight(px, py, center[k], box[k]):
+            # a grid along the fine one is a quarter of the work
+            stamp = out[n : start[k + 1]]
+            _sample_straight(image, amplitude[k], center[k], px, py, box[k], stamp)
+            continue
         for y in range(box[k, 0], box[k, 0] + box[k, 2]):
             v = y - center[k, 1]
             for m in range(nx):
