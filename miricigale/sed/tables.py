@@ -181,8 +181,10 @@ def check_parameters(names, model):
         if name in known:
             continue
         sentences = declared("miricigale.sed", "parameter_hints.toml")["sentences"]
-        if name in sentences:
-            msg = f"no parameter {name!r}; {sentences[name]}"
+        by_lower_case = {label.lower(): sentence for label, sentence in sentences.items()}
+        sentence = sentences.get(name, by_lower_case.get(name.lower()))
+        if sentence is not None:
+            msg = f"no parameter {name!r}; {sentence}"
             raise KeyError(msg)
         ours, owners = _components_with(name)
         if owners:

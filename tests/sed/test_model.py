@@ -240,7 +240,9 @@ def test_parameters_have_their_names_of_cigale_too(model, filters):
     refuses(message, model.fluxes, filters, redshift=[1.0], E_BV_lines=0.3, error=KeyError)
     starburst = SEDModel(["sfhdelayed", "bc03", "dustatt_modified_starburst"])
     assert starburst.evaluate(redshift=1.0, E_BV_lines=0.3).parameters["ebv_lines"].value == 0.3
-    refuses("no parameter 'Av'; .* ebv", model.evaluate, Av=1.0, error=KeyError)
+    for name in ("Av", "AV", "A_V"):
+        message = f"no parameter '{name}'; .* ebv"
+        refuses(message, model.evaluate, **{name: 1.0}, error=KeyError)
     refuses("no parameter 'spin'; known: age, ", model.evaluate, spin=1.0, error=KeyError)
     zred = model.evaluate(zred=1.0, massformed=10.0, E_BVs_young=0.2)
     assert zred.parameters == model.evaluate(redshift=1.0, mass=1e10, ebv=0.2).parameters
