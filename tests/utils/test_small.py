@@ -108,7 +108,7 @@ def test_progress_is_lines_where_no_bar_can_be_drawn(capsys):
 def test_package_lists_its_classes_without_loading_them():
     assert {"Filter", "SEDModel", "Detector", "BayesFitter"} <= set(dir(miricigale))
     assert miricigale.Filter.__name__ == "Filter"
-    with pytest.raises(AttributeError, match="No miricigale attribute Nonsense"):
+    with pytest.raises(AttributeError, match="no attribute 'Nonsense'; its classes are"):
         miricigale.Nonsense  # noqa: B018
 
 

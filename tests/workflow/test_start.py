@@ -55,6 +55,10 @@ def test_light_commands_and_errors_import_nothing_heavy(tmp_path):
     assert list(ends) == LIGHT + WRONG
 
 
+def test_the_package_itself_imports_no_numpy(tmp_path):
+    python(tmp_path, "import sys, miricigale; assert 'numpy' not in sys.modules")
+
+
 #: First all subpackages, one after the other: the first that imports a kernel is named. Then all of their names.
 SUBPACKAGES = """
 import importlib, sys
