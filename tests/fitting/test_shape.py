@@ -83,6 +83,16 @@ def test_uniform_weights_give_straight_quantiles():
     assert np.isnan(quantiles[7]).all()
 
 
+def test_the_last_node_has_its_whole_weight():
+    """30 % at 0 and 70 % at 1, uniform in cells that end halfway to the next node."""
+    weights = np.zeros((1, 11))
+    weights[0, [0, 10]] = 0.3, 0.7
+    percentiles = cell_percentiles(np.linspace(0, 1, 11), weights, [0.16, 0.5, 0.84], (0, 1))
+    inside = np.array([0.2, 0.54]) / 0.7
+    assert_allclose(percentiles[0, 0], 0.05 * 0.16 / 0.3, rtol=1e-12)
+    assert_allclose(percentiles[0, 1:], 0.95 + 0.05 * inside, rtol=1e-12)
+
+
 def test_the_place_in_a_catalog_makes_no_difference():
     """Rows are worked out together; each has the digits that it has alone, ties included."""
     rng = np.random.default_rng(1)
