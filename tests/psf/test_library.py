@@ -210,6 +210,20 @@ def test_a_gaussian_has_its_width_and_energy():
     assert encircled_energy(psf, 0.4 * u.arcsec) == pytest.approx(0.5, rel=3e-3)
 
 
+@pytest.mark.parametrize("n_pixels", [80, 81])
+def test_energy_of_a_narrow_gaussian_whatever_the_parity(n_pixels):
+    # as narrow as F770W in the pixels of MIRI
+    pixel = 0.11 * u.arcsec
+    sigma = 1.04
+    width = sigma * np.sqrt(8 * np.log(2)) * pixel
+    psf = gaussian_psf(width, pixel_scale=pixel, fov=n_pixels * pixel)
+    radii = np.array([1.0, 1.5, 2.0, 3.0, 5.0])
+    # light is constant over cells of a quarter of a pixel, which adds their variance
+    variance = sigma**2 + 0.25**2 / 12
+    expected = 1 - np.exp(-0.5 * radii**2 / variance)
+    assert_allclose(encircled_energy(psf, radii * pixel), expected, atol=5e-4)
+
+
 WIDE = gaussian_psf(0.5 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
 PIXEL, F770W = {"pixel_scale": 1 * u.arcsec, "frame": "sky"}, ["F770W"]
 
