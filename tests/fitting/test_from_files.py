@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 from helpers.browser import BROWSER, opened, read_sources
 from helpers.commands import command
 from helpers.errors import refuses
+from helpers.figures import no_pictures
 from miricigale.cli import catalogs, main
 from miricigale.fitting import (
     FitFlags,
@@ -58,6 +59,16 @@ def catalog():
     return out
 
 
+@pytest.fixture(scope="module")
+def fitted(catalog, tmp_path_factory):
+    """Table of the fit of the catalog by the plain command."""
+    path = tmp_path_factory.mktemp("fitted") / "cat.fits"
+    catalog.write(path)
+    with no_pictures():
+        assert main(fit(path)) == 0
+    return QTable.read(path.parent / "out" / "table.fits")
+
+
 @pytest.mark.pictures
 @pytest.mark.slow
 def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
@@ -85,50 +96,49 @@ def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
     assert "holds results of another fit: chunk_rows differ" in err
     assert "give another folder, or --no-resume to replace them" in err
     assert "resume=" not in err
-    assert main([*argv, "--chunk-rows", "3", "--no-resume"]) == 0
+    with no_pictures():
+        assert main([*argv, "--chunk-rows", "3", "--no-resume"]) == 0
     assert open_results(out).n_parts == 2
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["parquet", "vot"])
 def test_catalogs_of_other_formats_and_from_standard_input(
-    catalog, tmp_path, capsys, monkeypatch, kind
+    catalog, fitted, tmp_path, capsys, monkeypatch, kind
 ):
     """The values of a catalog in FITS; of parquet the table is parquet."""
     if kind == "parquet":
         pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     end = "parquet" if kind == "parquet" else "fits"
-    catalog.write(tmp_path / "cat.fits")
     catalog.write(tmp_path / f"cat.{kind}", format="votable" if kind == "vot" else None)
     data = io.BytesIO((tmp_path / f"cat.{kind}").read_bytes())
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(data))
     monkeypatch.chdir(tmp_path)
-    for path, out in (("cat.fits", "fits"), (f"cat.{kind}", "file"), ("-", "stdin")):
+    for path, out in ((f"cat.{kind}", "file"), ("-", "stdin")):
         told = command(capsys, *fit(Path(path), out=out)).out
-        assert f"{out}/table.{'fits' if out == 'fits' else end};" in told
-    wanted = QTable.read("fits/table.fits")
-    for out in ("file", "stdin"):
+        assert f"{out}/table.{end};" in told
         found = QTable.read(f"{out}/table.{end}")
-        assert found.colnames == wanted.colnames
+        assert found.colnames == fitted.colnames
         for name in ("id", "redshift_p50", "mass_best", "chi2_best"):
             assert_allclose(
-                u.Quantity(found[name]).value, u.Quantity(wanted[name]).value, rtol=1e-12
+                u.Quantity(found[name]).value, u.Quantity(fitted[name]).value, rtol=1e-12
             )
 
 
 @pytest.mark.slow
-def test_the_workers_of_a_scheduler_give_the_table_of_this_process(catalog, tmp_path, capsys):
+def test_the_workers_of_a_scheduler_give_the_table_of_this_process(
+    catalog, fitted, tmp_path, capsys
+):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
     catalog.write(tmp_path / "cat.fits")
     options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": ":0"}
     with distributed.LocalCluster(**options) as cluster:
         scheduler = ["--scheduler", cluster.scheduler_address, "--chunk-rows", "2"]
         command(capsys, *fit(tmp_path / "cat.fits", *scheduler, out="there"))
-    command(capsys, *fit(tmp_path / "cat.fits", out="here"))
     assert open_results(tmp_path / "there").n_parts == 3
-    there, here = (QTable.read(tmp_path / out / "table.fits") for out in ("there", "here"))
+    there = QTable.read(tmp_path / "there" / "table.fits")
     for name in ("id", "redshift_p50", "mass_best", "chi2_best"):
-        assert_allclose(u.Quantity(there[name]).value, u.Quantity(here[name]).value, rtol=1e-9)
+        assert_allclose(u.Quantity(there[name]).value, u.Quantity(fitted[name]).value, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -319,7 +329,8 @@ def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_p
     assert [unquote(path.stem) for path in written] == table["id"][:2].tolist()
     refuses("no object with the id 'x'", write_plots, results, tmp_path, ["x"], error=KeyError)
     browser = tmp_path / "page.html"
-    page = fit_page(results, tmp_path / "cat.fits", browser=browser).to_html()
+    with no_pictures():
+        page = fit_page(results, tmp_path / "cat.fits", browser=browser).to_html()
     assert "of all objects can be looked at <a href='sources.html'>one by one</a>" in page
     facts, entries = read_sources(tmp_path / "sources.html", tmp_path / "sources")
     assert facts["table"]["id"] == table["id"].tolist()
@@ -344,13 +355,15 @@ def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_p
         assert "5 of 5 sources" in document
         assert document.count('class="truth"') == 1
     monkeypatch.setattr("miricigale.fitting.catalogs.browser.MAX_OBJECTS", 2)
-    page = fit_page(results, tmp_path / "cat.fits", browser=browser).to_html()
+    with no_pictures():
+        page = fit_page(results, tmp_path / "cat.fits", browser=browser).to_html()
     assert "of one object in 3 can be looked at" in page
     assert read_sources(tmp_path / "sources.html", tmp_path / "sources")[0]["table"]["id"] == (
         table["id"][::3].tolist()
     )
     monkeypatch.setattr("miricigale.fitting.catalogs.page._MAX_OBJECTS", 2)
-    few = fit_page(results, tmp_path / "cat.fits").to_html()
+    with no_pictures():
+        few = fit_page(results, tmp_path / "cat.fits").to_html()
     assert "numbers and figures are of one object in 3, 2 of them" in few
     refuses("z_phot", fit_page, results, tmp_path / "cat.fits", z_spec="z_phot")
 
@@ -436,7 +449,7 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
     assert "those of the class of each object" in page
     monkeypatch.undo()
     # the fits of the classes are whole: the same command resumes from them, and finds nothing to do
-    with pytest.warns(MiricigaleWarning, match="not fitted"):
+    with no_pictures(), pytest.warns(MiricigaleWarning, match="not fitted"):
         assert main(argv) == 0
     assert "no such file" in command(capsys, *argv[:-1], tmp_path / "none", status=2).err
 

@@ -1,6 +1,17 @@
-"""What is drawn on axes."""
+"""What is drawn on axes, and pages without it."""
+
+import contextlib
 
 import numpy as np
+import pytest
+
+
+@contextlib.contextmanager
+def no_pictures():
+    """Leave pictures out of pages: drawing them takes most of the time of a page whose numbers are compared."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("miricigale.pages.page.image_of", lambda figure, dpi: ("data:,", 1))
+        yield
 
 
 def line_data(ax, style):

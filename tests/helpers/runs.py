@@ -1,11 +1,9 @@
 """A run of made-up products: what the stages after the photometry read."""
 
-import contextlib
 import itertools
 
 import astropy.units as u
 import numpy as np
-import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
@@ -106,14 +104,6 @@ def one_band(band, *, n_groups=7, n_integrations=1, kind="ramps", **sections):
 
 def do_stage(config, folder, name, unit=""):
     STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
-
-
-@contextlib.contextmanager
-def no_pictures():
-    """Leave pictures out of pages: drawing them takes most of the time of a page whose numbers are compared."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("miricigale.pages.page.image_of", lambda figure, dpi: ("data:,", 1))
-        yield
 
 
 def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=False, **options):

@@ -7,7 +7,7 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.runs import no_pictures
+from helpers.figures import no_pictures
 from miricigale.instrument.image_files import read_image
 from miricigale.workflow import load_config, run_study
 from miricigale.workflow.stage_list import study_stages

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from helpers.figures import legend_texts
+from helpers.figures import legend_texts, no_pictures
 from helpers.runs import (
     AREA,
     SCALE,
     SHAPE,
     make_run,
-    no_pictures,
     noise_image,
     sky_image,
     small_config,

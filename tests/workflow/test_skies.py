@@ -6,7 +6,8 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
-from helpers.runs import do_stage, make_run, no_pictures, small_config
+from helpers.figures import no_pictures
+from helpers.runs import do_stage, make_run, small_config
 from miricigale.photometry import ErrorModel
 from miricigale.workflow.stages.skies import sky_photometry
 from miricigale.workflow.truths import FIELD

@@ -11,12 +11,12 @@ from astropy.table import QTable
 from PIL import Image
 
 from helpers.browser import BROWSER, opened, read_sources
+from helpers.figures import no_pictures
 from helpers.runs import (
     SCALE,
     SHAPE,
     do_stage,
     make_run,
-    no_pictures,
     noise_image,
     sky_image,
     small_config,
