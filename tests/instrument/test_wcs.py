@@ -30,6 +30,7 @@ from miricigale.instrument import (
     v2v3_to_sky,
 )
 from miricigale.instrument.asdf_extension import imager_gwcs
+from miricigale.instrument.wcs import chebyshev_pixels
 
 FIELD = SkyCoord(53.1344, -27.83444, unit="deg")
 ROLL = 35 * u.deg
@@ -261,3 +262,11 @@ def test_gwcs_has_the_same_bytes_in_every_process():
         used = [entry["extension_uri"] for entry in file["history"]["extensions"]]
         assert len(used) == len(set(used)) >= 4
         assert file["meta"]["wcs"].available_frames[-1] == "world"
+
+
+def test_nodes_of_fits_lie_evenly_about_the_middle_of_the_image():
+    """Between the outer edges of the pixels, and near them."""
+    for nodes, n in zip(chebyshev_pixels((30, 50)), (50, 30), strict=True):
+        assert_allclose(np.sort(nodes.ravel()), np.sort(n - 1 - nodes.ravel()), atol=1e-9)
+        assert -0.5 < nodes.min() < -0.4
+        assert n - 0.6 < nodes.max() < n - 0.5

@@ -87,7 +87,10 @@ def test_few_sources_make_one_bin():
     truth = QTable({BAND: np.linspace(1, 2, 12) * u.uJy})
     measured = QTable({BAND: (truth[BAND].value + rng.normal(0, 0.1, 12)) * u.uJy})
     model = ErrorModel.from_tables(truth, measured)
-    assert len(model.to_table()) == 1
+    table = model.to_table()
+    assert len(table) == 1
+    for name in ("flux", "sigma", "low", "high", "photon"):
+        assert table[name].unit == u.uJy
     assert 0.03 < model.sigma(1.5 * u.uJy, BAND).value < 0.3
 
 
