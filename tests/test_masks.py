@@ -5,6 +5,7 @@ Public functions that take arrays are called with two different numbers behind o
 the three answers are the same, or all are refused.
 """
 
+import functools
 import importlib
 import inspect
 import re
@@ -134,19 +135,42 @@ TABLE = QTable({"id": np.arange(5)})
 for _band_name in ("acs.f606w", "wfc3.f160w"):
     TABLE[_band_name] = FLUX
     TABLE[f"{_band_name}_err"] = FLUX / 9
-FITTER = fitting.BayesFitter(
-    GALAXY,
-    ["acs.f606w", "wfc3.f160w"],
-    axes={"redshift": [0.3, 0.6, 1.0, 1.5, 2.2], "age": [1.0, 2.0]},
-)
-RESULTS = FITTER.fit(TABLE)
-DRAWS = FITTER.sample(TABLE, 3, seed=1)
 NUCLEI = sed.SEDModel.yang2021(libraries="bundled")
-HOSTS = fitting.BayesFitter(
-    NUCLEI,
-    ["acs.f606w", "wfc3.f160w"],
-    axes={"redshift": [0.5, 1.0], "age": [1.0, 2.0], "frac_agn": [0.0, 0.5]},
-).fit(TABLE)
+
+
+# fits are made by the tests that need them, not where all tests are collected
+@functools.cache
+def _fitter():
+    axes = {"redshift": [0.3, 0.6, 1.0, 1.5, 2.2], "age": [1.0, 2.0]}
+    return fitting.BayesFitter(GALAXY, ["acs.f606w", "wfc3.f160w"], axes=axes)
+
+
+@functools.cache
+def _results():
+    return _fitter().fit(TABLE)
+
+
+@functools.cache
+def _draws():
+    return _fitter().sample(TABLE, 3, seed=1)
+
+
+@functools.cache
+def _hosts():
+    axes = {"redshift": [0.5, 1.0], "age": [1.0, 2.0], "frac_agn": [0.0, 0.5]}
+    return fitting.BayesFitter(NUCLEI, ["acs.f606w", "wfc3.f160w"], axes=axes).fit(TABLE)
+
+
+@functools.cache
+def _fixed():
+    """Fits at given redshifts of what are no fluxes of galaxies."""
+    many = TABLE[np.arange(40) % 5]
+    many["id"] = np.arange(40)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MiricigaleWarning)
+        return _fitter().fit(many, redshift=np.tile(X, 8))
+
+
 BLANK = CCDData(IMAGE.data - 1, unit="uJy", wcs=IMAGE.wcs)
 EVEN = CCDData(
     np.ones((61, 61)),
@@ -233,18 +257,10 @@ def _saved_models(redshifts):
 
 def _plotted_redshifts(redshifts):
     figure, axes = pyplot.subplots()
-    RESULTS.plot_redshift(redshifts, ax=axes)
+    _results().plot_redshift(redshifts, ax=axes)
     offsets = [points.get_offsets() for points in axes.collections if len(points.get_offsets())]
     pyplot.close(figure)
     return [*offsets, np.array([len(axes.get_title())])]
-
-
-MANY = TABLE[np.arange(40) % 5]
-MANY["id"] = np.arange(40)
-with warnings.catch_warnings():
-    # these are no fluxes of galaxies
-    warnings.simplefilter("ignore", MiricigaleWarning)
-    FIXED = FITTER.fit(MANY, redshift=np.tile(X, 8))
 
 
 def _measured_errors(noise):
@@ -527,15 +543,16 @@ FUNCTIONS = {
         lambda x: reduction.drizzle_images([EVEN], EVEN.wcs, variances=[{"var_rnoise": _plane(x)}]).variances, X),
     "sed.with_xray_bands.alpha_ox": (lambda x: _with_xrays({"hard": [2, 7] * u.keV}, x), X - 3),
     "sed.with_xray_bands.bands": (lambda x: _with_xrays({"hard": x[:2]}, [-1.5]), X << u.keV),
-    "fitting.BayesFitter.fit.redshift": (lambda x: FITTER.fit(TABLE, redshift=x).chi2, X),
-    "fitting.FitResults.percentile.levels": (lambda x: RESULTS.percentile("redshift", x), X / 3),
-    "fitting.Samples.percentile.levels": (lambda x: DRAWS.percentile("redshift", x), X / 3),
+    "fitting.BayesFitter.fit.redshift": (lambda x: _fitter().fit(TABLE, redshift=x).chi2, X),
+    "fitting.FitResults.percentile.levels": (lambda x: _results().percentile("redshift", x), X / 3),
+    "fitting.Samples.percentile.levels": (lambda x: _draws().percentile("redshift", x), X / 3),
     "fitting.compare_classes.prior": (
-        lambda x: fitting.compare_classes({"a": RESULTS, "b": RESULTS}, prior={"a": x, "b": 1 - X / 3}), X / 3),
+        lambda x: fitting.compare_classes(
+            {"a": _results(), "b": _results()}, prior={"a": x, "b": 1 - X / 3}), X / 3),
     "photometry.ErrorModel.assign.noise": (
         lambda x: ERRORS.assign(QTable({"id": np.arange(5), "miri.f770w": FLUX}), noise={"miri.f770w": x}), X),
     "agn.agn_light.luminosity": (
-        lambda x: agn.agn_light(NUCLEI, HOSTS, x, {}, ["miri.f770w"])[0]["miri.f770w"], LUMINOSITY),
+        lambda x: agn.agn_light(NUCLEI, _hosts(), x, {}, ["miri.f770w"])[0]["miri.f770w"], LUMINOSITY),
     "photometry.SourceTemplates.from_arrays.arrays": (lambda x: _template(_image(x)).light[0].data, X),
     "scene.deconvolve.psf": (lambda x: scene.deconvolve(np.eye(9), _image(x)), X),
     "sed.Parameter.array.values": (lambda x: sed.Parameter(default=1.0, bounds=(0, 5), doc="a").array(x), X),
@@ -548,11 +565,11 @@ FUNCTIONS = {
     "cigale.CigaleSetup.grid.redshifts": (lambda x: SETUP.grid(["acs.f606w"], x).galaxy, X),
     "cigale.CigaleSetup.save_models.redshifts": (_saved_models, X),
     "agn.agn_light.parameters": (
-        lambda x: agn.agn_light(NUCLEI, HOSTS, LUMINOSITY, {"inclination": x}, ["miri.f770w"])[0]["miri.f770w"],
+        lambda x: agn.agn_light(NUCLEI, _hosts(), LUMINOSITY, {"inclination": x}, ["miri.f770w"])[0]["miri.f770w"],
         20 * X),
     "fitting.FitResults.plot_redshift.z_spec": (_plotted_redshifts, X),
     "fitting.measure_template_error.edges": (
-        lambda x: fitting.measure_template_error(FIXED, edges=x).error, X / 2 << u.um),
+        lambda x: fitting.measure_template_error(_fixed(), edges=x).error, X / 2 << u.um),
     "photometry.ErrorModel.from_tables.noise": (_measured_errors, X),
     "photometry.ForcedPhotometer.render.flux": (
         lambda x: photometry.ForcedPhotometer(DELTA).render(IMAGE, POINTS, x).value, FLUX),
@@ -700,6 +717,12 @@ def _answer(function, values):
     if isinstance(answer, (tuple, list)):
         return [np.asarray(getattr(one, "value", one)) for one in answer]
     return [np.asarray(getattr(answer, "value", answer))]
+
+
+@pytest.mark.parametrize("fits", [_fitter, _results, _draws, _hosts, _fixed])
+def test_fits_that_masks_are_tried_on_can_be_made(fits):
+    """What is refused below is not refused for want of them."""
+    assert fits() is fits()
 
 
 @pytest.mark.parametrize("kind", KINDS)
