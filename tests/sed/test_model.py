@@ -594,3 +594,10 @@ def test_a_stellar_mass_is_that_of_living_stars():
     assert_quantity_allclose(by_cigale.fnu, sed.fnu, rtol=1e-12)
     refuses("'stellar_mass' must be left out beside 'mass'", model, mass=3e10, stellar_mass=3e10)
     refuses("not its logarithm", model, stellar_mass=10.5)
+
+
+def test_what_a_session_completes_are_components():
+    model = SEDModel.yang2021()
+    names = model._ipython_key_completions_()
+    assert {one.role for one in model.components} <= set(names)
+    assert {model[name].name for name in names} == {one.name for one in model.components}
