@@ -80,7 +80,8 @@ class SourceModel:
     stamp: tuple  # The rectangle that it was fitted on.
     shape: Shape  # Its profile, on the pixels of the stamp.
     image: np.ndarray  # Its light on the stamp.
-    cutout: Cutout | None = None  # Its template; None for a point.
+    cutout: Cutout | None = None  # Its template; None for a point, and for a profile.
+    is_profile: bool = False  # Whether the profile is its template, which is drawn at the end.
     light: float = 1.0  # The profile's part of the light of the template.
     neighbor_light: np.ndarray | float = 0.0  # Light that was taken off the stamp before the fit.
     labels: tuple = ()  # Of the sources that it was fitted together with.

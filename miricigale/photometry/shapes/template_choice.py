@@ -154,9 +154,10 @@ def cutouts(
             fitted[chosen[row]] = record
             flags[chosen[row]] |= ForcedFlags.SHREDDED
     in_pieces = set(itertools.chain.from_iterable(galaxy.rows for galaxy in galaxies))
-    for row, (k, model) in enumerate(zip(chosen, models, strict=True)):
+    final_templates = parallel_map(lights.template, models, executor=executor)
+    for row, (k, model, template) in enumerate(zip(chosen, models, final_templates, strict=True)):
         if model is not None:
-            templates[k] = model.cutout
+            templates[k] = template
             fitted[k] = (*model.record, 0.0, 1.0)
         elif templates[k] is None or row not in in_pieces:
             flags[k] |= ForcedFlags.NOISY_SEGMENT
@@ -336,7 +337,7 @@ class _Lights:
         ``rows`` and ``labels`` are those of the pieces. With ``cut`` it has no light on the segments of others.
         """
         # the rectangle that holds the light of the galaxy
-        template = model.cutout
+        template = self.template(model)
         place = model.stamp
         reach = int(self.fitter.reach)
         low = rectangle_corner(place)[::-1] - reach
@@ -517,15 +518,16 @@ class _Lights:
         shape = self.fitter.fit(data, looser, xy - corner, prior, last.shape, last.neighbors)
         if shape is None:
             # as it was before, and if there was no template yet, as its profile
-            if last.cutout is None and last.shape.point <= 0.5:
-                return self._as_profile(last)
+            has_template = last.is_profile or last.cutout is not None
+            if not has_template and last.shape.point <= 0.5:
+                return dataclasses.replace(last, is_profile=True)
             return last
         fitted = {
             "shape": shape,
             "image": self._image(stamp, shape),
             "neighbor_light": neighbor_light,
         }
-        new = dataclasses.replace(last, **fitted, cutout=None, light=1.0)
+        new = dataclasses.replace(last, **fitted, cutout=None, is_profile=False, light=1.0)
         if self.select and shape.point > 0.5:
             return new
         # is the profile as good as the image in the core?
@@ -535,7 +537,7 @@ class _Lights:
             # chi^2 of the profile on the core beyond that of noise
             excess = np.sum(((data - new.image) * weight)[core] ** 2) - n
             if excess < _EXCESS * np.sqrt(2 * max(n, 1)):
-                return self._as_profile(new)
+                return dataclasses.replace(new, is_profile=True)
         # the image in the core, the profile beyond, scaled to what is seen
         profile = self._profile(shape, corner, light=shape.flux)
         origin = np.subtract(profile.origin, corner[::-1])
@@ -557,7 +559,7 @@ class _Lights:
         # light of the profile, of the core's difference from it, and beyond the stamp
         total = light.sum() + remainder.sum() + outer * (shape.flux - profile.data.sum())
         if not total > 0:
-            return self._as_profile(new)
+            return dataclasses.replace(new, is_profile=True)
         template = dataclasses.replace(
             profile,
             data=light / total,
@@ -568,11 +570,13 @@ class _Lights:
             new, image=image + remainder, cutout=template, light=shape.flux / total
         )
 
-    def _as_profile(self, model):
-        """Return a copy with its profile as the template."""
-        return dataclasses.replace(
-            model, cutout=self._profile(model.shape, rectangle_corner(model.stamp))
-        )
+    def template(self, model):
+        """Return the template (a `Cutout`) of a model, None for a point and without a model."""
+        if model is None:
+            return None
+        if model.is_profile:
+            return self._profile(model.shape, rectangle_corner(model.stamp))
+        return model.cutout
 
     def _profile(self, shape, corner, light=1.0):
         """Draw a fitted profile on the fine grid, as far as the PSF reaches at least: steps at its edge show."""
