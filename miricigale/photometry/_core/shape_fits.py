@@ -13,9 +13,6 @@ from miricigale.photometry._core.dense import (
 from miricigale.photometry._core.shapes import FAST, fill_curves
 from miricigale.utils.compilation import njit
 
-#: Shapes of a source whose images are drawn at once: as many as stay near the processor.
-_TOGETHER = 7
-
 #: How square images are made from transforms, by products of small matrices: frequencies kx and ky (rad per pixel)
 #: at ky >= 0, then at ky <= 0, (2 ny nx,), what their squares count in the sum over all pixels; the PSF's
 #: transform, (2, ny, nx); cosines and sines along y, (2, size, 2 ny), and along x, (2, 2 nx, size), and their
@@ -93,14 +90,13 @@ def _placed(plan, x, y):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _images(plan, curves, placed, n_moved):
+def _images(plan, curves, placed, n_moved, size):
     """
-    Draw images, (size, n, size), of transforms, (n, 2, ny, nx).
+    Draw images, (size, n, size), of transforms, (n, 2, ny, nx), on a square of at most the plan's size.
 
     After them come the derivatives of the first ``n_moved`` to x and to y, (size, n_moved, size) each.
     """
     n, _, ny, nx = curves.shape
-    size = plan.inner.shape[1]
     # sums and differences of the two at +-ky, real and imaginary parts
     right = np.empty((2 * ny, n, 2 * nx), np.float32)
     for i in range(ny):
@@ -117,16 +113,19 @@ def _images(plan, curves, placed, n_moved):
                 right[ny + i, c, j] = negative_imag - positive_imag
                 right[ny + i, c, nx + j] = positive_real - negative_real
     # inverse transforms along y, then along x, as products of matrices
-    middle = np.dot(plan.inner[0], right.reshape(2 * ny, -1)).reshape(size, n, 2 * nx)
-    images = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0]).reshape(size, n, size)
+    outer = plan.outer[:, :, :size].copy()
+    middle = np.dot(plan.inner[0, :size], right.reshape(2 * ny, -1)).reshape(size, n, 2 * nx)
+    images = np.dot(middle.reshape(-1, 2 * nx), outer[0]).reshape(size, n, size)
+    form = (size, n_moved, size)
+    if n_moved == 0:
+        return images, np.empty(form, np.float32), np.empty(form, np.float32)
     if n_moved < n:
         middle = middle[:, :n_moved].copy()
         right = right[:, :n_moved].copy()
     # derivatives: the waves of one axis are replaced by their slopes
-    along_x = np.dot(middle.reshape(-1, 2 * nx), plan.outer[1])
-    middle = np.dot(plan.inner[1], right.reshape(2 * ny, -1))
-    along_y = np.dot(middle.reshape(-1, 2 * nx), plan.outer[0])
-    form = (size, n_moved, size)
+    along_x = np.dot(middle.reshape(-1, 2 * nx), outer[1])
+    middle = np.dot(plan.inner[1, :size], right.reshape(2 * ny, -1))
+    along_y = np.dot(middle.reshape(-1, 2 * nx), outer[0])
     return images, along_x.reshape(form), along_y.reshape(form)
 
 
@@ -153,7 +152,9 @@ def draw_curves(plan, curves, x, y, n_derivatives):
     _, ny, nx = plan.response.shape
     placed = _placed(plan, x, y)
     n_moved = n_derivatives // 2
-    images, along_x, along_y = _images(plan, curves.reshape(-1, 2, ny, nx), placed, n_moved)
+    size = plan.inner.shape[1]
+    curves = curves.reshape(-1, 2, ny, nx)
+    images, along_x, along_y = _images(plan, curves, placed, n_moved, size)
     return np.concatenate((images[:, :n_moved], along_x, along_y, images[:, n_moved:]), axis=1)
 
 
@@ -170,32 +171,65 @@ def _whiten(images, k, inverse, y, x, column):
 
 
 @njit(cache=True, nogil=True)
-def _products(plan, table, inverse, corners, parameters, columns):
+def _products(plan, table, inverse, squares, parameters, columns):
     """Write whitened models and derivatives into all columns but the last; products of all columns."""
-    k = (len(columns) - 1) // len(parameters)
+    n = len(parameters)
+    k = (len(columns) - 1) // n
+    last = n * k
+    width = inverse.shape[1]
     _, ny, nx = plan.response.shape
-    x0 = corners[:, 0].min()
-    y0 = corners[:, 1].min()
+    x0 = squares[:, 0].min()
+    y0 = squares[:, 1].min()
     # with the shape free (k = 7) the derivatives to its four parameters are drawn too
     n_curves = 5 if k == 7 else 1
     curves = np.empty((n_curves, 2, ny, nx), np.float32)
     n_moved = min(k - 1, 1)
-    for s in range(len(parameters)):
+    products = np.zeros((last + 1, last + 1))
+    for s in range(n):
         shape = parameters[s, 2:]
         first = s * k
         fill_curves(plan.kx, plan.ky, shape, table, curves.reshape(len(curves), -1))
         # each source is drawn on a square of its own
-        placed = _placed(plan, parameters[s, 0] - corners[s, 0], parameters[s, 1] - corners[s, 1])
-        images, along_x, along_y = _images(plan, curves, placed, n_moved)
-        x = corners[s, 0] - x0
-        y = corners[s, 1] - y0
+        placed = _placed(plan, parameters[s, 0] - squares[s, 0], parameters[s, 1] - squares[s, 1])
+        images, along_x, along_y = _images(plan, curves, placed, n_moved, squares[s, 2])
+        x = squares[s, 0] - x0
+        y = squares[s, 1] - y0
         _whiten(images, 0, inverse, y, x, columns[first])
         if n_moved:
             _whiten(along_x, 0, inverse, y, x, columns[first + 1])
             _whiten(along_y, 0, inverse, y, x, columns[first + 2])
         for j in range(3, k):
             _whiten(images, j - 2, inverse, y, x, columns[first + j])
-    return np.dot(columns, columns.T)
+    if n == 1:
+        return np.dot(columns, columns.T)
+    products[last, last] = np.dot(columns[last], columns[last])
+    for s in range(n):
+        # on the rows of the square alone, beyond which there is no light
+        low = squares[s, 1] - y0
+        high = low + squares[s, 2]
+        first = s * k
+        own = columns[first : first + k, low * width : high * width].copy()
+        right = np.dot(own, columns[last, low * width : high * width].copy())
+        for i in range(k):
+            products[first + i, last] = right[i]
+            products[last, first + i] = right[i]
+        block = np.dot(own, own.T)
+        for i in range(k):
+            for j in range(k):
+                products[first + i, first + j] = block[i, j]
+        for t in range(s):
+            top = max(low, squares[t, 1] - y0)
+            end = min(high, squares[t, 1] - y0 + squares[t, 2])
+            if top >= end:
+                continue
+            rows = slice(top * width, end * width)
+            left = columns[first : first + k, rows].copy()
+            block = np.dot(left, columns[t * k : t * k + k, rows].copy().T)
+            for i in range(k):
+                for j in range(k):
+                    products[first + i, t * k + j] = block[i, j]
+                    products[t * k + j, first + i] = block[i, j]
+    return products
 
 
 @njit(cache=True, nogil=True)
@@ -277,7 +311,7 @@ def _step(matrix, slope, parameters, limits, damping):
 
 
 @njit(cache=True, nogil=True)
-def minimum(plan, table, white, inverse, corners, start, mean, precision, limits, steps, gain):
+def minimum(plan, table, white, inverse, squares, start, mean, precision, limits, steps, gain):
     """
     Fit the light and the first parameters of sources, with Gaussian priors, after Levenberg and Marquardt.
 
@@ -288,8 +322,8 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     white, inverse : `~numpy.ndarray`, shape (h, w)
         Light over its noise, and the inverse of the noise, zero for pixels that do not count, of the rectangle
         of all squares.
-    corners : int `~numpy.ndarray`, shape (n, 2)
-        First x and y of the square that each source is drawn on.
+    squares : int `~numpy.ndarray`, shape (n, 3)
+        First x and y, and side, of the square that each source is drawn on; no side is larger than the plan's.
     start, mean : `~numpy.ndarray`, shape (n, 6)
         Parameters to begin with, and of the prior.
     precision : `~numpy.ndarray`, shape (n, m, m)
@@ -326,7 +360,7 @@ def minimum(plan, table, white, inverse, corners, start, mean, precision, limits
     chi2 = np.inf
     damping = 0.1
     while True:
-        products = _products(plan, table, inverse, corners, trial, columns)
+        products = _products(plan, table, inverse, squares, trial, columns)
         state = _state(products, trial, mean, precision)
         if state[0] <= chi2:
             parameters = trial
@@ -412,21 +446,47 @@ def _product(a, b):
     return total
 
 
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _image_products(images, s, inverse, white):
+    """Sum the squares of a whitened model, and its products with the data."""
+    power = 0.0
+    projection = 0.0
+    for row in range(len(images)):
+        for i in range(len(images)):
+            value = images[row, s, i] * inverse[row, i]
+            power += value * value
+            projection += value * white[row, i]
+    return power, projection
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _steepness(plan, curve):
+    """Sum the squares of the slopes of an image over all pixels, by its transform."""
+    total = 0.0
+    for i in range(curve.size):
+        x = plan.kx[i]
+        y = plan.ky[i]
+        total += plan.weight[i] * (x * x + y * y) * curve[i] * curve[i]
+    return total
+
+
 @njit(cache=True, nogil=True)
 def evidence_of(
-    plan, table, white, inverse, corners, best, flux, shapes, mean, precision, neighbors
+    plan, table, white, inverse, squares, best, flux, shapes, drift, mean, precision, neighbors
 ):
     """
     Calculate likelihoods of shapes of a source, with the light, center and neighbors that fit best.
 
     Parameters
     ----------
-    plan, table, white, inverse, corners
+    plan, table, white, inverse, squares
         As for `minimum`.
     best, flux : `~numpy.ndarray`, shapes (1, 6) and (1,)
         The best parameters and light.
     shapes : `~numpy.ndarray`, shape (k, 4)
         The shapes.
+    drift : `~numpy.ndarray`, shape (k, 2)
+        How far the best center of each shape is from that of the best shape.
     mean, precision : `~numpy.ndarray`, shapes (1, 6) and (1, 2, 2)
         The prior of the center.
     neighbors : `~numpy.ndarray`, shape (b, pixels)
@@ -437,75 +497,74 @@ def evidence_of(
     likelihoods : `~numpy.ndarray`, shape (k, 2)
         Ln of the likelihood, integrated over a light that is flat in its logarithm, and ln flux; -1e9 and 0
         where no positive light fits.
+
+    Notes
+    -----
+    The constraint on the center is that of the best shape, in proportion to the squares of the slopes of the
+    images.
     """
     _, ny, nx = plan.response.shape
-    # the best one first
-    n_shapes = len(shapes) + 1
-    all_shapes = np.empty((n_shapes, 4))
-    for i in range(4):
-        all_shapes[0, i] = best[0, 2 + i]
-        for s in range(1, n_shapes):
-            all_shapes[s, i] = shapes[s - 1, i]
-    placed = _placed(plan, best[0, 0] - corners[0, 0], best[0, 1] - corners[0, 1])
-    curves = np.empty((_TOGETHER, 2, ny, nx), np.float32)
-    likelihoods = np.zeros((n_shapes, 2))
-    neighbor_data = np.zeros(len(neighbors))
-    products = np.empty((3, 4))
+    size = plan.inner.shape[1]
+    x0 = best[0, 0] - squares[0, 0]
+    y0 = best[0, 1] - squares[0, 1]
     columns = np.empty((3, white.size))
+    neighbor_data = np.zeros(len(neighbors))
+    curves = np.empty((1, 2, ny, nx), np.float32)
+    curve = curves.reshape(1, -1)
     data = 0.0
     for row in white:
         data += _product(row, row)
+    # the best one first, whose center is free
+    fill_curves(plan.kx, plan.ky, best[0, 2:], table, curve)
+    images, along_x, along_y = _images(plan, curves, _placed(plan, x0, y0), 1, size)
+    products = np.empty((3, 4))
+    _center_products(images, along_x, along_y, 0, inverse, white, products)
+    if len(neighbors):
+        # neighbors' light that was taken off is the best together with this one's
+        _whiten(images, 0, inverse, 0, 0, columns[0])
+        _whiten(along_x, 0, inverse, 0, 0, columns[1])
+        _whiten(along_y, 0, inverse, 0, 0, columns[2])
+        shared = np.dot(columns, neighbors.T)
+        for b in range(len(neighbors)):
+            neighbor_data[b] = flux[0] * shared[0, b]
+        data -= _product(neighbor_data, neighbor_data)
+        for i in range(3):
+            for j in range(3):
+                products[i, j] -= _product(shared[i], shared[j])
+    own_x = products[1, 0]
+    own_y = products[2, 0]
+    power = max(products[0, 0], 1e-300)
+    steepness = _steepness(plan, curve[0])
+    xx = (products[1, 1] - own_x * own_x / power) / steepness
+    xy = (products[1, 2] - own_x * own_y / power) / steepness
+    yy = (products[2, 2] - own_y * own_y / power) / steepness
     center = precision[0]
-    off_x = best[0, 0] - mean[0, 0]
-    off_y = best[0, 1] - mean[0, 1]
     log_prior = np.log(center[0, 0] * center[1, 1] - center[0, 1] ** 2)
-    # derivative of half of the prior's chi^2 by the center
-    pull_x = center[0, 0] * off_x + center[0, 1] * off_y
-    pull_y = center[0, 1] * off_x + center[1, 1] * off_y
-    for first in range(0, n_shapes, _TOGETHER):
-        n = min(_TOGETHER, n_shapes - first)
-        for s in range(n):
-            shape = all_shapes[first + s]
-            fill_curves(plan.kx, plan.ky, shape, table, curves[s].reshape(1, -1))
-        images, along_x, along_y = _images(plan, curves[:n], placed, n)
-        for s in range(n):
-            _center_products(images, along_x, along_y, s, inverse, white, products)
-            if len(neighbors):
-                # neighbors' light that was taken off is the best together with this one's
-                _whiten(images, s, inverse, 0, 0, columns[0])
-                _whiten(along_x, s, inverse, 0, 0, columns[1])
-                _whiten(along_y, s, inverse, 0, 0, columns[2])
-                shared = np.dot(columns, neighbors.T)
-                if first + s == 0:
-                    for b in range(len(neighbors)):
-                        neighbor_data[b] = flux[0] * shared[0, b]
-                    data -= _product(neighbor_data, neighbor_data)
-                for i in range(3):
-                    for j in range(3):
-                        products[i, j] -= _product(shared[i], shared[j])
-                    products[i, 3] -= _product(shared[i], neighbor_data)
-            likelihoods[first + s, 0] = -1e9
-            power = products[0, 0]
-            projection = products[0, 3]
-            if power > 0 and projection > 0:
-                # the center: changes of the pixels are in proportion to the light
-                light = projection / power
-                own_x = products[1, 0]
-                own_y = products[2, 0]
-                slope_x = light * (products[1, 3] - light * own_x) - pull_x
-                slope_y = light * (products[2, 3] - light * own_y) - pull_y
-                xx = center[0, 0] + light**2 * (products[1, 1] - own_x * own_x / power)
-                xy = center[0, 1] + light**2 * (products[1, 2] - own_x * own_y / power)
-                yy = center[1, 1] + light**2 * (products[2, 2] - own_y * own_y / power)
-                # one Newton step of the center, with the light that is best at each place
-                det = xx * yy - xy * xy
-                step_x = (yy * slope_x - xy * slope_y) / det
-                step_y = (xx * slope_y - xy * slope_x) / det
-                chi2 = data - light * projection + off_x * pull_x + off_y * pull_y
-                gained = slope_x * step_x + slope_y * step_y
-                # Laplace's integral over center and light
-                evidence = gained - chi2 - np.log(abs(det)) - np.log(power) + log_prior
-                moved = (own_x * step_x + own_y * step_y) / power
-                likelihoods[first + s, 1] = np.log(light * max(1.0 - moved, 0.1))
-                likelihoods[first + s, 0] = 0.5 * evidence - likelihoods[first + s, 1]
-    return likelihoods[1:]
+    likelihoods = np.zeros((len(shapes), 2))
+    for s in range(len(shapes)):
+        fill_curves(plan.kx, plan.ky, shapes[s], table, curve)
+        placed = _placed(plan, x0 + drift[s, 0], y0 + drift[s, 1])
+        images, _, _ = _images(plan, curves, placed, 0, size)
+        power, projection = _image_products(images, 0, inverse, white)
+        if len(neighbors):
+            _whiten(images, 0, inverse, 0, 0, columns[0])
+            shared_light = np.dot(neighbors, columns[0])
+            power -= _product(shared_light, shared_light)
+            projection -= _product(shared_light, neighbor_data)
+        likelihoods[s, 0] = -1e9
+        if power > 0 and projection > 0:
+            light = projection / power
+            off_x = best[0, 0] + drift[s, 0] - mean[0, 0]
+            off_y = best[0, 1] + drift[s, 1] - mean[0, 1]
+            pull_x = center[0, 0] * off_x + center[0, 1] * off_y
+            pull_y = center[0, 1] * off_x + center[1, 1] * off_y
+            chi2 = data - light * projection + off_x * pull_x + off_y * pull_y
+            # changes of the pixels with the center are in proportion to the light
+            scale = light**2 * _steepness(plan, curve[0])
+            det = (center[0, 0] + scale * xx) * (center[1, 1] + scale * yy)
+            det -= (center[0, 1] + scale * xy) ** 2
+            # Laplace's integral over center and light
+            evidence = log_prior - chi2 - np.log(abs(det)) - np.log(power)
+            likelihoods[s, 1] = np.log(light)
+            likelihoods[s, 0] = 0.5 * evidence - likelihoods[s, 1]
+    return likelihoods

@@ -239,7 +239,7 @@ class ShapeFitter(ShapeModels):
             return Shape(flux, parameters, 0.0, covariance)
         # what else the source may be: shapes about the best, and a point
         changes = inner.changes(neighbors)
-        nodes = inner.nodes(parameters, flux, covariance[3:, 3:], mean, changes)
+        nodes = inner.nodes(parameters, flux, covariance[1:, 1:], mean, changes)
         start = parameters.copy()
         start[2] = POINT_SIZE
         as_point = -np.inf
@@ -280,7 +280,8 @@ class ShapeFitter(ShapeModels):
         for k, population in enumerate(populations):
             mean[k], precision[k] = _prior(xy[k], population)
         start = np.array([shape.parameters for shape in shapes])
-        inner = self._stamp(data, weight, mean, max(map(_half_width, start)))
+        half_widths = np.array([_half_width(parameters) for parameters in start])
+        inner = self._stamp(data, weight, mean, half_widths)
         solution = inner.minimum(start, mean, precision)
         if solution is None:
             return list(shapes), [None] * len(shapes)
@@ -310,19 +311,20 @@ class ShapeFitter(ShapeModels):
         return Shape(np.nan, parameters, population.point, covariance)
 
     def _stamp(self, data, weight, means, half):
-        """Cut out the pixels within some distance of the middles, (n, 6): the rectangle that holds all."""
-        corners = np.round(means[:, :2]).astype(int) - half
-        size = 2 * half + 1
-        (x0, y0) = corners.min(axis=0)
-        x1, y1 = corners.max(axis=0) + size
+        """Cut out the pixels within distances, (n,) or one, of the middles, (n, 6), in a rectangle."""
+        squares = np.empty((len(means), 3), int)
+        squares[:, 2] = 2 * half + 1
+        squares[:, :2] = np.round(means[:, :2]) - np.reshape(half, (-1, 1))
+        x0, y0, _ = squares.min(axis=0)
+        x1, y1 = (squares[:, :2] + squares[:, 2:]).max(axis=0)
         white_inverse = np.zeros((2, y1 - y0, x1 - x0))
-        for x, y in corners:
+        for x, y, size in squares.tolist():
             part = np.s_[max(y, 0) : max(y + size, 0), max(x, 0) : max(x + size, 0)]
             inverse = weight[part]
             at = max(y, 0) - y0, max(x, 0) - x0
             box = np.s_[:, at[0] : at[0] + inverse.shape[0], at[1] : at[1] + inverse.shape[1]]
             white_inverse[box] = data[part] * inverse, inverse
-        return _Stamp(self, self.plan(size), *white_inverse, corners)
+        return _Stamp(self, self.plan(int(squares[:, 2].max())), *white_inverse, squares)
 
 
 @value_class
@@ -331,12 +333,12 @@ class _Stamp:
     plan: Plan
     white: np.ndarray
     inverse: np.ndarray
-    corners: np.ndarray
+    squares: np.ndarray
 
     @property
     def pixels(self):
         """As the kernels take them."""
-        return self.plan, profile_table(), self.white, self.inverse, self.corners
+        return self.plan, profile_table(), self.white, self.inverse, self.squares
 
     @functools.cached_property
     def limits(self):
@@ -372,7 +374,7 @@ class _Stamp:
             parameters = neighbors.parameters[k]
             corner = np.round(parameters[:2]).astype(int) - half
             drawn = self.models.profiles(size, parameters - center_change(corner), 6)
-            middle = (corner - self.corners[0])[::-1] + half
+            middle = (corner - self.squares[0, :2])[::-1] + half
             with contextlib.suppress(NoOverlapError):
                 (y, x), (drawn_y, drawn_x) = overlap_slices(size, size, tuple(middle))
                 image[:, y, x] = drawn[:, drawn_y, drawn_x]
@@ -387,21 +389,25 @@ class _Stamp:
         """
         Calculate shapes about the best as `Population.odds` takes them: likelihood over density, flux, shape.
 
-        The likelihood is that of the best light, center and neighbors: these change along ``beside``, (m, p), the
-        whitened change of their light by the independent unit normal deviates of what is possible.
+        The likelihood is that of the best light, center and neighbors: these change along ``changes``, (m, p), the
+        whitened change of their light by the independent unit normal deviates of what is possible. ``covariance``,
+        (6, 6), is that of center and shape.
         """
         # nodes are drawn from a normal distribution wider than that of the fit
-        root = np.linalg.cholesky(covariance) * _WIDER
+        root = np.linalg.cholesky(covariance[2:, 2:]) * _WIDER
         z = normal_nodes()
         shapes = parameters[2:] + z @ root.T
         shapes[:, 0] = np.clip(shapes[:, 0], np.log(0.05), self.limits[1, 2])
         low, high = np.log(INDEX_RANGE)
         shapes[:, 1] = np.clip(shapes[:, 1], low, high)
+        # the center moves with the shape as their covariance says
+        drift = (shapes - parameters[2:]) @ np.linalg.solve(covariance[2:, 2:], covariance[2:, :2])
         likelihoods = evidence_of(
             *self.pixels,
             parameters[None],
             np.array([flux]),
             shapes,
+            drift,
             mean[None],
             _CENTER[None],
             changes,
