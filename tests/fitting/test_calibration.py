@@ -10,7 +10,7 @@ from numpy.testing import assert_array_less
 from scipy import stats
 
 from helpers.grids import cells, make_grid, node_fitter, photometry_table
-from miricigale.fitting.posterior.posterior import randomized_ranks
+from miricigale.fitting.posterior.posterior import bin_edges, randomized_ranks
 from miricigale.fitting.posterior.quantities import DERIVED_LEVELS
 
 N = 3000
@@ -84,3 +84,12 @@ def test_mass(fitted):
     kept = results.quantiles[:, results.quantities.index("mass")]
     rank = np.array([np.interp(x, row, DERIVED_LEVELS) for x, row in zip(s, kept, strict=True)])
     _check(rank, "mass")
+
+
+@pytest.mark.parametrize("value", [1e-30, 3.0, 1e11, 1e40])
+@pytest.mark.parametrize("log", [False, True])
+def test_bins_of_equal_values_are_narrow_about_them(value, log):
+    edges = bin_edges(np.full(3, value), log=log)
+    assert np.all(np.diff(edges) > 0)
+    assert edges[0] == value
+    assert edges[-1] == pytest.approx(value, rel=2e-6, abs=0)
