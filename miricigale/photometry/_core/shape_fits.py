@@ -67,7 +67,7 @@ def make_plan(size, transform, passed):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _placed(plan, x, y):
     """Move the PSF's transform to a place, (4, ny, nx): its two parts, the real and the imaginary one of each."""
     _, ny, nx = plan.response.shape
@@ -89,7 +89,7 @@ def _placed(plan, x, y):
     return placed
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(fastmath=FAST)
 def _images(plan, curves, placed, n_moved, size):
     """
     Draw images, (size, n, size), of transforms, (n, 2, ny, nx), on a square of at most the plan's size.
@@ -129,7 +129,7 @@ def _images(plan, curves, placed, n_moved, size):
     return images, along_x.reshape(form), along_y.reshape(form)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def draw_curves(plan, curves, x, y, n_derivatives):
     """
     Draw the images of transforms.
@@ -158,7 +158,7 @@ def draw_curves(plan, curves, x, y, n_derivatives):
     return np.concatenate((images[:, :n_moved], along_x, along_y, images[:, n_moved:]), axis=1)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _whiten(images, k, inverse, y, x, column):
     """Write image k of (size, n, size) over the noise into a column: the pixels of a rectangle, from (y, x) on."""
     size = len(images)
@@ -170,7 +170,7 @@ def _whiten(images, k, inverse, y, x, column):
             column[(y + row) * width + x + i] = images[row, k, i] * noise
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _products(plan, table, inverse, squares, parameters, columns):
     """Write whitened models and derivatives into all columns but the last; products of all columns."""
     n = len(parameters)
@@ -232,7 +232,7 @@ def _products(plan, table, inverse, squares, parameters, columns):
     return products
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _state(products, parameters, mean, precision):
     """Return chi^2 with the prior, the best light, and half of the second and (negative) first derivatives."""
     n, m = precision.shape[:2]
@@ -278,7 +278,7 @@ def _state(products, parameters, mean, precision):
     return chi2, flux, matrix, slope
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _step(matrix, slope, parameters, limits, damping):
     """
     Calculate a damped Newton step of light and parameters, (n (1 + m),), and the gain in chi^2 without damping.
@@ -310,7 +310,7 @@ def _step(matrix, slope, parameters, limits, damping):
     return step, gained
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def minimum(plan, table, white, inverse, squares, start, mean, precision, limits, steps, gain):
     """
     Fit the light and the first parameters of sources, with Gaussian priors, after Levenberg and Marquardt.
@@ -412,7 +412,7 @@ def minimum(plan, table, white, inverse, squares, start, mean, precision, limits
     return chi2, flux, parameters, evidence, covariance, matrix
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(fastmath=FAST)
 def _center_products(images, along_x, along_y, s, inverse, white, products):
     """Sum products, (3, 4), of a whitened model and its derivatives to the center with these and the data."""
     aa = ab = ac = ad = bb = bc = bd = cc = cd = 0.0
@@ -437,7 +437,7 @@ def _center_products(images, along_x, along_y, s, inverse, white, products):
     products[2] = (ac, bc, cc, cd)
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def _product(a, b):
     """Sum of the products of two vectors: expressions of whole arrays take seconds to compile."""
     total = 0.0
@@ -446,7 +446,7 @@ def _product(a, b):
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(fastmath=FAST)
 def _image_products(images, s, inverse, white):
     """Sum the squares of a whitened model, and its products with the data."""
     power = 0.0
@@ -459,7 +459,7 @@ def _image_products(images, s, inverse, white):
     return power, projection
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(fastmath=FAST)
 def _steepness(plan, curve):
     """Sum the squares of the slopes of an image over all pixels, by its transform."""
     total = 0.0
@@ -470,7 +470,7 @@ def _steepness(plan, curve):
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def evidence_of(
     plan, table, white, inverse, squares, best, flux, shapes, drift, mean, precision, neighbors
 ):

@@ -52,7 +52,7 @@ def profile_table():
     return scipy.interpolate.CubicSpline(log_n, rows).c
 
 
-@njit(cache=True, nogil=True)
+@njit()
 def profile_of(table, log_n, changes):
     """Return the transform of one index at the nodes, and its derivative to ln n if ``changes`` is True."""
     # the interval of the spline in ln n
@@ -71,7 +71,7 @@ def profile_of(table, log_n, changes):
     return profile
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(fastmath=FAST)
 def fill_curves(kx, ky, shape, table, out):
     """
     Write the transform of a centered Sersic profile of unit light, and its derivatives.
