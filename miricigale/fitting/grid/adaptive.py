@@ -318,11 +318,12 @@ class AdaptiveSampler:
         log = self.evaluated[rows, 0] - np.log(self.density[rows])
         weight = np.exp(np.maximum(log - log.max(), -700.0))
         group = self.peak[rows]
-        chosen = range(len(self.peaks))
+        chosen = np.arange(len(self.peaks))
         if self.pursue:
             group = self._groups(self.label[rows], self.peak[rows])
             share = np.bincount(group, weight, minlength=self.n_groups)
-            chosen = np.flatnonzero(self.pursued | (share > MIN_WEIGHT * share.sum()))
+            number = np.bincount(group, minlength=self.n_groups)
+            chosen = fitted_groups(self.pursued, share, number)
         return Places(
             label=self.label[rows],
             score=self.score[rows],
@@ -539,6 +540,32 @@ class AdaptiveSampler:
         return self._placed(
             place, evaluated, np.concatenate(weight), uniform, sample, converged=False
         )
+
+
+def fitted_groups(pursued, share, number):
+    """
+    Select the labels in peaks whose places parts are fitted to.
+
+    Parameters
+    ----------
+    pursued : `~numpy.ndarray` of bool, shape (n_groups,)
+        Labels that are pursued whatever their weight.
+    share : `~numpy.ndarray`, shape (n_groups,)
+        Weight of each.
+    number : `~numpy.ndarray` of int, shape (n_groups,)
+        Number of its places.
+
+    Returns
+    -------
+    groups : `~numpy.ndarray` of int
+        Those that are pursued or have weight. If none of them has places enough to show a shape, all that have:
+        wide parts beside theirs bring places to the others.
+    """
+    chosen = np.flatnonzero(pursued | (share > MIN_WEIGHT * share.sum()))
+    has_shape = number >= _MIN_FITTED_PLACES
+    if has_shape[chosen].any():
+        return chosen
+    return np.flatnonzero(has_shape)
 
 
 def _with_columns(table, n):
