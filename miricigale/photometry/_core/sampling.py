@@ -74,7 +74,7 @@ def _quintic(position, node, weight):
         weight[5, i] = t**5 / 120.0
 
 
-#: Fine pixels by which rows and columns of the image may be bent or turned and still count as those of the fine grid.
+#: Fine pixels by which rows and columns may be bent or turned and still count as those of the fine grid.
 _STRAIGHT = 1e-6
 
 
