@@ -505,8 +505,10 @@ def test_a_catalog_is_calibrated_by_its_known_redshifts(tmp_path, capsys, monkey
         assert main(fit(tmp_path / "some.fits", *kept, *options, out=out)) == 0
     narrow, wide = (next(iter(open_results(tmp_path / out).parts())) for out in ("between", "agn"))
     assert wide.meta["fit"]["agn_error"] == 0.5
-    spread = [np.nanmean(some.std("frac_agn").value) for some in (narrow, wide)]
-    assert spread[1] > 1.03 * spread[0]
+    # of each object: a mean is that of the few whose fractions are least certain
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = wide.std("frac_agn").value / narrow.std("frac_agn").value
+    assert np.median(ratio[np.isfinite(ratio)]) > 1.03
 
 
 def test_the_sentence_at_the_end_has_the_reason_of_objects_without_a_fit():
