@@ -318,12 +318,12 @@ class AdaptiveSampler:
         log = self.evaluated[rows, 0] - np.log(self.density[rows])
         weight = np.exp(np.maximum(log - log.max(), -700.0))
         group = self.peak[rows]
-        chosen = np.arange(len(self.peaks))
+        is_wanted = np.ones(len(self.peaks), bool)
         if self.pursue:
             group = self._groups(self.label[rows], self.peak[rows])
             share = np.bincount(group, weight, minlength=self.n_groups)
-            number = np.bincount(group, minlength=self.n_groups)
-            chosen = fitted_groups(self.pursued, share, number)
+            is_wanted = self.pursued | (share > MIN_WEIGHT * share.sum())
+        chosen = fitted_groups(is_wanted, np.bincount(group, minlength=is_wanted.size))
         return Places(
             label=self.label[rows],
             score=self.score[rows],
@@ -445,8 +445,6 @@ class AdaptiveSampler:
         flat = np.zeros(self.n)
         for j in chosen:
             rows = np.flatnonzero(group == j)
-            if rows.size < _MIN_FITTED_PLACES:
-                continue
             flat_weight = np.empty(rows.size)
             power, _ = _core.flatten(log[rows], min(float(n_flat), 0.5 * rows.size), flat_weight)
             flat[rows] = flat_weight / flat_weight.sum()
@@ -542,30 +540,27 @@ class AdaptiveSampler:
         )
 
 
-def fitted_groups(pursued, share, number):
+def fitted_groups(is_wanted, number):
     """
-    Select the labels in peaks whose places parts are fitted to.
+    Select the groups of places, such as labels in peaks, that parts are fitted to.
 
     Parameters
     ----------
-    pursued : `~numpy.ndarray` of bool, shape (n_groups,)
-        Labels that are pursued whatever their weight.
-    share : `~numpy.ndarray`, shape (n_groups,)
-        Weight of each.
+    is_wanted : `~numpy.ndarray` of bool, shape (n_groups,)
+        Groups that have weight, or that are pursued whatever their weight.
     number : `~numpy.ndarray` of int, shape (n_groups,)
-        Number of its places.
+        Number of places of each.
 
     Returns
     -------
     groups : `~numpy.ndarray` of int
-        Those that are pursued or have weight. If none of them has places enough to show a shape, all that have:
-        wide parts beside theirs bring places to the others.
+        Those that are wanted and have places enough to show a shape. If there are none, the wanted ones with any
+        place, whose parts have the shape of all places, and the others that show one.
     """
-    chosen = np.flatnonzero(pursued | (share > MIN_WEIGHT * share.sum()))
     has_shape = number >= _MIN_FITTED_PLACES
-    if has_shape[chosen].any():
-        return chosen
-    return np.flatnonzero(has_shape)
+    if np.any(is_wanted & has_shape):
+        return np.flatnonzero(is_wanted & has_shape)
+    return np.flatnonzero((is_wanted | has_shape) & (number > 0))
 
 
 def _with_columns(table, n):
