@@ -1,14 +1,11 @@
 """Tables in FITS files: what astropy reads otherwise than the file means it, and types that FITS does not have."""
 
+import io
 import warnings
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import Column, MaskedColumn, Table
-from astropy.table.meta import get_yaml_from_table
-from astropy.table.serialize import represent_mixins_as_columns
-from astropy.time import Time
-from astropy.utils.data_info import serialize_context_as
+from astropy.table import Column, MaskedColumn
 from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.exceptions import CatalogWarning, warn
@@ -19,8 +16,6 @@ from miricigale.utils.options import check_that
 LDAC_HEADER = "LDAC_IMHEAD"
 #: What astropy writes for a missing integer, if the column has no such number.
 _NULL = 999999
-#: Characters of a comment of what astropy knows of a column.
-_COMMENT = 70
 #: Types that FITS does not have, or takes for truth values, by what stands for them.
 FITS_TYPES = {np.dtype(np.int8): np.int16, np.dtype(np.float16): np.float32}
 
@@ -133,56 +128,13 @@ def table_hdu(table):
     """Binary table of a table with any columns that astropy has; its meta as `fits_meta` has it."""
     table = fits_ready(table)
     table.meta = fits_meta(table.meta)
-    return described_hdu(table)
-
-
-def described_hdu(table):
-    """
-    Binary table of a table that `fits_ready` prepared, the same as astropy writes.
-
-    Descriptions and classes of columns are comments, as astropy has them. It inserts them one by one into a
-    header that it indexes anew each time, which takes most of its time where there are hundreds of columns.
-
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        Of columns that FITS can hold, as its meta is.
-
-    Returns
-    -------
-    hdu : `~astropy.io.fits.BinTableHDU`
-    """
-    plain, comments = _plain_columns(table)
+    stream = io.BytesIO()
     with warnings.catch_warnings():
         # units such as dex are kept for astropy, and in the descriptions
         warnings.filterwarnings("ignore", "The unit .* could not be saved", AstropyUserWarning)
-        hdu = fits.table_to_hdu(plain, character_as_bytes=True)
-    for comment in comments:
-        hdu.header.append(("COMMENT", comment), end=True)
-    return hdu
-
-
-def _plain_columns(table):
-    """A table whose columns are no quantities or positions, and the comments that tell astropy what they were."""
-    with serialize_context_as("fits"):
-        # FITS has columns of times of its own
-        plain = represent_mixins_as_columns(table, exclude_classes=(Time,))
-    infos = [column.info for column in table.itercols()]
-    if plain is table and not any(info.description or info.meta for info in infos):
-        return table, []
-    meta = dict(plain.meta)
-    serialized = meta.pop("__serialized_columns__", {})
-    plain = Table(plain.columns, meta=meta, copy=False)
-    described = Table(plain.columns, meta={"__serialized_columns__": serialized}, copy=False)
-    comments = ["--BEGIN-ASTROPY-SERIALIZED-COLUMNS--"]
-    for line in get_yaml_from_table(described):
-        starts = range(0, max(1, len(line)), _COMMENT)
-        pieces = [line[start : start + _COMMENT] for start in starts]
-        # all but the last say that they go on
-        comments += [piece + "\\" for piece in pieces[:-1]]
-        comments.append(pieces[-1])
-    comments.append("--END-ASTROPY-SERIALIZED-COLUMNS--")
-    return plain, comments
+        table.write(stream, format="fits")
+    stream.seek(0)
+    return fits.open(stream)[1]
 
 
 def fits_ready(table):

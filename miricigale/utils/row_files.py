@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import warnings
 from functools import cached_property
 from pathlib import Path
 
@@ -18,7 +19,6 @@ from miricigale.utils.files import open_fits, reading, replacing, split_extensio
 from miricigale.utils.fits_tables import (
     LDAC_HEADER,
     check_names_differ,
-    described_hdu,
     fits_ready,
     mask_scaled_nulls,
     names_in_header,
@@ -28,9 +28,6 @@ from miricigale.utils.meta import plain_value
 from miricigale.utils.optional_packages import require
 from miricigale.utils.table_files import read_table
 from miricigale.utils.units import check_count
-
-#: Bytes in a block of a FITS file.
-_BLOCK = 2880
 
 
 def open_rows(path, chunk_rows, *, hdu=None, id_names=()):
@@ -310,7 +307,7 @@ def _write_fits(path, tables, n_rows):
                 stream.write(headers.encode("ascii"))
             _check_same(layout, columns)
             n_bytes += stream.write(rows)
-        stream.write(bytes(-n_bytes % _BLOCK))
+        stream.write(bytes(-n_bytes % 2880))
 
 
 def _check_same(layout, columns):
@@ -332,12 +329,14 @@ def _fits_rows(table):
             table.meta[key] = value
         else:
             table.meta[key] = json.dumps(value, default=plain_value)
-    hdu = described_hdu(fits_ready(table))
-    stream = io.BytesIO()
-    hdu.writeto(stream)
-    header = hdu.header
-    n_bytes = header["NAXIS1"] * header["NAXIS2"]
-    data = stream.getvalue()
-    # the last blocks are full
-    start = len(data) - n_bytes - (-n_bytes % _BLOCK)
-    return header, data[start : start + n_bytes]
+    file = io.BytesIO()
+    table = fits_ready(table)
+    with warnings.catch_warnings():
+        # FITS does not know dex; astropy does when it reads the table
+        warnings.filterwarnings("ignore", "The unit 'dex' could not be saved in native FITS")
+        table.write(file, format="fits")
+    data = file.getvalue()
+    with fits.open(io.BytesIO(data)) as hdus:
+        header = hdus[1].header.copy()
+        start = hdus[1].fileinfo()["datLoc"]
+    return header, data[start : start + header["NAXIS1"] * header["NAXIS2"]]

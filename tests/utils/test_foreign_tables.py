@@ -2,24 +2,19 @@
 
 import bz2
 import gzip
-import io
 import lzma
 import warnings
 import zipfile
 
-import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.io.votable import from_table
 from astropy.table import MaskedColumn, QTable, Table
-from astropy.time import Time
-from astropy.utils.exceptions import AstropyUserWarning
 
 from helpers.errors import refuses, warned
 from miricigale.utils.exceptions import CatalogWarning, DataError
-from miricigale.utils.fits_tables import described_hdu, fits_ready
 from miricigale.utils.positions import as_positions
 from miricigale.utils.row_files import open_rows, write_rows
 from miricigale.utils.table_files import read_table, write_table
@@ -135,29 +130,6 @@ def test_missing_values_are_missing_after_writing_and_no_others(name, tmp_path):
     # what is written is a copy
     assert table["true"].dtype == bool
     assert table["whole"][0] == 999999
-
-
-def test_tables_of_all_kinds_of_columns_are_written_as_astropy_writes_them():
-    """The same bytes: units, descriptions of up to three comments, classes, missing values, meta."""
-    table = QTable(nullable())
-    for n in (0, 1, 69, 70, 71, 140, 180):
-        table[f"flux_{n}"] = [1.0, 2.0, 3.0] * u.uJy
-        table[f"flux_{n}"].info.description = "d" * n
-    table["sky"] = SkyCoord([1.0, 2.0, 3.0] * u.deg, [1.0, 2.0, 3.0] * u.deg)
-    table["when"] = Time([50000.0, 50001.0, 50002.0], format="mjd")
-    table["pdf"] = np.arange(6.0).reshape(3, 2)
-    table["heat"] = [1.0, 2.0, 3.0] * u.dex(u.K)
-    table.meta = {"N": 3, "NAME": "a catalog"}
-    plain = Table({"id": [1, 2], "flux": [1.0, 2.0]})
-    for one in (table, plain):
-        ready = fits_ready(one)
-        wanted, found = io.BytesIO(), io.BytesIO()
-        with warnings.catch_warnings():
-            # dex is no unit of FITS
-            warnings.simplefilter("ignore", AstropyUserWarning)
-            ready.write(wanted, format="fits")
-        described_hdu(ready).writeto(found)
-        assert found.getvalue() == wanted.getvalue()
 
 
 def test_a_column_of_all_bytes_has_no_null_value(tmp_path):
