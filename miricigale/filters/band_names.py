@@ -99,6 +99,19 @@ def curves_of_band(band):
     return [name for name in sorted(names) if re.split("[._]", name)[-1].lower() == band.lower()]
 
 
+def unknown_filter(name):
+    """Make the `KeyError` of a name that no filter has: cameras that have such a band, or the nearest names."""
+    with_cameras = curves_of_band(name)
+    if with_cameras:
+        msg = f"no filter {name!r} without its camera: {', '.join(with_cameras)}"
+        return KeyError(msg)
+    camera = name.lower()
+    if any(filter_name.startswith(f"{camera}.") for filter_name in FILTERS.names()):
+        msg = f"no filter {name!r}, which is a camera: FilterSet('{camera}.*') has its filters"
+        return KeyError(msg)
+    return unknown_name("filter", name, FILTERS.names())
+
+
 def name_and_unit(text):
     """
     Take the unit off the end of the name of a column.

@@ -9,12 +9,12 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters import _core
-from miricigale.filters.band_names import curves_of_band, find_filter
+from miricigale.filters.band_names import find_filter, unknown_filter
 from miricigale.filters.curve_files import read_curve
 from miricigale.filters.library import FILTERS, load_curve
 from miricigale.filters.spectra import check_wave, spectrum_arrays
 from miricigale.utils.caching import cached, cached_property
-from miricigale.utils.exceptions import argument_error, data_error, unknown_name
+from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
@@ -189,15 +189,7 @@ class Filter(Frozen, Interactive):
         """
         full_name = find_filter(str(name))
         if full_name is None and not str(name).startswith("sedpy."):
-            cameras = curves_of_band(str(name))
-            if cameras:
-                msg = f"no filter {name!r} without its camera: {', '.join(cameras)}"
-                raise KeyError(msg)
-            camera = f"{name}".lower()
-            if any(known.startswith(f"{camera}.") for known in FILTERS.names()):
-                msg = f"no filter {name!r}, which is a camera: FilterSet('{camera}.*') has its filters"
-                raise KeyError(msg)
-            raise unknown_name("filter", name, FILTERS.names())
+            raise unknown_filter(str(name))
         return _from_name(full_name or str(name))
 
     @staticmethod
