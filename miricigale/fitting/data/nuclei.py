@@ -171,10 +171,8 @@ def read_nuclei(table, columns, data, reader):
 
     Raises
     ------
-    ValueError
-        If a column holds something else than numbers.
-    `~astropy.units.UnitsError`
-        If a flux has no unit of flux density, or a correlation has a unit.
+    ValueError, `~astropy.units.UnitsError`
+        As `nucleus_table`.
     """
     n = len(table)
     values = np.zeros((n, len(columns.bands), 4))
