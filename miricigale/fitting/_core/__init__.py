@@ -6,7 +6,8 @@ model that can matter are listed by their bounds (`pairs`, down to those of `flo
 (`batched_pairs`, `single` in single precision, `limits` with upper limits) and summed up (`sums`, `histogram`);
 `summarize` turns the sums into moments and quantiles. `weigh_masses` (`masses`) puts a prior of mass in,
 `find_models` (`mixture`) finds wrong bands. `interpolate_light` (`interpolation`) and `evaluate_places`
-(`population`, `nuclei`, `importance`) are of models between nodes, `allocation` says where more are wanted.
+(`population`, `nuclei`, `importance`) are of models between nodes, `part_fits` fits what proposes them, and
+`allocation` says where more are wanted.
 `structs` says what the kernels take and where it stands there, `workspace` makes it.
 """
 
@@ -24,13 +25,7 @@ from miricigale.fitting._core.importance import (
     Labels,
     Parts,
     add_density,
-    add_local_parts,
-    add_widest,
     evaluate_places,
-    fit_groups,
-    fit_parts,
-    flatten,
-    mean_and_cov,
     propose,
 )
 from miricigale.fitting._core.interpolation import (
@@ -44,6 +39,14 @@ from miricigale.fitting._core.interpolation import (
 from miricigale.fitting._core.masses import weigh_masses
 from miricigale.fitting._core.mixture import find_models
 from miricigale.fitting._core.nuclei import Nuclei
+from miricigale.fitting._core.part_fits import (
+    add_local_parts,
+    add_widest,
+    fit_groups,
+    fit_parts,
+    flatten,
+    mean_and_cov,
+)
 from miricigale.fitting._core.population import NEVER, Masses, Mixture, Object, Space
 from miricigale.fitting._core.scan import (
     TOGETHER,
