@@ -4,7 +4,7 @@ from miricigale.cli.catalogs import fit_options, fit_workers
 from miricigale.cli.options import filled
 
 #: CPU-seconds of a fit of an object as a galaxy, and as each other class.
-_SECONDS = 0.15
+_SECONDS = 0.1
 
 
 def agn(args):
