@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from miricigale.filters import FilterSet
 from miricigale.sed import _core
@@ -116,6 +117,7 @@ class Chain:
         if tuple(span) != INFRARED:
             self.functionals = np.concatenate([self.functionals, [self._light_in(span)]])
             self.reference_row = -1
+        self._sparse_functionals = csr_array(self.functionals)
         self._names = {
             role: tuple(part.parameters) if part else () for role, part in self.by_role.items()
         }
@@ -373,6 +375,11 @@ class Chain:
     def reference(self, spectrum):
         """Integral of L_lambda over the range that AGN fractions refer to, along the last axis."""
         return spectrum @ self.functionals[self.reference_row]
+
+    def functional_sums(self, spectra):
+        """Sums over spectra L_lambda, (n, n_wave), with ``functionals``: (n, n_functional)."""
+        # most weights are 0; and threads of the linear algebra would cost more than they gain
+        return (self._sparse_functionals @ np.ascontiguousarray(spectra.T)).T
 
     def lnu(self, spectrum):
         """L_nu in W/Hz from L_lambda in W/um."""

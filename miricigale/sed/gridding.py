@@ -5,12 +5,14 @@ from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
+from scipy.sparse import csr_array, vstack
 
 from miricigale.sed.chain import GALAXY_ROLES, STELLAR, distinct
 from miricigale.sed.derived import DERIVED, galaxy_quantities
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import BLOCK, dilution, seen_agn
+from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ModelWarning, argument_error, unknown_name, warn
 from miricigale.utils.missing_values import own_mask
 from miricigale.utils.named_values import subset, without
@@ -18,6 +20,8 @@ from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import WAVE, is_ascending
 
+#: Largest number of bands whose weights are kept, each at the redshifts of one table: some 200 kB each.
+_MAX_BANDS = 256
 #: Roles whose parameters shape the galaxy.
 _COLD = 30.0  # um at rest, beyond which dust heated by the mean field shines
 
@@ -86,39 +90,139 @@ def _parameter_table(parameters, rows):
     return described_table(columns)
 
 
-class Galaxies:
-    """Galaxies of a grid: their different attenuated starlight and dust."""
+class Starlight:
+    """
+    Starlight behind dust of many galaxies, each different one worked out once.
 
-    def __init__(self, model, rows):
-        chain = self.chain = model.chain
-        excess = [row.get("dust_excess", 1.0) for row in rows]
+    Parameters
+    ----------
+    chain : `~miricigale.sed.chain.Chain`
+    rows : list of dict
+        Values of all parameters of each galaxy.
+
+    Attributes
+    ----------
+    stars : `~miricigale.sed.chain.Stars`
+    star_rows, light_rows : `~numpy.ndarray` of int, shape (n,)
+        Which of the stars, and of the different galaxies, each galaxy has.
+    """
+
+    def __init__(self, chain, rows):
+        self.chain = chain
         self.stars, self.star_rows = chain.stars(chain.keys(rows, STELLAR))
         dims = chain.keys(rows, "attenuation")
-        dusts = chain.keys(rows, "dust")
-        # many galaxies: their spectra are in memory once
-        pairs, self.light_rows = distinct(zip(self.star_rows.tolist(), dims, strict=True))
-        self.starlight = np.empty((len(pairs), chain.wave.size))
-        absorbed = np.empty(len(pairs))
-        for first in range(0, len(pairs), BLOCK):
+        self._pairs, self.light_rows = distinct(zip(self.star_rows.tolist(), dims, strict=True))
+
+    def sums(self, functions):
+        """
+        Sums over the spectra of every galaxy, a block at a time: all spectra would not fit into the cache.
+
+        Parameters
+        ----------
+        functions : list of callable
+            Each gives the sums, shape (n_block, ...), of spectra L_lambda in W/um, shape (n_block, n_wave).
+
+        Returns
+        -------
+        sums : list of `~numpy.ndarray`, shape (n, ...)
+        absorbed : `~numpy.ndarray`, shape (n,)
+            Power in W that dust takes.
+        """
+        n = len(self._pairs)
+        scratch = np.empty((BLOCK, self.chain.wave.size))
+        absorbed = np.empty(n)
+        sums = [None for _ in functions]
+        for first in range(0, n, BLOCK):
             part = slice(first, first + BLOCK)
-            rows, keys = zip(*pairs[part], strict=True)
-            out = self.starlight[part]
-            _, absorbed[part] = chain.attenuated(self.stars, np.array(rows), keys, out=out)
-        dusts, self.dust_rows = distinct(dusts)
-        self.dust = chain.dusts(dusts)
-        self.absorbed = absorbed[self.light_rows] * excess
+            rows, keys = zip(*self._pairs[part], strict=True)
+            spectra = scratch[: len(rows)]
+            _, absorbed[part] = self.chain.attenuated(self.stars, np.array(rows), keys, out=spectra)
+            for k, function in enumerate(functions):
+                of_block = function(spectra)
+                if sums[k] is None:
+                    sums[k] = np.empty((n,) + of_block.shape[1:])
+                sums[k][part] = of_block
+        if n < len(self.light_rows):
+            sums = [of_different[self.light_rows] for of_different in sums]
+            absorbed = absorbed[self.light_rows]
+        return sums, absorbed
 
-    def sums(self, weights):
-        """Sums over the light of every galaxy for weights of shape (n_wave, n)."""
-        out = (self.starlight @ weights)[self.light_rows]
-        out += self.absorbed[:, None] * (self.dust @ weights)[self.dust_rows]
-        return out
 
-    def quantities(self):
-        """Derived quantities: dict of arrays, one value for each galaxy."""
-        sums = self.sums(self.chain.functionals.T)
-        row = self.chain.reference_row
-        return galaxy_quantities(self.stars, self.star_rows, self.absorbed, sums, row)
+class BandSums:
+    """
+    Sums over rest-frame spectra that give fluxes in bands at some redshifts.
+
+    Parameters
+    ----------
+    model : `~miricigale.sed.SEDModel`
+    values : dict
+        Values of all parameters of what lies between the source and us.
+    filters : `~miricigale.filters.FilterSet`
+    redshift : `~numpy.ndarray`, shape (nz,)
+    """
+
+    def __init__(self, model, values, filters, redshift):
+        self.shape = len(filters), len(redshift)
+        chain = model.chain
+        far = distance(redshift, model.cosmology)
+        factor = np.empty((len(redshift), chain.wave.size))
+        for i, z in enumerate(redshift):
+            sky = chain.sky(values | {"redshift": float(z)})
+            factor[i] = sky * chain.to_lnu * dilution(z, far[i])
+        wave = chain.wave.tobytes()
+        stretch = (1.0 + np.asarray(redshift, float)).tobytes()
+        weights = []
+        for band in filters:
+            of_band = csr_array(_sparse_weights(band, wave, stretch), shape=factor.shape)
+            weights.append(of_band.multiply(factor))
+        # a band sees few of the wavelengths
+        self.weights = vstack(weights, format="csr")
+
+    def __call__(self, spectra):
+        """Fluxes in uJy, shape (n, nz, nb), of spectra L_lambda in W/um, shape (n, n_wave)."""
+        flux = np.empty((len(spectra),) + self.shape[::-1])
+        for first in range(0, len(spectra), BLOCK):
+            part = slice(first, first + BLOCK)
+            sums = self.weights @ np.ascontiguousarray(spectra[part].T)
+            flux[part] = sums.reshape(self.shape + (-1,)).T
+        return flux
+
+
+@cached(maxsize=_MAX_BANDS)
+def _sparse_weights(band, wave, stretch):
+    """
+    Weights of a filter for rest wavelengths, times each of some factors; further models need them again.
+
+    Wavelengths and factors are bytes of their arrays. Returned is what `scipy.sparse.csr_array` makes the weights
+    of, shape (n_factor, n_wave).
+    """
+    wave = np.frombuffer(wave)
+    factors = np.frombuffer(stretch)
+    weights = np.empty((factors.size, wave.size))
+    for row, factor in zip(weights, factors, strict=True):
+        row[:] = band.weights(wave * factor)
+    sparse = csr_array(weights)
+    return sparse.data, sparse.indices, sparse.indptr
+
+
+class Galaxies:
+    """Galaxies of a grid: sums over their light."""
+
+    def __init__(self, model, rows, band_sums):
+        chain = model.chain
+        excess = [row.get("dust_excess", 1.0) for row in rows]
+        starlight = Starlight(chain, rows)
+        (flux, sums), absorbed = starlight.sums([band_sums, chain.functional_sums])
+        dusts, dust_rows = distinct(chain.keys(rows, "dust"))
+        dust = chain.dusts(dusts)
+        self.absorbed = absorbed * excess
+        #: Fluxes in uJy of one solar mass formed, shape (n, nz, nb).
+        self.flux = flux + self.absorbed[:, None, None] * band_sums(dust)[dust_rows]
+        sums = sums + self.absorbed[:, None] * chain.functional_sums(dust)[dust_rows]
+        #: Derived quantities: dict of arrays, one value for each galaxy.
+        self.quantities = galaxy_quantities(
+            starlight.stars, starlight.star_rows, self.absorbed, sums, chain.reference_row
+        )
 
 
 def _galaxy_tables(quantities):
@@ -180,8 +284,9 @@ def model_grid(model, axes, filters):
     rows = _products(of_galaxy, axes)
     defaults = model.defaults
     _refuse_invalid(model, [defaults | row for row in rows], GALAXY_ROLES)
-    galaxies = Galaxies(model, rows)
-    quantities = galaxies.quantities()
+    band_sums = BandSums(model, defaults, filters, redshift)
+    galaxies = Galaxies(model, rows, band_sums)
+    quantities = galaxies.quantities
     properties, shape = _galaxy_tables(quantities)
 
     nuclei = {}
@@ -202,21 +307,15 @@ def model_grid(model, axes, filters):
         }
     dusty = model.frac_agn_definition == "dust"
 
-    galaxy = np.empty((redshift.size, len(rows), len(filters)))
-    agn = np.empty((redshift.size, len(agn_spectra), len(filters)))
-    far = distance(redshift, model.cosmology)
-    for i, z in enumerate(redshift):
-        sky = chain.sky(defaults | {"redshift": float(z)})
-        weights = (filters.weights(chain.wave * (1.0 + z)) * sky).T * dilution(z, far[i])
-        galaxy[i] = galaxies.sums(weights * chain.to_lnu[:, None])
-        agn[i] = agn_spectra @ weights
+    # these are L_nu, and the sums take L_lambda
+    agn = band_sums(agn_spectra / chain.to_lnu)
     age = np.array([row["age"] for row in rows])
     universe = model.cosmology.age(redshift).to_value(u.Gyr)
     return ModelGrid(
         filters=filters.names,
         redshift=redshift,
-        galaxy=galaxy,
-        agn=agn,
+        galaxy=np.ascontiguousarray(np.moveaxis(galaxies.flux, 1, 0)),
+        agn=np.ascontiguousarray(np.moveaxis(agn, 1, 0)),
         dust_luminosity=galaxies.absorbed if dusty else quantities["reference"],
         allowed=age[None, :] <= universe[:, None],
         galaxy_parameters=_parameter_table(of_galaxy, rows),

@@ -7,22 +7,16 @@ Each part depends on a few parameters only, so that each can be tabulated much m
 """
 
 import numpy as np
-from scipy.sparse import csr_array, vstack
 
 from miricigale.sed.chain import STELLAR, VISUAL, Stars
 from miricigale.sed.derived import galaxy_quantities
-from miricigale.sed.gridding import Galaxies, agn_table
-from miricigale.sed.spectrum import distance
-from miricigale.sed.tables import dilution
-from miricigale.utils.named_values import without
+from miricigale.sed.gridding import BandSums, Starlight, agn_table
 from miricigale.utils.values import value_class
 
 #: Time spans in Gyr over which star-formation rates are averaged, by quantity.
 RATE_SPANS = {"sfr_10myr": 0.01, "sfr_100myr": 0.1}
 #: Years in a Gyr.
 _YEARS = 1e9
-#: Spectra whose sums are made together: they fit into the processor's cache.
-_BLOCK = 128
 #: First columns of `LightParts.starlight`, before the sums over the light.
 _STELLAR_COLUMNS = (
     "stellar_mass",
@@ -53,41 +47,6 @@ class PartTable:
 
     flux: np.ndarray
     columns: np.ndarray
-
-
-class BandSums:
-    """
-    Sums over rest-frame spectra that give fluxes in bands at some redshifts.
-
-    Parameters
-    ----------
-    model : `~miricigale.sed.SEDModel`
-    values : dict
-        Values of all parameters of what lies between the source and us.
-    filters : `~miricigale.filters.FilterSet`
-    redshift : `~numpy.ndarray`, shape (nz,)
-    """
-
-    def __init__(self, model, values, filters, redshift):
-        chain = model.chain
-        far = distance(redshift, model.cosmology)
-        self.shape = len(redshift), len(filters)
-        weights = []
-        for z, distance_z in zip(redshift, far, strict=True):
-            sky = chain.sky(values | {"redshift": float(z)})
-            factor = sky * chain.to_lnu * dilution(z, distance_z)
-            weights.append(csr_array(filters.weights(chain.wave * (1.0 + z)) * factor))
-        # a band sees few of the wavelengths
-        self.weights = vstack(weights, format="csr")
-
-    def __call__(self, spectra):
-        """Fluxes in uJy, shape (n, nz, nb), of spectra L_lambda in W/um, shape (n, n_wave)."""
-        flux = np.empty((len(spectra),) + self.shape)
-        for first in range(0, len(spectra), _BLOCK):
-            part = slice(first, first + _BLOCK)
-            sums = self.weights @ np.ascontiguousarray(spectra[part].T)
-            flux[part] = sums.T.reshape((-1,) + self.shape)
-        return flux
 
 
 class LightParts:
@@ -134,10 +93,11 @@ class LightParts:
             them, sums over the light with ``Chain.functionals``, and last the power in W that dust takes.
         """
         values = self._rows(rows)
-        galaxies = self._galaxies(values)
-        spectra = galaxies.starlight[galaxies.light_rows]
-        stars = galaxies.stars
-        of_row = galaxies.star_rows
+        starlight = Starlight(self.model.chain, values)
+        functions = [self.sums, self.model.chain.functional_sums]
+        (flux, functionals), absorbed = starlight.sums(functions)
+        stars = starlight.stars
+        of_row = starlight.star_rows
         columns = {name: getattr(stars, name)[of_row] for name in _STELLAR_COLUMNS[:5]}
         age = np.array([row["age"] for row in values])
         for name, span in RATE_SPANS.items():
@@ -151,25 +111,20 @@ class LightParts:
             without_gas = without_gas - stars.nebular_young[:, at] - stars.nebular_old[:, at]
         columns["visual_stars"] = without_gas[of_row]
         columns["visual_age"] = (without_gas * stars.age_light)[of_row]
-        functionals = spectra @ self.model.chain.functionals.T
         parts = [np.array([columns[name] for name in _STELLAR_COLUMNS]).T, functionals]
-        parts.append(galaxies.absorbed[:, None])
-        return PartTable(self.sums(spectra), np.concatenate(parts, axis=1))
+        parts.append(absorbed[:, None])
+        return PartTable(flux, np.concatenate(parts, axis=1))
 
     def absorbed(self, rows):
         """Power in W that dust takes from the starlight of one solar mass formed, shape (n,)."""
-        return self._galaxies(self._rows(rows)).absorbed
-
-    def _galaxies(self, values):
-        # the dust's excess over energy balance is a factor of its light, not of what it takes
-        without_excess = [without(row, ["dust_excess"]) for row in values]
-        return Galaxies(self.model, without_excess)
+        _, absorbed = Starlight(self.model.chain, self._rows(rows)).sums([])
+        return absorbed
 
     def dust(self, rows):
         """Dust for one watt; the columns are sums over its light with ``Chain.functionals``: `PartTable`."""
         chain = self.model.chain
         spectra = chain.dusts([chain.key(row, "dust") for row in self._rows(rows)])
-        return PartTable(self.sums(spectra), spectra @ chain.functionals.T)
+        return PartTable(self.sums(spectra), chain.functional_sums(spectra))
 
     def agn(self, rows):
         """AGN for one watt of what AGN fractions refer to; the columns are its properties: `PartTable`."""

@@ -44,6 +44,11 @@ ARGUMENTS = {
     "sed.components.parametric_torus._gauss": (4,),
     "sed.components.attenuation._exponents": (WAVE, "calzetti"),
     "sed.components.agn._polar_grid": (WAVE, "smc"),
+    "sed.gridding._sparse_weights": (
+        Filter.from_name("miri.f770w"),
+        np.geomspace(1.0, 20.0, 300).tobytes(),
+        np.array([1.0, 1.5]).tobytes(),
+    ),
     "sed.foreground._table": ("G23", 3.1),
     "sed.tables._cigale_parameters": (("tau", "age"), True),
     "fitting.grid.points.quasi_random": (3, 6, 1),

@@ -27,12 +27,16 @@ _MAX_HALVINGS = 6
 
 def logarithms(flux, columns, redshift):
     """Return ln of fluxes (n, nz, nb) times z^2, and of columns (n, k), as one table (n, nz, nb + k)."""
+    n_bands = flux.shape[2]
+    table = np.empty(flux.shape[:2] + (n_bands + columns.shape[1],))
+    # large tables: worked out where they stay
+    log_flux = table[..., :n_bands]
     top = flux.max(axis=-1, keepdims=True, initial=0.0)
-    log_flux = np.log(np.maximum(flux, np.maximum(_DARK * top, LEAST)))
+    np.maximum(flux, np.maximum(_DARK * top, LEAST), out=log_flux)
+    np.log(log_flux, out=log_flux)
     log_flux += 2.0 * np.log(np.maximum(redshift, 1e-6))[None, :, None]
-    log_columns = np.log(np.maximum(columns, LEAST))
-    log_columns = np.repeat(log_columns[:, None], len(redshift), axis=1)
-    return np.concatenate([log_flux, log_columns], axis=2)
+    table[..., n_bands:] = np.log(np.maximum(columns, LEAST))[:, None]
+    return table
 
 
 def to_scale(value, power):
@@ -113,8 +117,10 @@ def _single(table):
     offset = np.zeros(table.shape[-1])
     if table.size:
         offset = 0.5 * (table.min(axis=(0, 1)) + table.max(axis=(0, 1)))
-    by_redshift = np.moveaxis(table - offset, 0, 1)
-    return np.ascontiguousarray(by_redshift, np.float32), offset
+    n_models, n_z, n_columns = table.shape
+    single = np.empty((n_z, n_models, n_columns), np.float32)
+    np.subtract(np.moveaxis(table, 0, 1), offset, out=single, casting="same_kind")
+    return single, offset
 
 
 def empty_part(n_columns):
