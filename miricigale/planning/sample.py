@@ -22,8 +22,10 @@ from miricigale.workflow.stages.truth import (
     other_skies,
 )
 
-#: Sources whose AGN are drawn: those of some 200 pointings. AGN of others than the sample stand in it, too.
-_DRAWS = 76000
+#: Largest number of galaxies whose AGN are drawn in other skies, those of some 200 pointings, and of these skies:
+#: as many AGN as make the error of the completeness smaller than those that follow from the sample itself.
+_MAX_DRAWS = 76000
+_MAX_SKIES = 75
 #: Stellar populations may not be older than the universe: the fit's ages, Gyr, are cut to this share.
 _AGE_SHARE = 0.95
 
@@ -91,7 +93,7 @@ def make_sample(config, bands, *, executor=None):
         agn = "field"
         band = next(iter(bands))
         add_field_agn(sources, model, band, seed)
-        n_other = _DRAWS // len(sources)
+        n_other = min(_MAX_DRAWS // len(sources), _MAX_SKIES)
         n_skies += n_other
         limit = config.agn.limit
         others, _ = other_skies(sources, model, band, n_other, min_frac_agn=limit, seed=seed)
