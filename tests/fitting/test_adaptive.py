@@ -1,6 +1,7 @@
 """Adaptive importance sampling between nodes, against closed forms and sums over many models of the prior."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import astropy.units as u
 import numpy as np
@@ -15,7 +16,11 @@ from miricigale.fitting import BayesFitter, FitFlags, GridSettings, _core
 from miricigale.fitting.grid.adaptive import fitted_groups
 from miricigale.fitting.grid.peaks import redshift_peaks
 from miricigale.fitting.grid.points import quasi_random
-from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, draws_summary
+from miricigale.fitting.posterior.quantities import (
+    DERIVED_LEVELS,
+    draws_summary,
+    percentile_error,
+)
 from miricigale.sed import ModelGrid
 
 BANDS = tuple(f"band{i}" for i in range(6))
@@ -369,6 +374,43 @@ def test_weighted_summaries_are_those_of_repeated_draws():
     expected = np.interp(want[1][middle], np.sort(value), np.arange(400))
     assert_allclose(place, expected, atol=1.5)
     assert quantiles.size == DERIVED_LEVELS.size
+
+
+def test_errors_of_percentiles_are_those_of_order_statistics():
+    n = 1600
+    normal = ndtri((np.arange(n) + 0.5) / n)
+    equal = np.full(n, 1 / n)
+    # asymptotic variance p (1 - p) / n f^2, largest at 16 and 84 %; half of the interval is 0.994
+    density = np.exp(-0.5 * ndtri(0.84) ** 2) / np.sqrt(2 * np.pi)
+    expected = np.sqrt(0.16 * 0.84 / n) / density / ndtri(0.84)
+    assert percentile_error(normal, equal) == pytest.approx(expected, rel=0.02)
+    # the same draws in pairs of weights 1 and 3 count as 0.8 of their number
+    unequal = np.where(np.arange(n) % 2, 1.5, 0.5) / n
+    assert percentile_error(normal, unequal) == pytest.approx(expected / np.sqrt(0.8), rel=0.02)
+    # a peak that has the part of the weight at which a percentile stands: it is in one or the other
+    two_peaks = np.where(np.arange(n) < 0.84 * n, 0.01 * normal, 10 + 0.01 * normal)
+    assert percentile_error(two_peaks, equal) > 0.4
+    assert percentile_error(np.where(np.arange(n) < 0.3 * n, 0.0, normal), equal) < 0.1
+    assert percentile_error(np.ones(n), equal) == 0
+
+
+def test_percentiles_between_peaks_get_more_models(fitter, table):
+    """The scatter over scrambles of percentiles that are converged is a small part of the interval."""
+    between = fitter.backend.between
+    percentiles = []
+    converged = np.ones(len(table), bool)
+    for scramble in range(1, 7):
+        new = fitter.replace()
+        new.backend = replace(fitter.backend, between=replace(between, scramble=scramble))
+        results = new.fit(table)
+        converged &= (results.flags & FitFlags.NOT_CONVERGED) == 0
+        percentiles.append(results.percentile("redshift", (0.16, 0.5, 0.84)).value)
+    percentiles = np.array(percentiles)
+    half_width = 0.5 * np.median(percentiles[..., 2] - percentiles[..., 0], axis=0)
+    scatter = percentiles.std(axis=0, ddof=1) / half_width[:, None]
+    assert converged.any()
+    assert scatter[converged].max() < 0.3
+    assert np.mean(scatter[converged] < 0.15) > 0.9
 
 
 def test_places_go_where_they_are_inefficient():

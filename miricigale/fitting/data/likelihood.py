@@ -135,7 +135,8 @@ class FitFlags(Flags):
         (
             "The posterior between nodes is not converged: the effective number of models that "
             "``interpolate`` asks for was not reached, in all or in a redshift peak or kind of "
-            "model with more than 2 % of the weight."
+            "model with more than 2 % of the weight, or a percentile is uncertain by more than a "
+            "tenth of its 68 % interval."
         ),
     )
     BAND_OFF = (

@@ -43,7 +43,8 @@ class GridSettings:
         Effective number of models between the nodes for each object, with fluxes interpolated from the nodes
         around, by adaptive importance sampling (Cornuet et al. 2012); posteriors and percentiles are theirs. 80
         times as many models are evaluated at most (at least 16,384); objects for which that is not enough are
-        flagged ``NOT_CONVERGED``. Percentiles scatter by some 1.5 half-widths over the root of it. Chi2, best
+        flagged ``NOT_CONVERGED``. Percentiles scatter by some 1.5 half-widths over the root of it; where a
+        percentile lies between two peaks up to four times the number is taken. Chi2, best
         models and evidences are those of these models too, at known redshifts at those of the catalog. 0: the
         nodes alone, as with ``compat="cigale"`` and for templates.
     finer : `~miricigale.sed.SEDModel`, optional

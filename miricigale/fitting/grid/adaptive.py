@@ -121,6 +121,34 @@ class WeightedPlaces:
     wanted: np.ndarray
 
 
+class _Collection:
+    """
+    Places that results rest on.
+
+    Parameters
+    ----------
+    parts : `~miricigale.fitting.grid.proposals.FittedParts`
+        What they are drawn from.
+    missing : `~numpy.ndarray`, shape (n_labels * n_peaks,)
+        How many are still wanted in labels and peaks, or shares.
+    sampler : `AdaptiveSampler`
+        Whose further places they are.
+    """
+
+    def __init__(self, parts, missing, sampler):
+        self.parts = parts
+        self.missing = missing
+        self.first = sampler.n
+        #: How many were drawn from each label and peak.
+        self.total = np.zeros(sampler.n_groups)
+        #: Densities of the parts of each peak at all places of the sampler.
+        self.density = np.zeros((len(sampler.peaks), len(sampler.label)))
+        #: `WeightedPlaces` of all of them.
+        self.sample = None
+        #: Whether they are as many as are wanted.
+        self.is_enough = False
+
+
 class AdaptiveSampler:
     """
     Sampling of the posterior of one object.
@@ -180,6 +208,9 @@ class AdaptiveSampler:
         self.scratch = np.empty((n_axes + 2, _MAX_ROUND_SIZE))
         self.n_fitted = _MAX_FLAT
         self.n = 0
+        #: What results rest on.
+        self.collection = None
+        self._first_wanted = wanted
 
     def run(self, label, score, peak):
         """
@@ -203,25 +234,65 @@ class AdaptiveSampler:
         adapted = self._adapt(parts, share)
         if adapted is None:
             return None
-        parts, share = adapted
+        self.collection = _Collection(*adapted, self)
+        return self._models_of(self._reach(_N_TRIAL))
+
+    def extend(self, factor):
+        """
+        Add places until a larger effective number is reached.
+
+        Parameters
+        ----------
+        factor : float
+            That number over the one wanted before.
+
+        Returns
+        -------
+        models : `PlacedModels` or None
+            Converged if they reach the number wanted before, which places of large weight that are met now may
+            undo; None if that was not reached before.
+        """
+        if not self.collection.is_enough:
+            return None
+        self.collection.is_enough = False
+        first_wanted = self.wanted
+        self.wanted = int(factor * first_wanted)
+        # as many as it takes if the effective number keeps its part of them
+        sample = self._reach(int(factor * (self.n - self.collection.first)))
+        if sample is not None:
+            sample = replace(sample, enough=sample.effective >= first_wanted)
+        return self._models_of(sample)
+
+    def _reach(self, size):
+        """
+        Add places until there are enough: the best `WeightedPlaces`; None if none is possible.
+
+        What is known of the shape of the posterior is fitted by more parts if ``size`` places show that it would
+        take many more.
+        """
         best = None
-        size = _N_TRIAL
         while self.max_places - self.n >= ROUND_SIZE:
-            sample = self._collect(parts, share, size)
+            sample = self._collect(self.collection, size)
             if sample is None:
                 return None
             if best is None or sample.enough or sample.effective > best.effective:
                 best = sample
             if sample.enough:
+                self.collection.is_enough = True
                 break
-            # the shape of the posterior that is known by now is fitted by more parts
             size *= 2
             self.n_fitted *= 2
             parts = self._fit(self._places(self.n_fitted), n_local=_N_LOCAL)
-            share = sample.wanted
-        if best.effective >= _MIN_WEIGHED * self.wanted:
-            return self._models(best)
-        return self._moved(best)
+            self.collection = _Collection(parts, sample.wanted, self)
+        return best
+
+    def _models_of(self, sample):
+        """Make `PlacedModels` of `WeightedPlaces`; None of none."""
+        if sample is None:
+            return None
+        if sample.effective >= _MIN_WEIGHED * self._first_wanted:
+            return self._models(sample)
+        return self._moved(sample)
 
     def _adapt(self, parts, share):
         """
@@ -258,23 +329,23 @@ class AdaptiveSampler:
             parts = self._fit(places)
         return self._fit(places, n_local=_N_LOCAL), share
 
-    def _collect(self, parts, share, n_trial):
+    def _collect(self, collection, n_trial):
         """
         Add places that the parts do not depend on: `WeightedPlaces`, or None if none is possible.
 
         They are added until there are enough. If ``n_trial`` of them show that it would take many more, this ends
         as long as twice their number may follow.
         """
-        first = self.n
-        total = np.zeros(self.n_groups)
-        density = np.zeros((len(self.peaks), len(self.label)))
-        missing = share
+        parts = collection.parts
+        first = collection.first
+        total = collection.total
+        missing = collection.missing
         while self.max_places - self.n >= ROUND_SIZE:
             size = int(np.clip(missing.sum(), ROUND_SIZE, _MAX_ROUND_SIZE)) & ~127
             size = min(size, self.max_places - self.n)
             guarded = parts.possible(self._guarded(missing))
             ends = self._add_round(parts.shared(guarded), size)
-            density = _with_columns(density, len(self.label))
+            collection.density = density = _with_columns(collection.density, len(self.label))
             self._add_density(parts.kernel, ends, density, parts.group % len(self.peaks))
             total += size * guarded
             rows = slice(first, self.n)
@@ -285,6 +356,11 @@ class AdaptiveSampler:
                 return None
             n = self.n - first
             sample = replace(sample, enough=sample.enough and n >= _MIN_RESULT_PLACES)
+            group = self._groups(self.label[rows], self.peak[rows])
+            n_each = np.bincount(group, minlength=self.n_groups)
+            missing = np.maximum(sample.wanted - n_each, 0.02 * sample.wanted)
+            collection.missing = missing
+            collection.sample = sample
             many_more = self.wanted > _MAX_SHORTAGE * sample.effective
             may_follow = self.max_places - self.n > _TRIAL_GROWTH * n
             if sample.enough or (many_more and n >= n_trial and may_follow):
@@ -293,10 +369,7 @@ class AdaptiveSampler:
             is_hopeless = effective_in_all < _HOPELESS * self.wanted
             if n >= min(n_trial, _HOPELESS_TRIAL) and is_hopeless and not may_follow:
                 break
-            group = self._groups(self.label[rows], self.peak[rows])
-            n_each = np.bincount(group, minlength=self.n_groups)
-            missing = np.maximum(sample.wanted - n_each, 0.02 * sample.wanted)
-        return sample
+        return collection.sample
 
     @property
     def n_groups(self):
@@ -463,7 +536,8 @@ class AdaptiveSampler:
         indices = indices[np.lexsort((self.place[rows, 0], self.label[rows]))]
         rows = sample.rows.start + indices
         is_best = rows == rows[np.argmax(self.evaluated[rows, 4])]
-        indices, weight = thinned(indices, weight[indices], is_best, _MAX_MODELS)
+        max_models = _MAX_MODELS * self.wanted // self._first_wanted
+        indices, weight = thinned(indices, weight[indices], is_best, max_models)
         rows = sample.rows.start + indices
         return self._placed(
             self.place[rows],

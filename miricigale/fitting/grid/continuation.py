@@ -15,11 +15,20 @@ from miricigale.fitting.grid.node_scan import NodeScan
 from miricigale.fitting.grid.peaks import redshift_peaks
 from miricigale.fitting.grid.placed_models import places_to_values
 from miricigale.fitting.posterior.priors import GridAxis
+from miricigale.fitting.posterior.quantities import percentile_error
 from miricigale.utils.units import Frozen
 from miricigale.utils.values import value_class
 
 #: Draws of the posterior on nodes that sampling begins with.
 N_START = 256
+#: Error of a percentile, in units of half of the 68 % interval, above which more models are taken.
+_GOOD_ERROR = 0.1
+#: Error above which it is not converged.
+_MAX_ERROR = 0.2
+#: Quantities whose percentiles they are.
+_MAIN_QUANTITIES = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")
+#: Largest ratio of these errors whose square is the factor on the effective number of models.
+_MAX_RATIO = 2.0
 #: Fluxes of galaxies that differ by less than this part, along an axis, are the same.
 _SAME_FLUX = 1e-6
 
@@ -253,7 +262,18 @@ class Continuation(Frozen):
         models = sampler.run(label, score, peak)
         if models is None:
             return None
-        return self._describe(models, one, known, nuclei)
+        posterior = self._describe(models, one, known, nuclei)
+        error = posterior.percentile_error()
+        if error > _GOOD_ERROR:
+            # errors fall as the root of the number
+            factor = min(error / _GOOD_ERROR, _MAX_RATIO) ** 2
+            more_models = sampler.extend(factor)
+            if more_models is not None:
+                posterior = self._describe(more_models, one, known, nuclei)
+                error = posterior.percentile_error()
+        if error > _MAX_ERROR:
+            posterior = replace(posterior, converged=False)
+        return posterior
 
     def _cells_of(self, drawn):
         """Find the nodes of the axes of draws from the posterior on nodes: (n, n_axes)."""
@@ -446,6 +466,24 @@ class BetweenPosterior:
     chi2: float
     log_sum: float
     converged: bool
+
+    def percentile_error(self):
+        """
+        Estimate the largest error of the 16th, 50th and 84th percentiles of the main quantities.
+
+        Returns
+        -------
+        error : float
+            As by `~miricigale.fitting.posterior.quantities.percentile_error`.
+        """
+        largest = 0.0
+        for name in _MAIN_QUANTITIES:
+            values = self.values.get(name)
+            if values is None:
+                values = self.derived.get(name)
+            if values is not None:
+                largest = max(largest, percentile_error(values, self.weight))
+        return largest
 
 
 def _chi2(target, limits, z, flux):

@@ -15,6 +15,8 @@ DERIVED_LEVELS = frozen_array(
     [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.16, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5]
     + [0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.84, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999]
 )
+#: Levels of the 68 % interval and of its middle.
+_INTERVAL = frozen_array([0.16, 0.5, 0.84])
 #: Values of a shape quantity closer than this part of their range are one.
 _SAME = 1e-9
 #: Shape quantities whose outermost cells end at 0.
@@ -82,6 +84,44 @@ def _weighted_summary(value, weight, with_log):
         log = np.sum(lit * np.log10(value[first:])) / lit.sum()
     # a value stands for half of its weight on either side
     return np.array([mean, std, log]), np.interp(DERIVED_LEVELS, upto - 0.5 * weight, value)
+
+
+def percentile_error(values, weight):
+    """
+    Estimate the largest error of the 16th, 50th and 84th percentiles of a finite number of weighted draws.
+
+    Parameters
+    ----------
+    values, weight : `~numpy.ndarray`, shape (n,)
+        The draws, and their weights, which sum to 1.
+
+    Returns
+    -------
+    error : float
+        In units of half of the 68 % interval; 0 where that is a single value.
+
+    Notes
+    -----
+    The share p of the draws below a value has the variance sum w^2 (I - p)^2, with I = 1 for draws below and 0 for
+    those above. The percentiles at shares that are a standard error smaller and larger say what that means for the
+    value, also between two peaks, where there is no density to divide by.
+    """
+    order = np.argsort(values)
+    values = values[order]
+    weight = weight[order]
+    middles = np.cumsum(weight) - 0.5 * weight
+    low, high = np.interp(_INTERVAL[[0, -1]], middles, values)
+    half_width = 0.5 * (high - low)
+    # values that differ by rounding are one
+    if not half_width > _SAME * max(abs(low), abs(high)):
+        return 0.0
+    square_upto = np.cumsum(np.square(weight))
+    below = np.interp(_INTERVAL, middles, square_upto)
+    above = square_upto[-1] - below
+    share_error = np.sqrt(np.square(1.0 - _INTERVAL) * below + np.square(_INTERVAL) * above)
+    smaller = np.interp(_INTERVAL - share_error, middles, values)
+    larger = np.interp(_INTERVAL + share_error, middles, values)
+    return float(np.max(larger - smaller)) / (2.0 * half_width)
 
 
 def put_draws(results, new, i, values):
