@@ -262,18 +262,19 @@ class Continuation(Frozen):
         models = sampler.run(label, score, peak)
         if models is None:
             return None
-        posterior = self._describe(models, one, known, nuclei)
-        error = posterior.percentile_error()
+        quantities = self._quantities(models, one)
+        error = quantities.percentile_error()
         if error > _GOOD_ERROR:
             # errors fall as the root of the number
             factor = min(error / _GOOD_ERROR, _MAX_RATIO) ** 2
             more_models = sampler.extend(factor)
             if more_models is not None:
-                posterior = self._describe(more_models, one, known, nuclei)
-                error = posterior.percentile_error()
+                models = more_models
+                quantities = self._quantities(models, one)
+                error = quantities.percentile_error()
         if error > _MAX_ERROR:
-            posterior = replace(posterior, converged=False)
-        return posterior
+            models = replace(models, converged=False)
+        return self._describe(models, quantities, one, known, nuclei)
 
     def _cells_of(self, drawn):
         """Find the nodes of the axes of draws from the posterior on nodes: (n, n_axes)."""
@@ -318,19 +319,28 @@ class Continuation(Frozen):
         index[without_agn, 2] = -1
         return index
 
-    def _describe(self, models, one, known, nuclei):
-        """`BetweenPosterior` of models."""
+    def _quantities(self, models, one):
+        """Work out `_Quantities` of models."""
         values = {}
         node = {}
         for j, name in enumerate(self.axes):
             node[name], values[name] = places_to_values(self.space, j, models.place[:, j])
+        if one.redshift:
+            values["redshift"] = np.full(len(models.weight), one.redshift)
+        scale = self.engine.drawn_scale(models.scale, models.variance, models.uniform)
+        derived = self.models.describe(values, values["redshift"], models.power, scale)
+        return _Quantities(values, node, derived, scale, models.weight)
+
+    def _describe(self, models, quantities, one, known, nuclei):
+        """Make the `BetweenPosterior` of models and their `_Quantities`."""
+        values = quantities.values
+        node = quantities.node
+        scale = quantities.scale
         weight = models.weight
         z = node["redshift"]
         if one.redshift:
-            values["redshift"] = np.full(len(weight), one.redshift)
             z = np.zeros(len(weight), int)
         flux, _ = self.models.fluxes(values, values["redshift"], values["frac_agn"])
-        scale = self.engine.drawn_scale(models.scale, models.variance, models.uniform)
         drawn_flux = flux * scale[:, None]
         data_flux = flux
         bands = self.engine.mixture
@@ -354,7 +364,7 @@ class Continuation(Frozen):
         return BetweenPosterior(
             values=values,
             node=node,
-            derived=self._derived(values, models, scale),
+            derived=quantities.derived,
             weight=weight,
             wrong=share,
             flux=np.array([mean, np.sqrt(variance)]),
@@ -403,10 +413,6 @@ class Continuation(Frozen):
         flux, _ = self.models.fluxes(parameters, parameters["redshift"], parameters["frac_agn"])
         return self.index_of_nodes(node), derived | parameters, flux * derived["mass"][:, None]
 
-    def _derived(self, values, models, scale):
-        """Derive quantities by name, shape (n,), of models with scales (n,)."""
-        return self.models.describe(values, values["redshift"], models.power, scale)
-
     def _best(self, values, models, best):
         """Collect parameters and derived quantities of the best model: dict of str to float."""
         row = slice(best, best + 1)
@@ -420,6 +426,44 @@ class Continuation(Frozen):
                 if axis.kind == "agn":
                     out[name] = np.nan
         return out
+
+
+@value_class
+class _Quantities:
+    """
+    Parameters and derived quantities of weighted models; attributes as of `BetweenPosterior`.
+
+    Parameters
+    ----------
+    values, node, derived : dict of str to `~numpy.ndarray`, shape (n,)
+        Parameters, nodes and derived quantities.
+    scale, weight : `~numpy.ndarray`, shape (n,)
+        Scales, drawn from those that are possible, and weights.
+    """
+
+    values: dict
+    node: dict
+    derived: dict
+    scale: np.ndarray
+    weight: np.ndarray
+
+    def percentile_error(self):
+        """
+        Estimate the largest error of the 16th, 50th and 84th percentiles of the main quantities.
+
+        Returns
+        -------
+        error : float
+            As by `~miricigale.fitting.posterior.quantities.percentile_error`.
+        """
+        largest = 0.0
+        for name in _MAIN_QUANTITIES:
+            numbers = self.values.get(name)
+            if numbers is None:
+                numbers = self.derived.get(name)
+            if numbers is not None:
+                largest = max(largest, percentile_error(numbers, self.weight))
+        return largest
 
 
 @value_class
@@ -466,24 +510,6 @@ class BetweenPosterior:
     chi2: float
     log_sum: float
     converged: bool
-
-    def percentile_error(self):
-        """
-        Estimate the largest error of the 16th, 50th and 84th percentiles of the main quantities.
-
-        Returns
-        -------
-        error : float
-            As by `~miricigale.fitting.posterior.quantities.percentile_error`.
-        """
-        largest = 0.0
-        for name in _MAIN_QUANTITIES:
-            values = self.values.get(name)
-            if values is None:
-                values = self.derived.get(name)
-            if values is not None:
-                largest = max(largest, percentile_error(values, self.weight))
-        return largest
 
 
 def _chi2(target, limits, z, flux):

@@ -97,14 +97,8 @@ class BandMixture:
             0 in bands without data.
         """
         measured = np.isfinite(sigma)
-        part = np.broadcast_to(self.part, measured.shape)
-        narrow = np.where(measured, sigma, 1.0)
-        wide = np.where(measured, broad, 1.0)
-        square = np.where(measured, np.square(flux - model), 0.0)
         with np.errstate(divide="ignore"):
-            # ln of (1 - p) N(F; m, sigma) and p N(F; m, Sigma), in units of the density with sigma
-            good = np.log1p(-part) - 0.5 * square / np.square(narrow)
-            bad = np.log(part) - 0.5 * square / np.square(wide) + np.log(narrow / wide)
+            good, bad = self._log_parts(model, flux, sigma, broad)
             log = np.where(measured, np.logaddexp(good, bad), 0.0)
             wrong = np.where(measured, expit(bad - good), 0.0)
             if limit is not None:
@@ -117,6 +111,21 @@ class BandMixture:
                 wrong = np.where(has_limit, expit(bad - good), wrong)
         return log.sum(axis=-1), wrong
 
+    def _log_parts(self, model, flux, sigma, broad):
+        """
+        Compute ln of (1 - p) N(F; m, sigma) and p N(F; m, Sigma), in units of the density with sigma.
+
+        Arguments are those of `log_likelihood`; what stands in bands without data means nothing.
+        """
+        measured = np.isfinite(sigma)
+        part = np.broadcast_to(self.part, measured.shape)
+        narrow = np.where(measured, sigma, 1.0)
+        wide = np.where(measured, broad, 1.0)
+        square = np.where(measured, np.square(flux - model), 0.0)
+        good = np.log1p(-part) - 0.5 * square / np.square(narrow)
+        bad = np.log(part) - 0.5 * square / np.square(wide) + np.log(narrow / wide)
+        return good, bad
+
     def shares(self, model, target, broad, limits, z, weight):
         """
         Compute how likely each band is wrong, shape (nb,), over models, (n, nb), at nodes ``z`` of redshift.
@@ -125,13 +134,16 @@ class BandMixture:
         """
         with np.errstate(divide="ignore"):
             narrow = 1.0 / np.sqrt(target.weight[z])
+            if limits is None:
+                # the likelihoods, which take most of the time, are not asked for
+                good, bad = self._log_parts(model, target.flux, narrow, broad)
+                return weight @ np.where(np.isfinite(narrow), expit(bad - good), 0.0)
         limit = np.zeros(len(broad))
         limit_sigma = np.full(len(broad), np.inf)
-        if limits is not None:
-            limit[limits.bands] = limits.level / limits.inverse
-            limit_sigma[limits.bands] = 1.0 / limits.inverse
+        limit[limits.bands] = limits.level / limits.inverse
+        limit_sigma[limits.bands] = 1.0 / limits.inverse
         _, wrong = self.log_likelihood(model, target.flux, narrow, broad, limit, limit_sigma)
-        return np.sum(weight[:, None] * wrong, axis=0)
+        return weight @ wrong
 
 
 @value_class
