@@ -117,11 +117,54 @@ def number_or_file(text):
         return text
 
 
+#: Endings of files that people name as an output, where a command writes a folder.
+_FILE_ENDINGS = (
+    ".asdf",
+    ".cat",
+    ".csv",
+    ".dat",
+    ".ecsv",
+    ".fit",
+    ".fits",
+    ".gz",
+    ".h5",
+    ".hdf5",
+    ".html",
+    ".json",
+    ".parquet",
+    ".pdf",
+    ".png",
+    ".toml",
+    ".txt",
+    ".vot",
+    ".xml",
+)
+
+
+def output_folder(text):
+    """Return the path of a folder that a command writes; refuse a file, and a name that is one of a file."""
+    path = Path(text)
+    if path.is_dir():
+        return path
+    if path.exists():
+        msg = f"must be a folder, {text} is a file"
+        raise argparse.ArgumentTypeError(msg)
+    if path.suffix.lower() in _FILE_ENDINGS:
+        name = path.name
+        while Path(name).suffix.lower() in _FILE_ENDINGS:
+            name = Path(name).stem
+        folder = path.with_name(name)
+        msg = f"must be a folder, for several files are written; got {text} (such as {folder})"
+        raise argparse.ArgumentTypeError(msg)
+    return path
+
+
 #: Types of options by their names in the declarations.
 TYPES = {
     "int": int,
     "float": float,
     "path": Path,
+    "folder": output_folder,
     "pair": pair,
     "extension": extension,
     "number or file": number_or_file,

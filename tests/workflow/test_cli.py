@@ -220,6 +220,31 @@ def test_wrong_calls_are_one_sentence_and_status_2(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    "words", ["fit cat", "agn cat", "reduce x.fits", "inject x.fits", "plan", "run goodss"]
+)
+@pytest.mark.parametrize("name", ["out.fits", "my.v2.FITS.gz", "taken"])
+def test_folders_that_are_written_have_no_names_of_files(
+    capsys, tmp_path, monkeypatch, words, name
+):
+    monkeypatch.chdir(tmp_path)
+    Path("taken").write_text("a file")
+    with pytest.raises(SystemExit) as end:
+        main([*words.split(), "-o", name])
+    assert end.value.code == 2
+    error = capsys.readouterr().err
+    assert "-o/--output: must be a folder" in error
+    assert name in error
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_folders_may_have_dots_in_their_names_and_stand_already(tmp_path):
+    (tmp_path / "old.fits").mkdir()
+    for name in ("out.v1.5", "old.fits"):
+        args = make_parser(["fit"]).parse_args(["fit", "cat", "-o", str(tmp_path / name)])
+        assert args.output == tmp_path / name
+
+
 def test_quiet_and_verbose_stand_anywhere():
     parser = make_parser([])
     for words in (["-q", "compile"], ["compile", "-q"], ["compile", "--quiet"]):
