@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import logging
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from miricigale.detector.ramp import Ramp
 from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, miri_detector
 from miricigale.instrument.published_tables import table
-from miricigale.utils.exceptions import DetectorWarning, argument_error, warn
+from miricigale.utils.exceptions import DetectorWarning, argument_error, unknown_name, warn
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_kind, check_names, check_that
@@ -48,6 +49,15 @@ _OPTIONAL = (Residual, BrighterFatter, Persistence, ResetAnomaly, ResetDecay, Fi
 _STANDARD = [kind for kind in ORDER if kind not in _OPTIONAL]
 
 _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
+
+
+def _effect_class(name):
+    """Return the class of effects of a name, in any spelling: CosmicRays, cosmic_rays, "cosmic rays"."""
+    classes = {kind.__name__.lower(): kind for kind in ORDER}
+    bare = re.sub(r"[\s_-]", "", name).lower()
+    if bare not in classes:
+        raise unknown_name("effect", name, [kind.__name__ for kind in ORDER])
+    return classes[bare]
 
 
 @value_class
@@ -76,6 +86,8 @@ class Detector(Interactive):
     >>> Detector((Photons(), ReadNoise(), ADConversion())).effects
     (Photons(flat=True), ReadNoise(sigma=None, pink=0.0, octaves=16), ADConversion())
     """
+
+    _parts = ("properties",)
 
     effects: tuple | None = None
     _: dataclasses.KW_ONLY
@@ -170,17 +182,36 @@ class Detector(Interactive):
 
         Parameters
         ----------
-        *kinds : type
-            Classes of effects, such as `CosmicRays`. Photons and the conversion must stay.
+        *kinds : type or str
+            Classes of effects, such as `CosmicRays`, or their names (``"cosmic_rays"``). Photons and the
+            conversion must stay.
 
         Returns
         -------
         detector : `Detector`
+
+        Raises
+        ------
+        KeyError
+            If no effect of the package has the name.
+        ValueError
+            If a kind is no class of effects, or the others are no detector.
+
+        Examples
+        --------
+        >>> from miricigale.detector import Detector
+        >>> detector = Detector().without("cosmic_rays")
+        >>> "CosmicRays" in repr(detector)
+        False
         """
+        classes = []
         for kind in kinds:
+            if isinstance(kind, str):
+                kind = _effect_class(kind)
             if not (isinstance(kind, type) and issubclass(kind, Effect)):
                 raise argument_error("kinds", "classes of effects", repr(kind))
-        chain = [effect for effect in self.effects if not isinstance(effect, kinds)]
+            classes.append(kind)
+        chain = [effect for effect in self.effects if not isinstance(effect, tuple(classes))]
         return type(self)(chain, properties=self.properties)
 
     def __repr__(self):
@@ -202,7 +233,7 @@ class Detector(Interactive):
             Noiseless surface brightness (MJy/sr), shape ``exposure.shape``, sky included; of a scene what it
             renders.
             What its ``meta["psf_includes"]`` names (a list such as ``["pixel", "ipc"]``, or
-            its text) is not applied again.
+            its text) is not applied again. A list of scenes of exposures gives a list of ramps.
         exposure : `~miricigale.instrument.Exposure`, optional
             How it is exposed; a scene of an exposure knows.
         seed : int, `~numpy.random.Generator` or None, optional
@@ -218,7 +249,7 @@ class Detector(Interactive):
 
         Returns
         -------
-        ramp : `Ramp`
+        ramp : `Ramp` or list of `Ramp`
             Counts (uint16) with flags of pixels and groups.
 
         Raises
@@ -236,6 +267,12 @@ class Detector(Interactive):
         `~miricigale.utils.exceptions.DetectorWarning`
             If the sky alone fills the well before the last group.
         """
+        if isinstance(image, (list, tuple)):
+            wanted = "left out for a list of scenes"
+            check_that(exposure is None, "exposure", wanted + ", which have theirs", exposure)
+            check_that(previous is None, "previous", wanted + ": expose them one by one", previous)
+            options = {"seed": seed, "n_threads": n_threads, "progress_bar": progress_bar}
+            return [self.expose(scene, **options) for scene in image]
         task = self._task(image, exposure, seed, previous)
         shape = task.shape
         # counts, and flags of groups where all have some

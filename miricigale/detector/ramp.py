@@ -86,6 +86,8 @@ class Ramp(Interactive, NDData):
     (1, 10, 64, 72)
     """
 
+    _parts = ("exposure",)
+
     def __init__(
         self,
         data,
@@ -212,7 +214,9 @@ class Ramp(Interactive, NDData):
 
     def __getitem__(self, number):
         if not isinstance(number, numbers.Integral):
-            raise argument_error("number", "that of an integration", repr(number))
+            raise argument_error(
+                "number", "that of an integration (ramp.data has pixels)", repr(number)
+            )
         if not -len(self.data) <= number < len(self.data):
             msg = f"integration {number} of {len(self.data)}"
             raise IndexError(msg)

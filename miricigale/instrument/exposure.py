@@ -324,6 +324,24 @@ class Exposure(Interactive):
             [-0.5, nx - 0.5, nx - 0.5, -0.5], [-0.5, -0.5, ny - 0.5, ny - 0.5]
         )
 
+    def contains(self, sky):
+        """
+        Say which positions fall on the sub-array.
+
+        Parameters
+        ----------
+        sky : `~astropy.coordinates.SkyCoord`
+            Positions.
+
+        Returns
+        -------
+        inside : bool or bool `~numpy.ndarray`, of the shape of ``sky``
+        """
+        self.check_sky()
+        x, y = self.wcs.world_to_pixel(sky)
+        ny, nx = self.shape
+        return (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+
     def plot(self, ax=None, **kwargs):
         """
         Draw the sub-array on the sky, north up and east to the left.

@@ -68,6 +68,8 @@ class ReductionResult(Interactive):
     >>> path = result.write("mosaic.fits")  # doctest: +SKIP
     """
 
+    _parts = ("mosaic",)
+
     rates: tuple
     images: tuple
     backgrounds: tuple

@@ -21,7 +21,7 @@ from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import plain_floats
 from miricigale.utils.options import check_kind, check_that
@@ -55,7 +55,7 @@ class SceneFlags(Flags):
     DRAWN_AS_POINT = 16, "a Sersic profile whose parameters cannot be used"
 
 
-class Scene(Interactive):
+class Scene(WithTable):
     """
     A catalog of sources as an instrument would see it without noise.
 
@@ -128,6 +128,8 @@ class Scene(Interactive):
     >>> print(f"{scene.truth['flux_in_image'][0]:.1f}")
     18.9 uJy
     """
+
+    _parts = ("exposure",)
 
     def __init__(
         self,

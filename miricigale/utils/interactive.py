@@ -17,6 +17,9 @@ class Interactive:
     holds are attributes, which sessions complete. In notebooks an object is shown as a table of what it holds.
     """
 
+    #: Attributes, such as the exposure of a ramp, whose own values are found through the object too.
+    _parts = ()
+
     @property
     def _other_names(self):
         """Names that are usual elsewhere, and ours: an attribute, one of a part ("part.name"), or "method()"."""
@@ -34,6 +37,12 @@ class Interactive:
             return value
         if (value := self._value(name)) is not None:
             return value
+        for part in self._parts:
+            # half-made copies have no parts yet
+            value = getattr(vars(self).get(part), name, None)
+            # methods of a part would return another object than users expect
+            if value is not None and not callable(value):
+                return value
         raise UnknownAttributeError(self, name)
 
     def __dir__(self):
@@ -63,7 +72,15 @@ class Interactive:
         return f"<table>{rows}</table>"
 
 
-class Tabular(Interactive):
+class WithTable(Interactive):
+    """Base of what can be written as a table by its method ``to_table()``."""
+
+    def to_pandas(self):
+        """Return the table as a `pandas.DataFrame`; positions are the columns ``ra`` and ``dec`` in deg."""
+        return sky_as_angles(self.to_table()).to_pandas()
+
+
+class Tabular(WithTable):
     """
     Base of results with a table, ``to_table()``, which they are indexed like.
 
@@ -92,7 +109,3 @@ class Tabular(Interactive):
         table = self.to_table()
         table.add_index("id")
         return table.loc
-
-    def to_pandas(self):
-        """Return the table as a `pandas.DataFrame`; positions are the columns ``ra`` and ``dec`` in deg."""
-        return sky_as_angles(self.to_table()).to_pandas()

@@ -26,6 +26,7 @@ from miricigale.detector import (
     Residual,
 )
 from miricigale.instrument import DQ, miri_detector, photmjsr
+from miricigale.scene import Scene
 from miricigale.utils.exceptions import MiricigaleWarning
 
 PLAIN = (Photons(flat=False), Nonlinearity(linear=True), Bias(), ReadNoise(), ADConversion())
@@ -242,11 +243,29 @@ def test_effects_take_the_place_of_their_kind():
     back = other.without(Residual, Persistence, LastFrame).replace(Dark())
     assert back.effects == detector.effects
     assert Detector.miri_imager(Dark(current=2.0)).effects == detector.replace(Dark(2.0)).effects
+    for name in ("CosmicRays", "cosmic_rays", "cosmic rays"):
+        assert detector.without(name).effects == detector.without(CosmicRays).effects
+    refuses("no effect 'rays'; ", detector.without, "rays", error=KeyError)
     with pytest.warns(AstropyDeprecationWarning, match="Use replace instead"):
         assert detector.replaced(Dark(2.0)).effects == detector.replace(Dark(2.0)).effects
     # settings of the detector stay
     properties = miri_detector().replace(gain=2.0)
     assert Detector.miri_imager(properties=properties).without(Dark).properties is properties
+
+
+def test_scenes_of_several_exposures_make_as_many_ramps(make_exposure, detector):
+    star = {"ra": [53.0], "dec": [-27.0], "flux": [20] * u.uJy, "profile": "point"}
+    dithers = make_exposure(n_groups=3, pointing="53 -27").dithered(2)
+    scenes = [Scene(star, dither, background="low") for dither in dithers]
+    ramps = detector.expose(scenes, seed=3)
+    for ramp, scene in zip(ramps, scenes, strict=True):
+        assert_array_equal(ramp.data, detector.expose(scene, seed=3).data)
+    refuses("'exposure' must be left out", detector.expose, scenes, dithers[0])
+    # a ramp has the settings of its exposure, a detector the numbers of its properties
+    assert ramps[0].exposure_time == dithers[0].exposure_time
+    assert ramps[0].nints == scenes[0].n_integrations == dithers[0].n_integrations
+    assert detector.gain == detector.properties.gain
+    refuses("Ramp", getattr, ramps[0], "dithered", error=AttributeError)
 
 
 def test_ramps_do_not_change(make_exposure, make_sky, detector):

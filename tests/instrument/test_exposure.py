@@ -204,3 +204,17 @@ def test_the_footprint_is_the_field_of_the_array():
     ax = made.plot()
     assert ax.xaxis_inverted()
     np.testing.assert_allclose(ax.patches[0].get_xy()[:4, 1], corners.dec.deg)
+
+
+def test_positions_inside_the_footprint_are_on_the_array():
+    made = exposure(subarray="SUB256")
+    corners = made.footprint
+    center = SkyCoord(corners.cartesian.mean()).spherical
+    center = SkyCoord(center.lon, center.lat)
+    assert made.contains(center)
+    # 10 % inside and outside of each corner
+    for share, wanted in ((0.9, True), (1.1, False)):
+        east = center.ra + share * (corners.ra - center.ra)
+        north = center.dec + share * (corners.dec - center.dec)
+        assert np.all(made.contains(SkyCoord(east, north)) == wanted)
+    refuses("one with a pointing", exposure(pointing=None, roll=None).contains, FIELD)

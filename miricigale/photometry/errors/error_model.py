@@ -25,7 +25,7 @@ from miricigale.photometry.errors.error_curves import (
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.ids import id_column
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
 from miricigale.utils.random import check_seed, stream
@@ -92,7 +92,7 @@ def add_noise(photometry, name, sigma, seed):
 
 
 @value_class
-class ErrorModel(Interactive):
+class ErrorModel(WithTable):
     """
     The 1-sigma error of a flux, band by band; make it with one of the class methods.
 
