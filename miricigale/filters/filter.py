@@ -12,11 +12,11 @@ from miricigale.filters import _core
 from miricigale.filters.band_names import find_filter, unknown_filter
 from miricigale.filters.curve_files import read_curve
 from miricigale.filters.library import FILTERS, load_curve
-from miricigale.filters.spectra import check_wave, spectrum_arrays
+from miricigale.filters.spectra import are_spectra, check_wave, spectrum_arrays
 from miricigale.utils.caching import cached, cached_property
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import reading
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import WithTable
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import table_suffix, write_table
 from miricigale.utils.units import (
@@ -39,7 +39,7 @@ UNCOVERED = 1e-4
 
 
 @value_class
-class Filter(Frozen, Interactive):
+class Filter(Frozen, WithTable):
     """
     A passband: the response to photons against wavelength.
 
@@ -532,15 +532,15 @@ class Filter(Frozen, Interactive):
         ----------
         sed : object
             An `~miricigale.sed.SED`, a pair of wavelengths and flux densities (F_nu or F_lambda), a
-            spectrum of specutils or synphot, or an astropy model of a flux density. F_nu is taken as linear
-            between the wavelengths.
+            spectrum of specutils or synphot, or an astropy model of a flux density; or a list of any but pairs.
+            F_nu is taken as linear between the wavelengths.
         flux : `~astropy.units.Quantity`, optional
             Flux densities, if ``sed`` is the wavelengths.
 
         Returns
         -------
         flux : `~astropy.units.Quantity`
-            In uJy.
+            In uJy, shape (); (n,) of a list of n spectra.
 
         Raises
         ------
@@ -560,6 +560,8 @@ class Filter(Frozen, Interactive):
         >>> Filter("F770W").synthetic_flux(wave, wave.value**2 * u.uJy).round(2)
         <Quantity 58.36 uJy>
         """
+        if are_spectra(sed):
+            return u.Quantity([self.synthetic_flux(spectrum) for spectrum in sed])
         wave, fnu = spectrum_arrays(sed if flux is None else (sed, flux), [self])
         first, part = self._weights(wave, UNCOVERED)
         return float(part @ fnu[first : first + part.size]) * FNU

@@ -11,14 +11,15 @@ from astropy.table import QTable
 from miricigale.filters.band_names import find_filter, known_filter
 from miricigale.filters.filter import UNCOVERED, Filter
 from miricigale.filters.filter_arguments import as_filter
-from miricigale.filters.spectra import check_wave, spectrum_arrays
+from miricigale.filters.spectra import are_spectra, check_wave, spectrum_arrays
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.interactive import Interactive
-from miricigale.utils.units import FNU, WAVE
+from miricigale.utils.interactive import WithTable
+from miricigale.utils.options import check_that
+from miricigale.utils.units import FNU, WAVE, ab_magnitude
 
 
 @dataclasses.dataclass(frozen=True)
-class FilterSet(Interactive):
+class FilterSet(WithTable):
     """
     An ordered set of filters.
 
@@ -92,10 +93,15 @@ class FilterSet(Interactive):
         return name in self.names or (isinstance(name, str) and find_filter(name) in self.names)
 
     def __getitem__(self, key):
-        """The filter of a name or number; for a slice or a list of names, a set."""
+        """The filter of a name or number; for a slice, a list of names or numbers, or a mask, a set."""
         if isinstance(key, slice):
             return FilterSet(self.filters[key])
-        if isinstance(key, (list, tuple)):
+        is_mask = np.ndim(key) == 1 and np.asarray(key).dtype == bool
+        if is_mask:
+            wanted = f"of one value for each of {len(self)} filters"
+            check_that(len(key) == len(self), "key", wanted, len(key))
+            return FilterSet([self.filters[i] for i in np.flatnonzero(key)])
+        if isinstance(key, (list, tuple, np.ndarray)):
             return FilterSet([self[name] for name in key])
         if isinstance(key, str):
             name = known_filter(key, self.names, "filter in this set")
@@ -163,7 +169,7 @@ class FilterSet(Interactive):
 
         Returns
         -------
-        fluxes : `~astropy.units.Quantity`, shape (n_filters,)
+        fluxes : `~astropy.units.Quantity`, shape (n_filters,); (n, n_filters) of a list of n spectra
             In uJy.
 
         Examples
@@ -174,8 +180,14 @@ class FilterSet(Interactive):
         >>> FilterSet(["F160W", "F770W", "F2100W"]).synthetic_fluxes(sed).round(2)
         <Quantity [ 4.44,  7.29, 55.42] uJy>
         """
+        if are_spectra(sed):
+            return u.Quantity([self.synthetic_fluxes(spectrum) for spectrum in sed])
         wave, fnu = spectrum_arrays(sed, self.filters)
         return self.weights(wave) @ fnu * FNU
+
+    def synthetic_magnitudes(self, sed):
+        """AB magnitudes of a spectrum, NaN where the flux is not positive; see `synthetic_fluxes`."""
+        return ab_magnitude(self.synthetic_fluxes(sed)) * u.ABmag
 
     def plot(self, ax=None, **kwargs):
         """

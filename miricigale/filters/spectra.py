@@ -20,6 +20,17 @@ def check_wave(wave):
     return wave
 
 
+def are_spectra(sed):
+    """Whether it is a list of spectra (of this package, specutils or synphot), not one as a pair of arrays."""
+    if not isinstance(sed, (list, tuple)) or not len(sed):
+        return False
+    return all(_is_spectrum(item) for item in sed)
+
+
+def _is_spectrum(item):
+    return any(hasattr(item, name) for name in ("fnu", "spectral_axis", "waveset"))
+
+
 def spectrum_arrays(sed, bands):
     """
     Wavelengths (um) and F_nu (uJy) of a spectrum.

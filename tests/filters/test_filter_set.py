@@ -11,6 +11,7 @@ from synphot import Box1D, SpectralElement
 
 from helpers.errors import refuses
 from miricigale.filters import Filter, FilterSet
+from miricigale.sed import SED
 
 NAMES = ["megacam.u", "wfc3.f160w", "irac.ch4", "miri.f770w", "miri.f2100w"]
 
@@ -107,3 +108,23 @@ def test_names_are_forgiving():
         ("something else", r"^((?!did you mean).)*$"),
     ):
         refuses(match, Filter.from_name, name, error=KeyError)
+
+
+def test_masks_and_arrays_choose_filters(filters):
+    assert filters[filters.pivots > 5 * u.um].names == tuple(NAMES[2:])
+    assert filters[np.array([3, 0])].names == ("miri.f770w", "megacam.u")
+    refuses("'key' must be of one value for each of 5 filters", filters.__getitem__, [True, False])
+
+
+def test_several_spectra_have_a_row_each(filters):
+    wave = np.geomspace(0.1, 100, 700) * u.um
+    flat = SED(wave, np.full(700, 3.0) * u.uJy)
+    fluxes = filters.synthetic_fluxes([flat, 2 * flat, flat.to_specutils()])
+    assert_quantity_allclose(fluxes, np.outer([3, 6, 3], np.ones(5)) * u.uJy, rtol=1e-6)
+    one_band = filters["miri.f770w"].synthetic_flux((flat, 2 * flat))
+    assert_quantity_allclose(one_band, [3, 6] * u.uJy, rtol=1e-6)
+    # AB magnitude of 3 uJy
+    expected = 23.9 - 2.5 * np.log10(3)
+    magnitudes = filters.synthetic_magnitudes(flat)
+    assert magnitudes.unit == u.ABmag
+    assert_allclose(magnitudes.value, expected, atol=2e-4)
