@@ -32,18 +32,20 @@ def plot_filters(curves, ax=None, **kwargs):
     return ax
 
 
-def plot_spectrum(wave, fnu, ax=None, **kwargs):
+def plot_spectrum(wave, fnu, ax=None, *, rest_frame=False, **kwargs):
     """
     Draw a spectrum on logarithmic axes.
 
     Parameters
     ----------
     wave : `~numpy.ndarray`, shape (n,)
-        Observed wavelengths in um.
+        Wavelengths in um.
     fnu : `~numpy.ndarray`, shape (n,)
         Flux densities in uJy; values that are not positive are left out.
     ax : `~matplotlib.axes.Axes`, optional
         Where to; the current axes if not given.
+    rest_frame : bool, optional
+        Whether the wavelengths are those at the source, not as observed: for the label.
     **kwargs
         Passed to `~matplotlib.axes.Axes.plot`.
 
@@ -52,7 +54,10 @@ def plot_spectrum(wave, fnu, ax=None, **kwargs):
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
+    frame = "observed"
+    if rest_frame:
+        frame = "rest"
     fnu = np.where(np.asarray(fnu) > 0.0, fnu, np.nan)
     ax.loglog(wave, fnu, **kwargs)
-    ax.set(xlabel="observed wavelength (µm)", ylabel=r"$F_\nu$ (µJy)")
+    ax.set(xlabel=f"{frame} wavelength (µm)", ylabel=r"$F_\nu$ (µJy)")
     return ax

@@ -292,6 +292,9 @@ class SEDModel(Interactive):
         return next((c for c in self.components if c.role == role), None)
 
     def __getitem__(self, name):
+        """The component of a name, role or number."""
+        if isinstance(name, (int, np.integer)):
+            return self.components[name]
         component = next((c for c in self.components if name in (c.name, c.role)), None)
         if component is None:
             raise unknown_name("component", name, [c.name for c in self.components])

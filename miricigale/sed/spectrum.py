@@ -1,6 +1,8 @@
 """Spectra as observed: wavelengths and flux densities, of a whole and of its parts."""
 
 import dataclasses
+import functools
+import operator
 import re
 from dataclasses import field
 
@@ -19,9 +21,9 @@ from miricigale.utils.curve_columns import (
     unit_of_fluxes,
     unit_of_wavelengths,
 )
-from miricigale.utils.exceptions import argument_error, data_error
+from miricigale.utils.exceptions import argument_error, data_error, unknown_name
 from miricigale.utils.files import reading
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import full_meta
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
@@ -101,8 +103,27 @@ class _Flux(u.Quantity):
         raise TypeError(msg)
 
 
+class Parts(dict):
+    """
+    Parts of a spectrum by name.
+
+    ``"agn"`` is the sum of those of the AGN, ``"galaxy"`` that of the others, so that both make up the whole.
+    """
+
+    def __missing__(self, name):
+        groups = {"agn": [], "galaxy": []}
+        for key, part in self.items():
+            # light before attenuation is no part of the whole
+            if not key.endswith("_intrinsic"):
+                groups["agn" if key.startswith("agn_") else "galaxy"].append(part)
+        groups = {group: parts for group, parts in groups.items() if parts}
+        if name not in groups:
+            raise unknown_name("component", name, [*self, *groups])
+        return functools.reduce(operator.add, groups[name])
+
+
 @value_class
-class SED(Frozen, Interactive):
+class SED(Frozen, WithTable):
     """
     Spectral energy distribution: flux density against observed wavelength.
 
@@ -121,7 +142,8 @@ class SED(Frozen, Interactive):
     components : dict of str to `SED`, optional
         Its parts at the same wavelengths. Of a model ``stellar`` (attenuated), ``dust``, with gas ``nebular``
         (attenuated) and with an AGN ``agn_disk``, ``agn_torus`` and ``agn_polar`` sum to the whole;
-        ``stellar_intrinsic`` is the light of stars and gas before dust.
+        ``stellar_intrinsic`` is the light of stars and gas before dust. ``components["agn"]`` and
+        ``components["galaxy"]`` are sums of those of the AGN and of the others.
 
     Raises
     ------
@@ -201,7 +223,7 @@ class SED(Frozen, Interactive):
         check_that(good, "wave", "positive and strictly ascending", "something else")
         check_that(0 <= self.redshift < np.inf, "redshift", ">= 0", self.redshift)
         self.__dict__.update(wave=wave, fnu=fnu, redshift=float(self.redshift))
-        self.__dict__.update(meta=dict(self.meta), components=dict(self.components))
+        self.__dict__.update(meta=dict(self.meta), components=Parts(self.components))
 
     @property
     def parameters(self):
@@ -251,6 +273,29 @@ class SED(Frozen, Interactive):
         alike = self.redshift == other.redshift and np.array_equal(self.wave, other.wave)
         check_that(alike, "other", "an SED at the same redshift and wavelengths", other)
         return SED(self.wave, self.fnu + other.fnu, redshift=self.redshift)
+
+    def __sub__(self, other):
+        if not isinstance(other, SED):
+            return NotImplemented
+        return self + other * -1.0
+
+    def __getitem__(self, key):
+        """The part between two observed wavelengths, ``sed[5 * u.um:10 * u.um]``, or where a mask is True."""
+        if isinstance(key, slice):
+            check_that(key.step is None, "key", "two wavelengths without a step", key)
+            wave = self.wave.value
+            inside = np.ones(wave.size, bool)
+            if key.start is not None:
+                inside &= wave >= to_array(key.start, WAVE, "key", ndim=0)
+            if key.stop is not None:
+                inside &= wave <= to_array(key.stop, WAVE, "key", ndim=0)
+        else:
+            inside = np.asarray(key)
+            is_mask = inside.dtype == bool and inside.shape == self.wave.shape
+            wanted = "two wavelengths (sed[5 * u.um:10 * u.um]) or a mask of the points"
+            check_that(is_mask, "key", wanted, repr(key))
+        parts = {name: part[inside] for name, part in self.components.items()}
+        return self.replace(wave=self.wave[inside], fnu=self.fnu[inside], components=parts)
 
     def replace(self, **changes):
         """Copy with other values of the constructor's arguments."""
@@ -324,6 +369,41 @@ class SED(Frozen, Interactive):
         flux = self.fluxes(bands)
         return np.where(flux.value > 0, flux.value, np.nan) * flux.unit << u.ABmag
 
+    def normalize(self, flux, band):
+        """
+        Scale the spectrum to a flux in a band.
+
+        Parameters
+        ----------
+        flux : `~astropy.units.Quantity`
+            The flux in the band that the result has, such as ``10 * u.uJy`` or ``23.5 * u.ABmag``.
+        band : str or `~miricigale.filters.Filter`
+            The band.
+
+        Returns
+        -------
+        sed : `SED`
+            With its parts scaled too. ``parameters`` and ``derived`` stay those of the model.
+
+        Raises
+        ------
+        ValueError
+            If the spectrum has no light in the band.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> import astropy.units as u
+        >>> sed = SEDModel.yang2021(libraries="bundled")(redshift=1.0, mass=1e10)
+        >>> sed.normalize(10 * u.uJy, "F770W").synthetic_flux("F770W").round(3)
+        <Quantity 10. uJy>
+        """
+        if isinstance(flux, u.Magnitude):
+            flux = flux.to(FNU)
+        now = self.synthetic_flux(band)
+        check_that(now > 0, "band", "one in which the spectrum has light", band)
+        return self * float(to_array(flux, FNU, "flux", ndim=0) / now.to_value(FNU))
+
     def luminosity(self, low=None, high=None, *, cosmology=COSMOLOGY):
         """
         Luminosity nu L_nu at the source, at `rest_wavelength`, or that between two rest wavelengths.
@@ -381,6 +461,30 @@ class SED(Frozen, Interactive):
         parts = constant * (1 / x[:-1] - 1 / x[1:]) + slope * np.log(x[1:] / x[:-1])
         return np.sum(parts) * FNU * c / WAVE
 
+    @classmethod
+    def from_table(cls, table):
+        """
+        Make a spectrum of a table; see `read`.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            As `to_table` makes it, or with a column of wavelengths and one of flux densities.
+
+        Returns
+        -------
+        sed : `SED`
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from astropy.table import QTable
+        >>> from miricigale.sed import SED
+        >>> SED.from_table(QTable({"wave": [1, 2, 3] * u.um, "flux": [1, 1, 2] * u.mJy}))
+        <SED 3 points, 1 um to 3 um, redshift 0>
+        """
+        return cls._of_table(table, "the table")
+
     def to_table(self):
         """The spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""
         table = QTable({"wave": self.wave, "fnu": self.fnu})
@@ -430,7 +534,11 @@ class SED(Frozen, Interactive):
         ValueError
             If a sample is missing, or not to be used by a column ``DQ`` of JWST or ``mask``.
         """
-        table = read_table(path, wanted="a spectrum")
+        return cls._of_table(read_table(path, wanted="a spectrum"), path)
+
+    @classmethod
+    def _of_table(cls, table, path):
+        """Make a spectrum of a table, named ``path`` in messages."""
         wave_name, flux_name = curve_columns(table, _FLUX_NAME, path)
         wave = _with_unit(table[wave_name], unit_of_wavelengths)
         fnu = _with_unit(table[flux_name], unit_of_fluxes)
@@ -519,7 +627,7 @@ class SED(Frozen, Interactive):
         kind = getattr(specutils, "Spectrum", None) or specutils.Spectrum1D
         return kind(spectral_axis=self.wave, flux=self.fnu, meta=dict(self.meta))
 
-    def plot(self, ax=None, *, components=False, **kwargs):
+    def plot(self, ax=None, *, components=False, rest_frame=False, **kwargs):
         """
         Draw the spectrum on logarithmic axes.
 
@@ -530,6 +638,8 @@ class SED(Frozen, Interactive):
         components : bool, optional
             Whether the components are drawn too, with a legend: dashed what no observer sees (light before
             attenuation).
+        rest_frame : bool, optional
+            Whether the wavelengths are those at the source; flux densities stay as observed.
         **kwargs
             Passed to `~matplotlib.axes.Axes.plot` for the spectrum itself.
 
@@ -544,17 +654,21 @@ class SED(Frozen, Interactive):
         """
         from miricigale.plotting.curves import plot_spectrum
 
+        wave = self.wave.value
+        if rest_frame:
+            wave = self.rest_wavelength.value
         if not components:
-            return plot_spectrum(self.wave.value, self.fnu.value, ax=ax, **kwargs)
+            return plot_spectrum(wave, self.fnu.value, ax=ax, rest_frame=rest_frame, **kwargs)
         check_that(self.components, "components", "False for a spectrum without components", True)
         kwargs = {"color": "black", "lw": 1.5, "label": "sum"} | kwargs
-        ax = plot_spectrum(self.wave.value, self.fnu.value, ax=ax, **kwargs)
+        ax = plot_spectrum(wave, self.fnu.value, ax=ax, rest_frame=rest_frame, **kwargs)
         low, high = ax.get_ylim()
         for name, part in self.components.items():
             if np.any(part.fnu > 0):
                 style = "--" if name.endswith("_intrinsic") else "-"
                 label = name.replace("_", " ")
-                plot_spectrum(part.wave.value, part.fnu.value, ax=ax, label=label, ls=style, lw=1)
+                options = {"label": label, "ls": style, "lw": 1, "rest_frame": rest_frame}
+                plot_spectrum(wave, part.fnu.value, ax=ax, **options)
         # faint parts would stretch the axis by many decades
         ax.set_ylim(max(low, 1e-6 * high), high)
         ax.legend(fontsize="small")

@@ -602,3 +602,10 @@ def test_what_a_session_completes_are_components():
     names = model._ipython_key_completions_()
     assert {one.role for one in model.components} <= set(names)
     assert {model[name].name for name in names} == {one.name for one in model.components}
+
+
+def test_components_are_indexed_by_name_role_and_number():
+    model = SEDModel.yang2021(libraries="bundled")
+    assert model[0] is model["sfh"] is model.components[0]
+    assert model[-1] is model.components[-1]
+    refuses("no component 'skirtor'", model.__getitem__, "skirtor", error=KeyError)

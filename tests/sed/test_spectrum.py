@@ -1,4 +1,5 @@
 import operator
+import pickle
 
 import astropy.units as u
 import numpy as np
@@ -212,3 +213,48 @@ def test_magnitudes_of_several_bands_are_those_of_each(flat):
     assert flat.magnitudes(bands).unit == u.ABmag
     dark = flat * 0
     assert np.isnan(dark.magnitudes(bands).value).all()
+
+
+@pytest.mark.parametrize("flux", [10 * u.uJy, 1e-2 * u.mJy, (23.9 - 2.5) * u.ABmag])
+def test_spectra_are_scaled_to_a_flux_in_a_band(flat, flux):
+    scaled = flat.normalize(flux, "F770W")
+    assert_quantity_allclose(scaled.fnu, np.full(WAVE.size, 10.0) * u.uJy, rtol=1e-3)
+    assert_quantity_allclose(scaled.synthetic_flux("F770W"), u.Quantity(flux.to(u.uJy)))
+    refuses("'band' must be one in which", (0 * flat).normalize, flux, "F770W")
+
+
+def test_parts_of_a_spectrum_are_cut_and_subtracted(flat):
+    part = flat[5 * u.um : 1e5 * u.AA]
+    inside = np.abs(WAVE.value - 7.5) <= 2.5
+    assert_quantity_allclose(part.wave, WAVE[inside])
+    assert_quantity_allclose(flat[inside].fnu, part.fnu)
+    assert flat[5 * u.um :].wave[-1] == flat.wave[-1]
+    assert_allclose((3 * flat - flat).fnu.value, 6.0)
+    refuses("two wavelengths", flat.__getitem__, 3)
+    refuses("without unit|no unit|bare number", flat.__getitem__, slice(5, 9), error=u.UnitsError)
+
+
+def test_agn_and_galaxy_are_sums_of_parts_and_make_up_the_whole():
+    sed = SEDModel.yang2021(libraries="bundled")(redshift=1.0, mass=1e10, frac_agn=0.4)
+    parts = pickle.loads(pickle.dumps(sed)).components
+    whole = parts["agn"] + parts["galaxy"]
+    assert_allclose(whole.fnu.value, sed.fnu.value, rtol=1e-9)
+    agn = sum(parts[f"agn_{name}"].fnu for name in ("disk", "torus", "polar"))
+    assert_quantity_allclose(parts["agn"].fnu, agn)
+    assert "agn" not in list(parts)
+    refuses("no component 'star'; known: agn", parts.__getitem__, "star", error=KeyError)
+    # a galaxy without an AGN has none
+    alone = SEDModel.yang2021(libraries="bundled", agn=False)(redshift=1.0, mass=1e10)
+    refuses("no component 'agn'", alone.components.__getitem__, "agn", error=KeyError)
+
+
+def test_tables_and_axes_of_a_spectrum(flat):
+    moved = flat.redshifted(1.0)
+    back = SED.from_table(moved.to_table())
+    assert_quantity_allclose(back.fnu, moved.fnu)
+    assert back.redshift == 1.0
+    frame = moved.to_pandas()
+    assert list(frame.columns) == ["wave", "fnu"]
+    ax = moved.plot(rest_frame=True)
+    assert_allclose(ax.lines[-1].get_xdata(), moved.rest_wavelength.value)
+    assert ax.get_xlabel().startswith("rest wavelength")
