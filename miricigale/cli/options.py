@@ -83,14 +83,28 @@ def _nearest_option(flag, names):
 
 
 def quantity_in(unit):
-    """Return the type of an option that is a number in a unit."""
+    """Return the type of an option that is a number in a unit, or with one of its own: 300, 300s, "5 min"."""
 
     def number(text):
         import astropy.units as u
 
-        return float(text) * u.Unit(unit)
+        try:
+            return float(text) * u.Unit(unit)
+        except ValueError:
+            pass
+        try:
+            return u.Quantity(text).to(unit)
+        except (TypeError, ValueError) as err:
+            msg = f"must be a number in {unit}, or with another unit, got {text!r}"
+            raise argparse.ArgumentTypeError(msg) from err
 
     return number
+
+
+def number_in(unit):
+    """Return the type of an option that is the value in a unit of what `quantity_in` reads."""
+    quantity = quantity_in(unit)
+    return lambda text: float(quantity(text).value)
 
 
 def pair(text):
@@ -170,6 +184,11 @@ TYPES = {
     "number or file": number_or_file,
     "arcsec": quantity_in("arcsec"),
     "deg": quantity_in("deg"),
+    "seconds": number_in("s"),
+    "hours": number_in("h"),
+    "degrees": number_in("deg"),
+    "days": number_in("day"),
+    "square arcmin": number_in("arcmin2"),
 }
 
 

@@ -111,12 +111,21 @@ def show(args):
 
 
 def psf(args):
-    """Write the PSF of a mosaic."""
+    """Write the PSF of a mosaic, or of a single exposure in a filter."""
+    from miricigale.filters.band_names import find_filter
     from miricigale.photometry import MosaicFile
     from miricigale.photometry.commands.kernel_files import image_psf
     from miricigale.psf import MODEL_FILTERS
+    from miricigale.psf.by_filter import exposure_psf
 
-    model = image_psf(MosaicFile(args.image, filter=args.filter, pa_aper=args.pa_aper))
+    band = find_filter(args.image)
+    if band in MODEL_FILTERS and not Path(args.image).exists():
+        wanted = "left out without an image"
+        for name in ("filter", "pa_aper"):
+            check_that(getattr(args, name) is None, name, wanted, getattr(args, name))
+        model = exposure_psf(band)
+    else:
+        model = image_psf(MosaicFile(args.image, filter=args.filter, pa_aper=args.pa_aper))
     wanted = f"an image of a filter with a model ({', '.join(MODEL_FILTERS)}) and its PA_APER"
     check_that(model is not None, "IMAGE", wanted, args.image)
     check_output(args.output, "output", overwrite=args.overwrite, inputs=[args.image])

@@ -266,6 +266,20 @@ def test_plans_of_bands_are_exposed_as_in_ceers(capsys):
     assert "miri.f1280w" in told.out
 
 
+def test_options_with_a_unit_take_others(capsys):
+    told = command(capsys, "plan", "--bands", "F770W", "--time", "2h", "--print-config")
+    assert "time = [7200.0]" in told.out
+    told = command(capsys, "plan", "--bands", "F770W", "--hours", "90 min", "--print-config")
+    assert "hours = 1.5" in told.out
+    args = make_parser(["reduce"]).parse_args(["reduce", "x", "-o", "y", "--pixel-scale", "60mas"])
+    assert args.pixel_scale == 0.06 * u.arcsec
+    with pytest.raises(SystemExit):
+        main(["plan", "--time", "2um"])
+    assert (
+        "--time: must be a number in s, or with another unit, got '2um'" in capsys.readouterr().err
+    )
+
+
 @pytest.mark.slow
 def test_products_are_shown_cited_and_have_psfs(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -305,6 +319,13 @@ def test_products_are_shown_cited_and_have_psfs(capsys, tmp_path, monkeypatch):
     # Perrin et al.: 0.269 arcsec, and what drizzling adds
     assert 0.26 < InstrumentPSF.read("psf.fits").fwhm.to_value(u.arcsec) < 0.31
     command(capsys, "psf", "t.ecsv", status=2)
+    # a filter stands for a single exposure
+    command(capsys, "psf", "F770W", "-o", "exposure.fits")
+    assert InstrumentPSF.read("exposure.fits").frame == "detector"
+    assert (
+        "--pa-aper must be left out"
+        in command(capsys, "psf", "F770W", "--pa-aper", "3", status=2).err
+    )
 
 
 @pytest.mark.slow
