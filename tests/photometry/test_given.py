@@ -106,6 +106,8 @@ def forms(image, folder):
 def test_images_of_any_form_give_the_same(images, photometer, sky, flux, tmp_path):
     expected = photometer.measure(*images, catalog=sky)
     assert_allclose(expected.flux.value, flux, rtol=0.03)
+    # the third argument may be the positions, without segments
+    assert_array_equal(photometer.measure(*images, sky).flux.value, expected.flux.value)
     for pair in zip(*(forms(image, tmp_path) for image in images), strict=True):
         result = photometer(*pair, catalog=sky)
         assert_allclose(result.flux.value, expected.flux.value, rtol=1e-4)
@@ -148,6 +150,7 @@ def test_results_are_indexed_like_their_table(images, psfs, sky):
     assert_allclose(frame["ra"], sky.ra.deg)
     assert list(frame.columns[:3]) == ["id", "ra", "dec"]
     assert_allclose(result.magnitude.value, 23.9 - 2.5 * np.log10(result.flux.value))
+    assert_allclose(result.mag_err.value, 1.0857362 / result.snr, rtol=1e-6)
     assert result.flag_names()[0] == []
     assert "sources: 16" in result.summary()
     # on the pixels of the image

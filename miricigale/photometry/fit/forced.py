@@ -332,6 +332,8 @@ class ForcedPhotometer(Interactive):
             raise TypeError(msg)
         if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
             highres, catalog = None, highres
+        if isinstance(segmentation, (SkyCoord, Table)) and catalog is None:
+            segmentation, catalog = None, segmentation
         if are_exposures(image):
             from miricigale.photometry.fit.exposure_photometry import measure_exposures
 

@@ -367,6 +367,12 @@ class ForcedPhotometryResult(Tabular):
         flux = np.where(self.flux.value > 0, self.flux.value, np.nan) * self.flux.unit
         return flux.to(u.ABmag)
 
+    @property
+    def magnitude_err(self):
+        """Errors of `magnitude`, mag: 2.5 / ln 10 of the relative errors; NaN where the flux is not positive."""
+        snr = np.where(self.flux.value > 0, self.snr, np.nan)
+        return 2.5 / np.log(10) / snr * u.mag
+
     def flag_names(self):
         """Return the names of the flags of each source: a list of lists of str."""
         return [list(ForcedFlags.names(value)) for value in self.flags]
