@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 from miricigale.cli.options import declarations, destination, filled, workers
+from miricigale.utils.options import check_that
 
 
 def _key_values(args, command):
@@ -86,6 +87,9 @@ _COMPARED = [
 
 def plan(args):
     """Tabulate exposures, or compare plans."""
+    if args.positional:
+        check_that(args.bands is None, "bands", "left out beside bands without it", args.bands)
+        args.bands = args.positional
     values = _key_values(args, "plan")
     has_files = args.config is not None or args.output is not None
     has_options = args.bands is not None or args.position is not None or args.settings

@@ -36,6 +36,7 @@ from miricigale.instrument.published_tables import table
 from miricigale.utils.exceptions import DetectorWarning, argument_error, unknown_name, warn
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
+from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_kind, check_names, check_that
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.random import check_seed
@@ -148,7 +149,7 @@ class Detector(Interactive):
         """Return `replace` with the same effects."""
         return self.replace(*effects)
 
-    def replace(self, *effects):
+    def replace(self, *effects, **properties):
         """
         Return a detector with other effects: each takes the place of those of its kind.
 
@@ -156,6 +157,9 @@ class Detector(Interactive):
         ----------
         *effects : `~miricigale.detector.Effect`
             Where there is none of the kind, it is put where the order wants it.
+        **properties
+            Other values of ``properties``, such as ``read_noise=12`` (see
+            `~miricigale.instrument.DetectorProperties`).
 
         Returns
         -------
@@ -174,7 +178,11 @@ class Detector(Interactive):
             chain = [e for e in chain if place_of(e) != place]
             after = [i for i, e in enumerate(chain) if (place_of(e) or 0) > place]
             chain.insert(after[0] if after else len(chain), effect)
-        return type(self)(chain, properties=self.properties)
+        check_names(properties, "property", field_values(self.properties))
+        numbers = self.properties
+        if properties:
+            numbers = numbers.replace(**properties)
+        return type(self)(chain, properties=numbers)
 
     def without(self, *kinds):
         """

@@ -531,8 +531,8 @@ class Filter(Frozen, WithTable):
         Parameters
         ----------
         sed : object
-            An `~miricigale.sed.SED`, a pair of wavelengths and flux densities (F_nu or F_lambda), a
-            spectrum of specutils or synphot, or an astropy model of a flux density; or a list of any but pairs.
+            An `~miricigale.sed.SED`, a pair of wavelengths and flux densities (F_nu or F_lambda) or a table of
+            them, a spectrum of specutils or synphot, or an astropy model of a flux density; or a list of spectra.
             F_nu is taken as linear between the wavelengths.
         flux : `~astropy.units.Quantity`, optional
             Flux densities, if ``sed`` is the wavelengths.

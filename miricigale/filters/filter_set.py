@@ -108,6 +108,10 @@ class FilterSet(WithTable):
             return self.filters[self.names.index(name)]
         return self.filters[key]
 
+    def index(self, name):
+        """Return the place of a filter, by any of its names, as that of a list."""
+        return self.names.index(known_filter(name, self.names, "filter in this set"))
+
     def _ipython_key_completions_(self):
         """What a session offers in brackets: the names."""
         return list(self.names)

@@ -2,7 +2,9 @@
 
 import astropy.units as u
 import numpy as np
+from astropy.table import Table
 
+from miricigale.utils.curve_columns import FLUX_NAME, curve_columns
 from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
@@ -38,8 +40,8 @@ def spectrum_arrays(sed, bands):
     Parameters
     ----------
     sed : object
-        With ``wave`` and ``fnu``; a pair of wavelengths and flux densities; a spectrum of specutils
-        (``spectral_axis`` and ``flux``) or synphot; or a function of wavelengths that gives flux
+        With ``wave`` and ``fnu``; a pair of wavelengths and flux densities, or a table of them; a spectrum of
+        specutils (``spectral_axis`` and ``flux``) or synphot; or a function of wavelengths that gives flux
         densities, as astropy's models are.
     bands : iterable of `~miricigale.filters.Filter`
         Where a function is evaluated.
@@ -66,6 +68,10 @@ def spectrum_arrays(sed, bands):
         flux = sed.fnu
     elif isinstance(sed, (tuple, list)) and len(sed) == 2:
         wave, flux = sed
+    elif isinstance(sed, Table):
+        wave_name, flux_name = curve_columns(sed, FLUX_NAME, "'sed'")
+        wave = sed[wave_name]
+        flux = sed[flux_name]
     elif hasattr(sed, "spectral_axis") and hasattr(sed, "flux"):
         wave = sed.spectral_axis.to(WAVE, u.spectral())
         flux = sed.flux

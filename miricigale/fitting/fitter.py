@@ -67,10 +67,10 @@ class BayesFitter(CatalogFits):
         the photometry has with an error, for which the grid is then made.
     priors : dict, optional
         Parameter name to prior. On a grid: a density, as a function of the value or a frozen distribution of
-        `scipy.stats`, which is integrated over the cells of the nodes; an array of weights of the nodes; or
-        ``"log"``, flat in the logarithm. Others are flat in the nodes: each has the same weight, so nodes of
-        equal ratios are flat in the logarithm. For a sampler, of every free parameter (others are at the
-        defaults of the model):
+        `scipy.stats`, which is integrated over the cells of the nodes; ``(low, high)``, flat between two values,
+        or ``(low, high, "log")``; an array of weights of the nodes; or ``"log"``, flat in the logarithm. Others
+        are flat in the nodes: each has the same weight, so nodes of equal ratios are flat in the logarithm. For a
+        sampler, of every free parameter (others are at the defaults of the model):
 
         - ``(low, high)``: flat; ``(low, high, "log")``: flat in the logarithm; ``"flat"`` and
           ``"log"``: the same over the bounds of the parameter;

@@ -82,6 +82,13 @@ class Image(Interactive, CCDData):
         scales = proj_plane_pixel_scales(self.wcs.celestial)
         return (np.sqrt(np.prod(scales)) * u.deg).to(ANGLE)
 
+    @property
+    def err(self):
+        """Standard deviations as an array, in the unit of the image; None without an uncertainty."""
+        if self.uncertainty is None:
+            return None
+        return standard_deviation(self).array
+
     def cutout(self, position, size):
         """
         Cut a rectangle out, with its world coordinates, uncertainty and mask.

@@ -32,7 +32,7 @@ def plot_filters(curves, ax=None, **kwargs):
     return ax
 
 
-def plot_spectrum(wave, fnu, ax=None, *, rest_frame=False, **kwargs):
+def plot_spectrum(wave, fnu, ax=None, *, rest_frame=False, label_y=r"$F_\nu$ (µJy)", **kwargs):
     """
     Draw a spectrum on logarithmic axes.
 
@@ -41,11 +41,13 @@ def plot_spectrum(wave, fnu, ax=None, *, rest_frame=False, **kwargs):
     wave : `~numpy.ndarray`, shape (n,)
         Wavelengths in um.
     fnu : `~numpy.ndarray`, shape (n,)
-        Flux densities in uJy; values that are not positive are left out.
+        Flux densities; values that are not positive are left out.
     ax : `~matplotlib.axes.Axes`, optional
         Where to; the current axes if not given.
     rest_frame : bool, optional
         Whether the wavelengths are those at the source, not as observed: for the label.
+    label_y : str, optional
+        Label of the flux densities, those in uJy by default.
     **kwargs
         Passed to `~matplotlib.axes.Axes.plot`.
 
@@ -59,5 +61,5 @@ def plot_spectrum(wave, fnu, ax=None, *, rest_frame=False, **kwargs):
         frame = "rest"
     fnu = np.where(np.asarray(fnu) > 0.0, fnu, np.nan)
     ax.loglog(wave, fnu, **kwargs)
-    ax.set(xlabel=f"{frame} wavelength (µm)", ylabel=r"$F_\nu$ (µJy)")
+    ax.set(xlabel=f"{frame} wavelength (µm)", ylabel=label_y)
     return ax

@@ -146,6 +146,11 @@ class Scene(WithTable):
         cutouts=None,
         agn=None,
     ):
+        self._arguments = {
+            "catalog": catalog, "exposure": exposure, "filter": filter, "wcs": wcs, "psf": psf,
+            "background": background, "enclosed": enclosed, "max_radius": max_radius,
+            "n_threads": n_threads, "cutouts": cutouts, "agn": agn,
+        }  # fmt: skip
         if exposure is not None:
             check_kind(exposure, "exposure", Exposure)
             exposure.check_sky()
@@ -186,6 +191,10 @@ class Scene(WithTable):
         self._cutouts = self._check_cutouts(cutouts)
         self._galaxy_flux, self._agn_flux = self._split_flux(agn)
         self._warn_of_fluxes()
+
+    def replace(self, **changes):
+        """Scene with other values of the constructor's arguments, such as ``background="high"``."""
+        return type(self)(**(self._arguments | changes))
 
     def __len__(self):
         return len(self._catalog)

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import operator
-import re
 from dataclasses import field
 
 import astropy.units as u
@@ -16,12 +15,13 @@ from miricigale.filters import FilterSet, as_filter
 from miricigale.filters.spectra import spectrum_arrays
 from miricigale.instrument import DQ
 from miricigale.utils.curve_columns import (
+    FLUX_NAME,
     curve_columns,
     is_quality,
     unit_of_fluxes,
     unit_of_wavelengths,
 )
-from miricigale.utils.exceptions import argument_error, data_error, unknown_name
+from miricigale.utils.exceptions import argument_error, data_error, units_error, unknown_name
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import full_meta
@@ -42,9 +42,6 @@ from miricigale.utils.units import (
 from miricigale.utils.values import value_class
 
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
-
-#: Names of columns of flux densities.
-_FLUX_NAME = re.compile(r"flux(?:_?density)?|f_?nu|f_?lam(?:bda)?|s_?nu", re.IGNORECASE)
 
 #: Unit of the parts of a spectrum in files, another one than that of the whole.
 _PART = u.nJy
@@ -93,6 +90,18 @@ def _without_flagged(fnu, table):
         if bad.any():
             fnu = np.where(bad, np.nan, floats(fnu)) * fnu.unit
     return fnu
+
+
+def _plotted_unit(unit):
+    """Return the unit of a flux density, and what stands for it on an axis."""
+    unit = u.Unit(unit)
+    for kind, symbol in ((FNU, r"F_\nu"), (_FLAM, r"F_\lambda"), (_FLAM * u.AA, r"\nu F_\nu")):
+        if unit.is_equivalent(kind):
+            label = unit.to_string("unicode", fraction="inline")
+            if unit == FNU:
+                label = "µJy"
+            return unit, f"${symbol}$ ({label})"
+    raise units_error("unit", "one of F_nu, F_lambda or nu F_nu", unit)
 
 
 class _Flux(u.Quantity):
@@ -174,6 +183,8 @@ class SED(Frozen, WithTable):
         "spectral_axis": "wave",
         "waveset": "wave",
         "flux_density": "fnu",
+        "flux_at": "fnu_at",
+        "interpolate": "fnu_at",
         "f_nu": "fnu",
         "f_lambda": "flam",
         "nu": "frequency",
@@ -404,9 +415,38 @@ class SED(Frozen, WithTable):
         check_that(now > 0, "band", "one in which the spectrum has light", band)
         return self * float(to_array(flux, FNU, "flux", ndim=0) / now.to_value(FNU))
 
+    def color(self, blue, red):
+        """AB magnitude in one band less that in another."""
+        return self.synthetic_magnitude(blue) - self.synthetic_magnitude(red)
+
+    def absolute_magnitude(self, band, *, cosmology=COSMOLOGY):
+        """
+        Absolute AB magnitude in a band at rest.
+
+        Parameters
+        ----------
+        band : str or `~miricigale.filters.Filter`
+            The band, at the source.
+        cosmology : `~astropy.cosmology.Cosmology`, optional
+            The cosmology.
+
+        Returns
+        -------
+        magnitude : `~astropy.units.Magnitude`
+            That of the source at 10 pc and redshift 0. Absorption between the galaxies stays in it.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> sed = SEDModel.yang2021(libraries="bundled")(redshift=1.0, mass=1e10)
+        >>> print(f"{sed.absolute_magnitude('2MASS J'):.1f}")
+        -21.6 mag(AB)
+        """
+        return self.redshifted(0.0, cosmology=cosmology).synthetic_magnitude(band)
+
     def luminosity(self, low=None, high=None, *, cosmology=COSMOLOGY):
         """
-        Luminosity nu L_nu at the source, at `rest_wavelength`, or that between two rest wavelengths.
+        Luminosity nu L_nu at the source, at `rest_wavelength` or others, or that between two rest wavelengths.
 
         nu L_nu is 4 pi times the luminosity distance (10 pc at redshift 0) squared times nu F_nu, which is the
         same at the wavelengths of source and observer. Between two wavelengths L_nu is integrated over frequency,
@@ -415,19 +455,20 @@ class SED(Frozen, WithTable):
         Parameters
         ----------
         low, high : `~astropy.units.Quantity`, optional
-            Rest wavelengths to integrate between, such as 8 and 1000 um.
+            Rest wavelengths to integrate between, such as 8 and 1000 um. With ``low`` alone nu L_nu is that at
+            these wavelengths.
         cosmology : `~astropy.cosmology.Cosmology`, optional
             The cosmology.
 
         Returns
         -------
-        luminosity : `~astropy.units.Quantity`, shape (n,) or ()
-            In solar luminosities.
+        luminosity : `~astropy.units.Quantity`, shape (n,), or () between two wavelengths
+            In solar luminosities; of the shape of ``low`` where that is alone.
 
         Raises
         ------
         ValueError
-            If only one of ``low`` and ``high`` is given, they are not in order, or not within the spectrum.
+            If ``high`` is given without ``low``, they are not in order, or not within the spectrum.
 
         Examples
         --------
@@ -440,13 +481,17 @@ class SED(Frozen, WithTable):
         np.True_
         """
         far = distance(self.redshift, cosmology) * u.m
-        if low is not None or high is not None:
+        if low is not None and high is None:
+            wave = to_array(low, WAVE, "low") * (1.0 + self.redshift) * WAVE
+            frequency = wave.to(u.Hz, u.spectral())
+            return (4 * np.pi * far**2 * frequency * self.fnu_at(wave)).to(u.Lsun)
+        if high is not None:
             return (4 * np.pi * far**2 * self._integral(low, high)).to(u.Lsun)
         return (4 * np.pi * far**2 * self.frequency * self.fnu).to(u.Lsun)
 
     def _integral(self, low, high):
         """Integrate F_nu over the frequencies between two rest wavelengths."""
-        check_that(low is not None and high is not None, "high", "given with 'low'", high)
+        check_that(low is not None, "low", "given with 'high'", low)
         first = to_array(low, WAVE, "low") * (1.0 + self.redshift)
         last = to_array(high, WAVE, "high") * (1.0 + self.redshift)
         wave = self.wave.value
@@ -539,7 +584,7 @@ class SED(Frozen, WithTable):
     @classmethod
     def _of_table(cls, table, path):
         """Make a spectrum of a table, named ``path`` in messages."""
-        wave_name, flux_name = curve_columns(table, _FLUX_NAME, path)
+        wave_name, flux_name = curve_columns(table, FLUX_NAME, path)
         wave = _with_unit(table[wave_name], unit_of_wavelengths)
         fnu = _with_unit(table[flux_name], unit_of_fluxes)
         if wave is None or fnu is None:
@@ -627,7 +672,7 @@ class SED(Frozen, WithTable):
         kind = getattr(specutils, "Spectrum", None) or specutils.Spectrum1D
         return kind(spectral_axis=self.wave, flux=self.fnu, meta=dict(self.meta))
 
-    def plot(self, ax=None, *, components=False, rest_frame=False, **kwargs):
+    def plot(self, ax=None, *, components=False, rest_frame=False, unit=FNU, **kwargs):
         """
         Draw the spectrum on logarithmic axes.
 
@@ -640,6 +685,9 @@ class SED(Frozen, WithTable):
             attenuation).
         rest_frame : bool, optional
             Whether the wavelengths are those at the source; flux densities stay as observed.
+        unit : `~astropy.units.Unit` or str, optional
+            Unit of F_nu (``"mJy"``), of F_lambda (``"erg/(s cm2 AA)"``) or of nu F_nu
+            (``"erg/(s cm2)"``).
         **kwargs
             Passed to `~matplotlib.axes.Axes.plot` for the spectrum itself.
 
@@ -651,24 +699,31 @@ class SED(Frozen, WithTable):
         ------
         ValueError
             If components are asked for and the spectrum has none.
+        `~astropy.units.UnitsError`
+            If the unit is none of these.
         """
         from miricigale.plotting.curves import plot_spectrum
 
         wave = self.wave.value
         if rest_frame:
             wave = self.rest_wavelength.value
+        unit, symbol = _plotted_unit(unit)
+        axes = {"rest_frame": rest_frame, "label_y": symbol}
+        density = u.spectral_density(self.wave)
+        values = self.fnu.to_value(unit, density)
         if not components:
-            return plot_spectrum(wave, self.fnu.value, ax=ax, rest_frame=rest_frame, **kwargs)
+            return plot_spectrum(wave, values, ax=ax, **axes, **kwargs)
         check_that(self.components, "components", "False for a spectrum without components", True)
         kwargs = {"color": "black", "lw": 1.5, "label": "sum"} | kwargs
-        ax = plot_spectrum(wave, self.fnu.value, ax=ax, rest_frame=rest_frame, **kwargs)
+        ax = plot_spectrum(wave, values, ax=ax, **axes, **kwargs)
         low, high = ax.get_ylim()
         for name, part in self.components.items():
             if np.any(part.fnu > 0):
                 style = "--" if name.endswith("_intrinsic") else "-"
                 label = name.replace("_", " ")
-                options = {"label": label, "ls": style, "lw": 1, "rest_frame": rest_frame}
-                plot_spectrum(wave, part.fnu.value, ax=ax, **options)
+                options = {"label": label, "ls": style, "lw": 1}
+                values = part.fnu.to_value(unit, density)
+                plot_spectrum(wave, values, ax=ax, **axes, **options)
         # faint parts would stretch the axis by many decades
         ax.set_ylim(max(low, 1e-6 * high), high)
         ax.legend(fontsize="small")

@@ -16,6 +16,8 @@ _WAVE_UNITS = {
 _FLUX_UNITS = {"flam": _FLAM, "fnu": _FLAM * u.AA / u.Hz}
 #: Names of columns of wavelengths.
 _WAVE_NAME = re.compile(r"wave|lambda|λ|^lam$|\bwl\b", re.IGNORECASE)
+#: Names of columns of flux densities.
+FLUX_NAME = re.compile(r"flux(?:_?density)?|f_?nu|f_?lam(?:bda)?|s_?nu", re.IGNORECASE)
 #: Names of columns that tell how good another one is.
 _QUALITY_NAME = re.compile(
     r"(?:^|[_\W\d])(?:e|d|err|errors?|unc|uncert\w*|sigma|std\w*|var|variance|ivar|weights?|dq|flags?|mask)(?:$|[_\W\d])",

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.interactive import Interactive
@@ -98,7 +99,8 @@ class ObjectRows(Interactive):
     - ``results[rows]``, a slice, a list or an array of row numbers or of truth values: these rows;
     - ``results.loc[id]``: the object of this id (the first, if it occurs twice), a list of ids: several.
 
-    ``results["redshift_p50"]`` is a column of the table, ``results["some id"]`` also an object whose id is text.
+    ``results["redshift_p50"]`` is a column of the table, ``results[["redshift", "mass"]]`` a table of several,
+    ``results["some id"]`` also an object whose id is text.
     """
 
     _other_name = staticmethod(_same_name)
@@ -155,6 +157,9 @@ class ObjectRows(Interactive):
             raise TypeError(msg)
         if isinstance(key, slice):
             return self._take(key)
+        is_text = isinstance(key, (list, tuple)) and all(isinstance(name, str) for name in key)
+        if is_text and key and not any(name in self._row_of_id for name in key):
+            return QTable({name: self._column(name) for name in key})
         if isinstance(key, list) or (isinstance(key, np.ndarray) and key.ndim):
             return self._take(key if len(key) else slice(0))
         if isinstance(key, numbers.Integral) and not isinstance(key, (bool, np.bool_)):

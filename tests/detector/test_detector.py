@@ -251,6 +251,11 @@ def test_effects_take_the_place_of_their_kind():
     # settings of the detector stay
     properties = miri_detector().replace(gain=2.0)
     assert Detector.miri_imager(properties=properties).without(Dark).properties is properties
+    quiet = detector.replace(Dark(current=2.0), read_noise=3.0)
+    assert quiet.read_noise == 3.0
+    assert quiet.gain == detector.gain
+    assert Dark(current=2.0) in quiet.effects
+    refuses("no property 'noise'", detector.replace, noise=3.0, error=KeyError)
 
 
 def test_scenes_of_several_exposures_make_as_many_ramps(make_exposure, detector):

@@ -45,6 +45,9 @@ def percentiles(values, weights):
         (scipy.stats.uniform(0.1, 9.9), scipy.stats.uniform(0.1, 9.9)),
         (scipy.stats.loguniform(0.1, 10), scipy.stats.loguniform(0.1, 10)),
         ("log", scipy.stats.loguniform(0.1, 10)),
+        ((0.1, 10), scipy.stats.uniform(0.1, 9.9)),
+        ((0.5, 7.0), scipy.stats.uniform(0.5, 6.5)),
+        ((0.5, 7.0, "log"), scipy.stats.loguniform(0.5, 7.0)),
         (lambda x: 1.0, scipy.stats.uniform(0.1, 9.9)),
         (lambda x: 1.0 / x, scipy.stats.loguniform(0.1, 10)),
         (lambda x: x * np.exp(-x), scipy.stats.gamma(2.0)),
@@ -80,6 +83,13 @@ def test_weights_of_nodes_are_taken_as_they_are():
     assert_allclose(weights_of(values, tau=[1.0, 2.0, 1.0]), [0.25, 0.5, 0.25])
     masked = np.ma.MaskedArray([1.0, 2.0, 1.0], mask=[False, True, False])
     refuses("finite", weights_of, values, tau=masked)
+
+
+def test_ends_of_a_prior_are_in_order():
+    for ends in ((3.0, 1.0), (0.0, 3.0, "log"), (1.0, 3.0, "flat"), ("a", 3.0)):
+        refuses(r"'priors\['tau'\]' must be \(low, high\)", weights_of, NODES["steps"], tau=ends)
+    # two weights of two nodes
+    assert_allclose(weights_of(np.array([1.0, 2.0]), tau=(1.0, 3.0)), [0.25, 0.75])
 
 
 def test_a_density_of_one_node_is_no_information():

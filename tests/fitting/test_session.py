@@ -130,6 +130,20 @@ def test_columns_of_a_parameter_are_attributes(results):
     assert not hasattr(results, "redshift_p17")
 
 
+def test_several_columns_are_a_table(results):
+    table = results[["redshift", "mass"]]
+    assert table.colnames == ["redshift", "mass"]
+    assert_array_equal(table["mass"].value, results.mass.value)
+    assert len(results[["redshift"]]) == len(results)
+    refuses("no column or id 'redshit'", results.__getitem__, ["redshit"], error=KeyError)
+
+
+def test_residuals_are_in_errors(results):
+    chi2 = np.nansum(results.residuals**2, axis=1)
+    assert results.residuals.shape == results.flux.shape
+    assert_allclose(chi2[results.fitted], results.chi2[results.fitted], rtol=1e-6)
+
+
 def test_a_corner_plot_of_draws_has_any_quantity(fitter, photometry, results, figure):
     samples = fitter.sample(photometry, 400, seed=1)
     key = results.ids[results.fitted][0]

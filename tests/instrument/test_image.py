@@ -4,8 +4,9 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
-from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.nddata import CCDData, StdDevUncertainty, VarianceUncertainty
 from astropy.wcs import WCS
+from numpy.testing import assert_array_equal
 
 from helpers.errors import refuses
 from miricigale.instrument import Image, as_wcs, north_up_wcs
@@ -68,3 +69,11 @@ def test_world_coordinates_of_a_header_or_an_image():
             found.pixel_to_world(3, 4).ra.deg, wcs.pixel_to_world(3, 4).ra.deg
         )
     refuses("'grid' must be an astropy WCS with celestial axes", as_wcs, fits.Header(), "grid")
+
+
+def test_errors_of_an_image_are_standard_deviations():
+    image = Image(
+        np.ones((2, 2)), unit="MJy/sr", uncertainty=VarianceUncertainty(np.full((2, 2), 9.0))
+    )
+    assert_array_equal(image.err, 3.0)
+    assert Image(np.ones((2, 2)), unit="MJy/sr").err is None

@@ -8,6 +8,7 @@ from astropy.convolution import Gaussian2DKernel
 from astropy.coordinates import SkyCoord
 from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import QTable, Table
+from numpy.testing import assert_allclose
 from photutils.psf import CircularGaussianPRF, MoffatPSF
 
 from helpers import scenes
@@ -114,3 +115,13 @@ def test_the_model_of_the_user_is_left_alone():
     model = MoffatPSF(flux=3.0, x_0=7.0, y_0=5.0, alpha=2.0, beta=3.0)
     assert as_psf(model).data.sum() == pytest.approx(16)
     assert (model.flux.value, model.x_0.value) == (3.0, 7.0)
+
+
+def test_a_scene_with_another_setting_is_another(exposure):
+    star = {"ra": [53.0], "dec": [-27.0], "flux": [20] * u.uJy, "profile": "point"}
+    scene = Scene(star, exposure)
+    bright = scene.replace(background=2 * u.MJy / u.sr)
+    difference = bright.render().data - scene.render().data
+    assert_allclose(difference, 2.0, rtol=1e-6)
+    assert bright.exposure is exposure
+    refuses("unexpected keyword", scene.replace, sky=3, error=TypeError)

@@ -2,6 +2,7 @@ import operator
 import pickle
 
 import astropy.units as u
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from astropy.constants import c
@@ -195,7 +196,6 @@ def test_luminosities_are_those_of_the_closed_form(flat):
     closed = 4 * np.pi * far**2 * sed.fnu[0] * span / (1 + sed.redshift)
     assert_quantity_allclose(sed.luminosity(low, high), closed.to(u.Lsun), rtol=1e-9)
     assert_quantity_allclose(sed(2 * u.um), sed.fnu_at(2 * u.um))
-    refuses("'high' must be given with 'low', got None", sed.luminosity, low)
     refuses("'low, high' must be in order, and within", sed.luminosity, high, low)
     model = SEDModel.yang2021(libraries="bundled", agn=False)(redshift=2.0, mass=1e10, ebv=0.3)
     dust = model.components["dust"]
@@ -258,3 +258,39 @@ def test_tables_and_axes_of_a_spectrum(flat):
     ax = moved.plot(rest_frame=True)
     assert_allclose(ax.lines[-1].get_xdata(), moved.rest_wavelength.value)
     assert ax.get_xlabel().startswith("rest wavelength")
+
+
+@pytest.mark.parametrize(
+    ("unit", "symbol", "power"),
+    [("mJy", "F_\\nu", 0), ("erg / (s cm2)", "\\nu F", -1), ("erg / (s cm2 AA)", "\\lambda", -2)],
+)
+def test_spectra_are_drawn_in_units_of_flux_densities(flat, unit, symbol, power):
+    ax = plt.figure().add_subplot()
+    flat.plot(ax, unit=unit)
+    y = ax.lines[0].get_ydata()
+    # of constant F_nu
+    assert_allclose(y / y[0], (WAVE / WAVE[0]) ** power, rtol=1e-9)
+    assert symbol in ax.get_ylabel()
+    plt.close("all")
+    refuses("'unit' must be one of F_nu", flat.plot, unit="K", error=u.UnitsError)
+
+
+def test_colors_and_absolute_magnitudes_are_those_of_the_closed_form():
+    rising = SED(WAVE, WAVE.value * u.uJy, redshift=0.5)
+    f770w = Filter("F770W")
+    ratio = rising.synthetic_flux("F1500W") / rising.synthetic_flux("F770W")
+    assert rising.color("F770W", "F1500W").value == pytest.approx(2.5 * np.log10(ratio.value))
+    # F_nu as the wavelength: light moved to wavelengths (1 + z) shorter has the fluxes of before, but for distance
+    far = COSMOLOGY.luminosity_distance(0.5).to_value(u.pc)
+    expected = -2.5 * np.log10(
+        ((far / 10) ** 2 * rising.synthetic_flux(f770w)).to_value(u.Jy) / 3630.780548
+    )
+    assert rising.absolute_magnitude(f770w).value == pytest.approx(expected, abs=1e-3)
+
+
+def test_luminosities_at_wavelengths_are_between_those_of_the_points(flat):
+    source = flat.redshifted(1.0)
+    places = source.rest_wavelength[[3, 90]]
+    assert_quantity_allclose(source.luminosity(places), source.luminosity()[[3, 90]], rtol=1e-9)
+    assert source.luminosity(6 * u.um).shape == ()
+    refuses("'low' must be given with 'high'", source.luminosity, None, 9 * u.um)

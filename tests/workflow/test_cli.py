@@ -184,7 +184,7 @@ def test_help_names_presets_and_surveys(capsys):
         (["fit", "--catalog", "a.fits"], "CATALOG has no option before it"),
         (["fit", "a.fits", "--unit", "Jy"], "did you mean '--flux-unit'?"),
         (["help", "fit"], "did you mean '--help'?"),
-        (["plan", "--filters", "F770W"], "--filters F770W; did you mean '--bands'? (see"),
+        (["plan", "--filters", "F770W"], "--filters; did you mean '--bands'? (see"),
         (
             ["fit", "a.fits", "--zmax", "4"],
             "--zmax 4; the grid has the redshifts; BayesFitter(axes=",
@@ -264,6 +264,13 @@ def test_plans_of_bands_are_exposed_as_in_ceers(capsys):
     assert 'bands = ["miri.f770w", "miri.f2100w"]' in told.out
     told = command(capsys, "plan", "--sets", "all", "F770W", "--print-config")
     assert "miri.f1280w" in told.out
+
+
+def test_bands_of_a_plan_need_no_option(capsys):
+    told = command(capsys, "plan", "f770w", "F2100W", "--time", "60", "--print-config")
+    assert 'bands = ["miri.f770w", "miri.f2100w"]' in told.out
+    arguments = ("plan", "f770w", "--bands", "F2100W", "--print-config")
+    assert "--bands must be left out beside" in command(capsys, *arguments, status=2).err
 
 
 def test_options_with_a_unit_take_others(capsys):

@@ -15,7 +15,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats, own_mask, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
 from miricigale.utils.random import stream
-from miricigale.utils.units import are_not_negative, is_ascending, to_array
+from miricigale.utils.units import are_not_negative, is_ascending, is_number, to_array
 from miricigale.utils.values import value_class
 
 #: Power of the redshift in `magnitude_prior`.
@@ -256,6 +256,8 @@ def _axis(name, values, unit, kind, priors, bounds):
             weights = np.diff(np.log(edges))
         else:
             weights = np.ones(1)
+    elif isinstance(prior, tuple) and (len(prior) == 3 or values.size != len(prior) == 2):
+        weights = cell_integrals(_span(prior, argument), values, argument)
     elif callable(prior) or hasattr(prior, "pdf"):
         weights = cell_integrals(prior, values, argument)
     else:
@@ -265,6 +267,21 @@ def _axis(name, values, unit, kind, priors, bounds):
     good = are_not_negative(weights) and weights.sum() > 0
     check_that(good, argument, "finite, >= 0 and not all 0", weights)
     return GridAxis(name, values, unit, kind, weights / weights.sum(), None, bounds)
+
+
+def _span(prior, argument):
+    """Return the distribution of ``(low, high)`` or ``(low, high, "log")``."""
+    from scipy import stats
+
+    low, high, *scale = prior
+    wanted = "(low, high) or (low, high, 'log'), two numbers in order (with 'log' above 0)"
+    is_span = is_number(low) and is_number(high) and low < high
+    is_log = scale == ["log"]
+    good = is_span and (not scale or (is_log and low > 0))
+    check_that(good, argument, wanted, prior)
+    if is_log:
+        return stats.loguniform(low, high)
+    return stats.uniform(low, high - low)
 
 
 def cell_integrals(prior, values, argument):

@@ -230,6 +230,11 @@ class FitResults(FitRows):
         ]
 
     @property
+    def residuals(self):
+        """Fluxes less those of the best model, over ``sigma``, shape (n, n_bands); NaN without a flux."""
+        return (self.flux - self.best_flux) / self.sigma
+
+    @property
     def band_off(self):
         """The band that is off (`FitFlags` ``BAND_OFF``), empty without: array of str, shape (n,)."""
         names = np.array(list(self.filters) + [""])
