@@ -68,10 +68,10 @@ class Detector(Interactive):
 
     Parameters
     ----------
-    effects : iterable of `~miricigale.detector.Effect`, optional
-        The effects of `miri_imager` by default. They must be in the order of
-        ``miricigale.detector.effects.order.ORDER``: the first ones act on light, `Photons` makes a ramp of it, and
-        `ADConversion` is the last. Effects of other kinds stay where they are put.
+    effects : iterable of `~miricigale.detector.Effect` or str, optional
+        The effects of `miri_imager` by default, or a set of them by name (``"flight"``). They must be in the
+        order of ``miricigale.detector.effects.order.ORDER``: the first ones act on light, `Photons` makes a ramp
+        of it, and `ADConversion` is the last. Effects of other kinds stay where they are put.
     properties : `~miricigale.instrument.DetectorProperties`, optional
         Gain, noise and the rest; `~miricigale.instrument.miri_detector` if not given.
 
@@ -97,6 +97,8 @@ class Detector(Interactive):
     def __post_init__(self):
         if self.effects is None:
             effects = [kind() for kind in _STANDARD]
+        elif isinstance(self.effects, str):
+            effects = type(self).miri_imager(self.effects).effects
         else:
             effects = self.effects
         object.__setattr__(self, "effects", checked_effects(effects))

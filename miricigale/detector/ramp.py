@@ -5,6 +5,7 @@ import numbers
 import operator
 from operator import attrgetter
 
+import astropy.units as u
 import numpy as np
 from astropy.nddata import NDData
 
@@ -222,6 +223,11 @@ class Ramp(Interactive, NDData):
             raise IndexError(msg)
         return self.integration(number % len(self.data))
 
+    @property
+    def times(self):
+        """Times of the groups since the reset, s, shape (n_groups,)."""
+        return np.arange(1, self.shape[1] + 1) * self.group_time * u.s
+
     def plot(self, pixel=None, ax=None, **kwargs):
         """
         Draw the counts of a pixel over time.
@@ -256,12 +262,13 @@ class Ramp(Interactive, NDData):
             pixel = np.unravel_index(np.argmax(gathered), gathered.shape)[::-1]
         x, y = map(operator.index, pixel)
         check_that(0 <= x < nx and 0 <= y < ny, "pixel", f"(x, y) below ({nx}, {ny})", pixel)
-        time = (np.arange(self.shape[1]) + 1) * self.group_time
         flags = None
         if self.group_dq is not None:
             flags = self.group_dq[:, :, y, x] != 0
         title = f"pixel ({x}, {y})"
-        return plot_ramp(time, self.data[:, :, y, x], flags, ax=ax, title=title, **kwargs)
+        return plot_ramp(
+            self.times.value, self.data[:, :, y, x], flags, ax=ax, title=title, **kwargs
+        )
 
     def _facts(self):
         return self.exposure._facts() | {"data": f"{self.shape} {self.data.dtype}"}

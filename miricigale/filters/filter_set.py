@@ -120,11 +120,7 @@ class FilterSet(WithTable):
         return f"<FilterSet {', '.join(self.names)}>"
 
     def __add__(self, other):
-        if isinstance(other, FilterSet):
-            added = other.filters
-        else:
-            added = (as_filter(other),)
-        return FilterSet((*self.filters, *added))
+        return FilterSet((*self.filters, *FilterSet(other).filters))
 
     def to_table(self):
         """The filters as a `~astropy.table.QTable`: ``name``, ``pivot`` and ``width`` (um)."""

@@ -75,6 +75,11 @@ class Parameter:
     def __set_name__(self, owner, name):
         self.name = name
 
+    @property
+    def description(self):
+        """What it is: ``doc``, by the name that astropy has for it."""
+        return self.doc
+
     def __get__(self, instance, owner=None):
         if instance is None:
             return self

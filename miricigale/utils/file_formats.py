@@ -10,7 +10,7 @@ from astropy.io.registry import UnifiedReadWrite, UnifiedReadWriteMethod
 from miricigale.utils.files import split_extension
 from miricigale.utils.table_files import write_table
 
-_SUFFIXES = {"fits": (".fits", ".fit", ".fits.gz"), "ascii.ecsv": (".ecsv",)}
+_SUFFIXES = {"fits": (".fits", ".fit", ".fits.gz"), "ascii.ecsv": (".ecsv",), "ds9": (".reg",)}
 
 
 class _Method(UnifiedReadWrite):
@@ -136,7 +136,7 @@ def register(cls, *, read=None, write=None, name="fits"):
         ``read(path, **options)`` returns an instance.
     write : callable, optional
         ``write(instance, path, *, overwrite=False)``.
-    name : {"fits", "ascii.ecsv"}, optional
+    name : {"fits", "ascii.ecsv", "ds9"}, optional
         Name of the format.
     """
 

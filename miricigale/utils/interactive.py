@@ -37,6 +37,11 @@ class Interactive:
             return value
         if (value := self._value(name)) is not None:
             return value
+        if name.startswith("plot_"):
+            # plot_residual_image for residual_image.plot
+            drawn = getattr(self, name.removeprefix("plot_"), None)
+            if hasattr(drawn, "plot"):
+                return drawn.plot
         for part in self._parts:
             # half-made copies have no parts yet
             value = getattr(vars(self).get(part), name, None)

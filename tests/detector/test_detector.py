@@ -242,6 +242,7 @@ def test_effects_take_the_place_of_their_kind():
     assert len(other.effects) == len(detector.effects) + 3
     back = other.without(Residual, Persistence, LastFrame).replace(Dark())
     assert back.effects == detector.effects
+    assert Detector("flight").effects == Detector.miri_imager("flight").effects
     assert Detector.miri_imager(Dark(current=2.0)).effects == detector.replace(Dark(2.0)).effects
     for name in ("CosmicRays", "cosmic_rays", "cosmic rays"):
         assert detector.without(name).effects == detector.without(CosmicRays).effects
@@ -268,6 +269,8 @@ def test_scenes_of_several_exposures_make_as_many_ramps(make_exposure, detector)
     refuses("'exposure' must be left out", detector.expose, scenes, dithers[0])
     # a ramp has the settings of its exposure, a detector the numbers of its properties
     assert ramps[0].exposure_time == dithers[0].exposure_time
+    assert_allclose(np.diff(ramps[0].times.to_value(u.s)), ramps[0].group_time)
+    assert ramps[0].times[-1] == dithers[0].integration_time
     assert ramps[0].nints == scenes[0].n_integrations == dithers[0].n_integrations
     assert detector.gain == detector.properties.gain
     refuses("Ramp", getattr, ramps[0], "dithered", error=AttributeError)

@@ -111,6 +111,11 @@ def test_names_are_forgiving():
         refuses(match, Filter.from_name, name, error=KeyError)
 
 
+def test_filters_of_any_form_are_added(filters):
+    for other in ("F1000W", ["F1000W"], Filter("F1000W"), FilterSet(["F1000W"])):
+        assert (filters + other).names == (*NAMES, "miri.f1000w")
+
+
 def test_masks_and_arrays_choose_filters(filters):
     assert filters[filters.pivots > 5 * u.um].names == tuple(NAMES[2:])
     assert filters[np.array([3, 0])].names == ("miri.f770w", "megacam.u")

@@ -138,6 +138,19 @@ def test_several_columns_are_a_table(results):
     refuses("no column or id 'redshit'", results.__getitem__, ["redshit"], error=KeyError)
 
 
+@pytest.mark.parametrize("name", ["redshift", "mass"])
+def test_probabilities_are_those_of_percentiles(results, name):
+    levels = results.percentile(name, [0.2, 0.9])
+    for row in range(3):
+        low, high = levels[row]
+        within = results[row].probability(name, low, high)
+        assert within == pytest.approx(0.7, abs=0.01)
+        assert results[row].probability(name, high=low) == pytest.approx(0.2, abs=0.01)
+        assert results.probability(name, high)[row] == pytest.approx(0.1, abs=0.01)
+    refuses("'high' must be at least 'low'", results.probability, name, 2.0, 1.0)
+    refuses("'low' must be given", results.probability, name)
+
+
 def test_residuals_are_in_errors(results):
     chi2 = np.nansum(results.residuals**2, axis=1)
     assert results.residuals.shape == results.flux.shape

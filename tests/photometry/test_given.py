@@ -170,6 +170,11 @@ def test_results_are_indexed_like_their_table(images, psfs, sky):
     message = "no column 'fluxx'; known: .*; did you mean 'flux'"
     refuses(message, result.__getitem__, "fluxx", error=KeyError)
     assert result.residual is result.residual_image
+    assert_array_equal(result.match(sky[3:5])["second"], matches["second"])
+    image = result.plot_residual().get_images()[0]
+    assert_array_equal(image.get_array(), result.plot_residual_image().get_images()[-1].get_array())
+    plt.close("all")
+    refuses("did you mean", getattr, result, "plot_fluxx", error=AttributeError)
 
 
 def test_a_kernel_is_applied_and_drawn(psfs, images):
@@ -187,6 +192,23 @@ def test_a_kernel_is_applied_and_drawn(psfs, images):
     truth = 1 - np.exp(-0.5 * (radius / sigma) ** 2)
     assert_allclose(curves["sharp PSF"], truth, atol=0.02)
     refuses("'array' must be a square array", MatchingKernel, psfs["psf"], pixel_scale=1 * u.arcsec)
+
+
+def test_errors_of_several_exposures_are_those_of_each():
+    deep = Exposure("F770W", n_groups=100)
+    short = Exposure("F1500W", n_groups=40)
+    both = ErrorModel.from_exposure([deep, short])
+    for exposure in (deep, short):
+        limit = ErrorModel.from_exposure(exposure, n_dithers=1).limiting_flux(exposure.filter)
+        assert both.limiting_flux(exposure.filter) == limit
+    # dithers add up
+    deep = deep.replace(pointing="53 -27")
+    dithered = ErrorModel.from_exposure(deep.dithered(4))
+    whole = ErrorModel.from_exposure(deep, 4 * deep.exposure_time, n_dithers=4)
+    assert dithered.limiting_flux("F770W") == whole.limiting_flux("F770W")
+    other = deep.replace(n_groups=50)
+    refuses("of one n_groups, got 100, 50", ErrorModel.from_exposure, [deep, other])
+    refuses("a list of exposures", ErrorModel.from_exposure, ["F770W"])
 
 
 def test_errors_of_an_exposure():

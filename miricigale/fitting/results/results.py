@@ -24,7 +24,7 @@ from miricigale.fitting.results.sample_flags import worst_bands
 from miricigale.fitting.results.table_columns import FIELDS, ODDS, OUTLIER, TEXTS
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.object_rows import PerObject, PerObjectDict, of_id
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.units import FNU
 from miricigale.utils.values import value_class
@@ -430,6 +430,49 @@ class FitResults(FitRows):
         # rounding may lift a sum above 1
         levels = np.minimum(first + np.cumsum(weights, axis=-1), 1.0)
         return edges, np.concatenate([first, levels], axis=-1)
+
+    def probability(self, name, low=None, high=None):
+        """
+        Return the posterior probability that a parameter or derived quantity is within limits.
+
+        Parameters
+        ----------
+        name : str
+            As for `percentile`.
+        low, high : float or `~astropy.units.Quantity`, optional
+            The limits; none on a side that is left out. A number is in the unit of the parameter.
+
+        Returns
+        -------
+        probability : `~numpy.ndarray`, shape (n,), or float
+            From `cdf`: to 0.001 for a derived quantity. What has its weight at 0, such as an AGN that is absent,
+            is above a ``low`` of 0 and not above any other.
+
+        Raises
+        ------
+        ValueError
+            If no limit is given, or they are not in order.
+        """
+        unit = self.unit(name)
+        wanted = "given, or 'high'"
+        check_that(low is not None or high is not None, "low", wanted, "None")
+        ends = [u.Quantity(end, unit).value for end in (low, high) if end is not None]
+        check_that(ends == sorted(ends), "high", f"at least 'low', {low}", high)
+        values, levels = self.cdf(name)
+        values, levels = np.broadcast_arrays(np.atleast_2d(values.value), levels)
+        out = np.empty(len(levels))
+        for row, (x, y) in enumerate(zip(values, levels, strict=True)):
+            # a cell of no width at 0 belongs to what is above 0
+            below = 0.0
+            if low is not None and ends[0] > x[0]:
+                below = np.interp(ends[0], x, y, left=0.0, right=1.0)
+            above = 1.0
+            if high is not None:
+                above = np.interp(ends[-1], x, y, left=0.0, right=1.0)
+            out[row] = above - below
+        if self.isscalar:
+            return float(out[0])
+        return out
 
     @property
     def redshift_odds(self):

@@ -257,8 +257,9 @@ class ErrorModel(WithTable):
 
         Parameters
         ----------
-        filter : str or `~miricigale.instrument.Exposure`
-            Any name of one of the imaging filters; or an exposure, which has the time, integrations and frames.
+        filter : str, `~miricigale.instrument.Exposure` or list of `~miricigale.instrument.Exposure`
+            Any name of one of the imaging filters; or an exposure, which has the time, integrations and frames; or
+            exposures of several filters, of which those of one filter, such as dithers, add up.
         time : `~astropy.units.Quantity`, optional
             Total exposure time.
         fractional : float, optional
@@ -289,6 +290,10 @@ class ErrorModel(WithTable):
         # loads photutils, which a command that reads depths does without
         from miricigale.depth import fitted_noise
 
+        if isinstance(filter, (list, tuple)):
+            check_that(time is None, "time", "left out for a list of exposures", time)
+            options |= {"fractional": fractional, "excess": excess}
+            return cls._of_exposures(filter, options)
         if isinstance(filter, Exposure):
             for name in ("n_integrations", "frame_time", "n_frames", "subarray"):
                 options.setdefault(name, getattr(filter, name))
@@ -300,6 +305,27 @@ class ErrorModel(WithTable):
         sky, photon = fitted_noise(filter, time, excess=excess, **options)
         curve = Analytic(sky, float(fractional), photon)
         return cls({str(filter): curve}, provenance(source="exposure"))
+
+    @classmethod
+    def _of_exposures(cls, exposures, options):
+        """Compute the noise of each filter of some exposures; those of one filter are dithers."""
+        dithers = {}
+        for exposure in exposures:
+            if not isinstance(exposure, Exposure):
+                raise argument_error("filter", "a list of exposures", repr(exposure))
+            dithers.setdefault(exposure.filter, []).append(exposure)
+        check_that(dithers, "filter", "one exposure or more", "none")
+        curves = {}
+        for name, parts in dithers.items():
+            first = parts[0]
+            for setting in ("n_integrations", "frame_time", "n_frames", "subarray", "n_groups"):
+                values = {str(getattr(part, setting)) for part in parts}
+                wanted = f"exposures in {name} of one {setting}"
+                check_that(len(values) == 1, "filter", wanted, ", ".join(sorted(values)))
+            time = sum(part.exposure_time for part in parts)
+            own = {"n_dithers": len(parts)} | options
+            curves |= cls.from_exposure(first, time, **own).curves
+        return cls(curves, provenance(source="exposure"))
 
     def sigma(self, flux, filter):
         """

@@ -259,3 +259,4 @@ def _field(state):
 register(SourceTemplates, read=_read_templates, write=_write_templates)
 register(ForcedPhotometryResult, read=_read_result, write=_write_result)
 register(ForcedPhotometryResult, write=write_ecsv, name="ascii.ecsv")
+register(ForcedPhotometryResult, write=ForcedPhotometryResult.write_regions, name="ds9")
