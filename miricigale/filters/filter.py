@@ -446,6 +446,10 @@ class Filter(Frozen, WithTable):
         wave, throughput, _ = self._fine
         return _core.photon_integral(wave, throughput, 1) / throughput.max() * WAVE
 
+    def integrate(self):
+        """Integral of the throughput over wavelength, um: the equivalent width."""
+        return self.width * self.throughput.max()
+
     @cached_property
     def fwhm(self):
         """Full width at half of the highest throughput, um."""

@@ -192,6 +192,18 @@ class Scene(WithTable):
         self._galaxy_flux, self._agn_flux = self._split_flux(agn)
         self._warn_of_fluxes()
 
+    def _value(self, name):
+        # half-made copies have no catalog yet
+        catalog = vars(self).get("_catalog")
+        if catalog is None:
+            return None
+        if name == "flux":
+            name = self._filter
+        return catalog[name] if name in catalog.colnames else None
+
+    def _value_names(self):
+        return ("flux", *self._catalog.colnames)
+
     def replace(self, **changes):
         """Scene with other values of the constructor's arguments, such as ``background="high"``."""
         return type(self)(**(self._arguments | changes))

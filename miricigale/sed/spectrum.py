@@ -92,7 +92,7 @@ def _without_flagged(fnu, table):
     return fnu
 
 
-def _plotted_unit(unit):
+def _flux_unit(unit):
     """Return the unit of a flux density, and what stands for it on an axis."""
     unit = u.Unit(unit)
     for kind, symbol in ((FNU, r"F_\nu"), (_FLAM, r"F_\lambda"), (_FLAM * u.AA, r"\nu F_\nu")):
@@ -185,6 +185,10 @@ class SED(Frozen, WithTable):
         "flux_density": "fnu",
         "flux_at": "fnu_at",
         "interpolate": "fnu_at",
+        "nufnu": "nu_fnu",
+        "nu_f_nu": "nu_fnu",
+        "lambda_flambda": "nu_fnu",
+        "lambda_f_lambda": "nu_fnu",
         "f_nu": "fnu",
         "f_lambda": "flam",
         "nu": "frequency",
@@ -260,6 +264,16 @@ class SED(Frozen, WithTable):
     def flam(self):
         """Flux density F_lambda, erg/s/cm2/Angstrom."""
         return self.fnu.to(_FLAM, u.spectral_density(self.wave))
+
+    @property
+    def nu_fnu(self):
+        """Flux nu F_nu, the same as lambda F_lambda, erg/s/cm2."""
+        return (self.frequency * self.fnu).to(_FLAM * u.AA)
+
+    def to(self, unit):
+        """Return the flux densities in a unit of F_nu, F_lambda or nu F_nu, `~astropy.units.Quantity`."""
+        unit, _ = _flux_unit(unit)
+        return self.fnu.to(unit, u.spectral_density(self.wave))
 
     def _changed(self, change):
         """Copy with F_nu of the whole and of each part changed."""
@@ -707,7 +721,7 @@ class SED(Frozen, WithTable):
         wave = self.wave.value
         if rest_frame:
             wave = self.rest_wavelength.value
-        unit, symbol = _plotted_unit(unit)
+        unit, symbol = _flux_unit(unit)
         axes = {"rest_frame": rest_frame, "label_y": symbol}
         density = u.spectral_density(self.wave)
         values = self.fnu.to_value(unit, density)

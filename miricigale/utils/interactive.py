@@ -78,7 +78,10 @@ class Interactive:
 
 
 class WithTable(Interactive):
-    """Base of what can be written as a table by its method ``to_table()``."""
+    """Base of what can be written as a table by its method ``to_table()``, and by ``QTable(...)`` of astropy."""
+
+    def __astropy_table__(self, cls, copy, **kwargs):
+        return cls(self.to_table(), copy=copy, **kwargs)
 
     def to_pandas(self):
         """Return the table as a `pandas.DataFrame`; positions are the columns ``ra`` and ``dec`` in deg."""

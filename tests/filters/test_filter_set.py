@@ -111,6 +111,12 @@ def test_names_are_forgiving():
         refuses(match, Filter.from_name, name, error=KeyError)
 
 
+def test_the_equivalent_width_is_that_of_synphot(filters):
+    band = filters["miri.f770w"]
+    assert_quantity_allclose(band.integrate(), band.to_synphot().equivwidth().to(u.um), rtol=1e-3)
+    assert band.equivwidth() == band.equivalent_width
+
+
 def test_filters_of_any_form_are_added(filters):
     for other in ("F1000W", ["F1000W"], Filter("F1000W"), FilterSet(["F1000W"])):
         assert (filters + other).names == (*NAMES, "miri.f1000w")

@@ -5,6 +5,7 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 from matplotlib import pyplot as plt
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -135,6 +136,9 @@ def test_several_columns_are_a_table(results):
     assert table.colnames == ["redshift", "mass"]
     assert_array_equal(table["mass"].value, results.mass.value)
     assert len(results[["redshift"]]) == len(results)
+    whole = QTable(results)
+    assert whole.colnames == results.to_table().colnames
+    assert_array_equal(whole["mass_p50"], results.mass)
     refuses("no column or id 'redshit'", results.__getitem__, ["redshit"], error=KeyError)
 
 

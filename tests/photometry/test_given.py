@@ -148,6 +148,7 @@ def test_results_are_indexed_like_their_table(images, psfs, sky):
     assert list(result.columns) == result.to_table().colnames
     frame = result.to_pandas()
     assert_allclose(frame["ra"], sky.ra.deg)
+    assert_array_equal(QTable(result)["flux"].value, result.flux.value)
     assert list(frame.columns[:3]) == ["id", "ra", "dec"]
     assert_allclose(result.magnitude.value, 23.9 - 2.5 * np.log10(result.flux.value))
     assert_allclose(result.mag_err.value, 1.0857362 / result.snr, rtol=1e-6)
@@ -201,6 +202,12 @@ def test_errors_of_several_exposures_are_those_of_each():
     for exposure in (deep, short):
         limit = ErrorModel.from_exposure(exposure, n_dithers=1).limiting_flux(exposure.filter)
         assert both.limiting_flux(exposure.filter) == limit
+    refuses("no band of this error model None", both.limiting_flux, error=KeyError)
+    single = ErrorModel.from_exposure(short)
+    # a model of one band needs no name
+    assert single.limiting_magnitude() == single.limiting_magnitude("F1500W")
+    limit = single.limiting_flux(n_sigma=7)
+    assert single.snr(limit) == pytest.approx(7, rel=1e-6)
     # dithers add up
     deep = deep.replace(pointing="53 -27")
     dithered = ErrorModel.from_exposure(deep.dithered(4))

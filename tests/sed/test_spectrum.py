@@ -272,6 +272,10 @@ def test_spectra_are_drawn_in_units_of_flux_densities(flat, unit, symbol, power)
     assert_allclose(y / y[0], (WAVE / WAVE[0]) ** power, rtol=1e-9)
     assert symbol in ax.get_ylabel()
     plt.close("all")
+    values = flat.to(unit)
+    assert values.unit == u.Unit(unit)
+    assert_allclose(values.value, y)
+    assert_quantity_allclose(flat.nu_fnu, flat.wave * flat.flam, rtol=1e-9)
     refuses("'unit' must be one of F_nu", flat.plot, unit="K", error=u.UnitsError)
 
 

@@ -238,6 +238,12 @@ def test_folders_that_are_written_have_no_names_of_files(
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
+def test_folders_have_defaults():
+    for words, folder in (("reduce x", "reduced"), ("inject x", "injected")):
+        parser = make_parser(words.split())
+        assert parser.parse_args(words.split()).folder == Path(folder)
+
+
 def test_folders_may_have_dots_in_their_names_and_stand_already(tmp_path):
     (tmp_path / "old.fits").mkdir()
     for name in ("out.v1.5", "old.fits"):

@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.fitting._core import percentile_places
 from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.interactive import WithTable
 from miricigale.utils.missing_values import floats
 from miricigale.utils.object_rows import ObjectRows
 from miricigale.utils.options import check_names, check_that
@@ -271,7 +272,7 @@ def other_name(name, known):
     return name
 
 
-class FitRows(ObjectRows):
+class FitRows(ObjectRows, WithTable):
     """Base of what fits return: objects that may be flagged as not fitted, and the model if it is known."""
 
     #: Where the formats of files are registered.

@@ -141,6 +141,10 @@ class ErrorModel(WithTable):
         return tuple(self.curves)
 
     def _curve(self, name):
+        """Return the curve of a band, which may be left out if there is only one."""
+        if name is None and len(self.curves) == 1:
+            (curve,) = self.curves.values()
+            return curve
         try:
             return self.curves[_band(name)]
         except KeyError:
@@ -327,7 +331,7 @@ class ErrorModel(WithTable):
             curves |= cls.from_exposure(first, time, **own).curves
         return cls(curves, provenance(source="exposure"))
 
-    def sigma(self, flux, filter):
+    def sigma(self, flux, filter=None):
         """
         Return the 1-sigma error of a flux in uJy.
 
@@ -335,8 +339,8 @@ class ErrorModel(WithTable):
         ----------
         flux : `~astropy.units.Quantity`
             Of any shape and sign.
-        filter : str
-            Band.
+        filter : str, optional
+            Band; needed if there are several.
 
         Returns
         -------
@@ -346,7 +350,11 @@ class ErrorModel(WithTable):
         """
         return self._curve(filter).sigma(to_array(flux, FNU, "flux")) * FNU
 
-    def extrapolated(self, flux, filter):
+    def snr(self, flux, filter=None):
+        """Return the signal-to-noise ratio of a flux; parameters are those of `sigma`."""
+        return (flux / self.sigma(flux, filter)).to_value(u.dimensionless_unscaled)
+
+    def extrapolated(self, flux, filter=None):
         """
         Find fluxes outside of the range in which the model was measured.
 
@@ -358,14 +366,14 @@ class ErrorModel(WithTable):
         """
         return self._curve(filter).outside(to_array(flux, FNU, "flux"))
 
-    def limiting_flux(self, filter, n_sigma=5.0):
+    def limiting_flux(self, filter=None, n_sigma=5.0):
         """
         Find the flux (uJy) above which the signal-to-noise exceeds a value.
 
         Parameters
         ----------
-        filter : str
-            Band.
+        filter : str, optional
+            Band; needed if there are several.
         n_sigma : float, optional
             The value.
 
@@ -378,14 +386,14 @@ class ErrorModel(WithTable):
         check_positive(n_sigma, "n_sigma")
         return limiting_flux(self._curve(filter), n_sigma) * FNU
 
-    def limiting_magnitude(self, filter, n_sigma=5.0):
+    def limiting_magnitude(self, filter=None, n_sigma=5.0):
         """
         Find the AB magnitude at which the signal-to-noise reaches a value.
 
         Parameters
         ----------
-        filter : str
-            Band.
+        filter : str, optional
+            Band; needed if there are several.
         n_sigma : float, optional
             Signal-to-noise at the limit (the paper's error of 0.217 mag is one of 5.003).
 
