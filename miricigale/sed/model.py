@@ -10,7 +10,7 @@ from miricigale.filters import FilterSet
 from miricigale.refdata import citations
 from miricigale.sed import gridding, presets, tables
 from miricigale.sed.chain import Chain
-from miricigale.sed.component import in_order, read_config
+from miricigale.sed.component import Component, in_order, named_component, read_config
 from miricigale.sed.derived import DERIVED, Derived
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
@@ -231,6 +231,44 @@ class SEDModel(Interactive):
         model._notes = self._notes
         model.preset = self.preset
         return model
+
+    def replace(self, *components):
+        """
+        Model with other components, each in the place of the one of its role.
+
+        Parameters
+        ----------
+        *components : `~miricigale.sed.Component` or str
+            Components, or names of some with their defaults. One of a role that the chain lacks is added.
+
+        Returns
+        -------
+        model : `SEDModel`
+            Without ``preset``: the axes of that are of other components.
+
+        Examples
+        --------
+        >>> from miricigale import SEDModel
+        >>> SEDModel.yang2021(libraries="bundled", agn=False).replace("smc")
+        <SEDModel delayed -> bc03 -> smc -> dl07_alpha -> meiksin2006>
+        """
+        new = {}
+        for component in components:
+            if isinstance(component, str):
+                component = named_component(component)
+            check_that(
+                isinstance(component, Component),
+                "components",
+                "Component instances or names",
+                component,
+            )
+            new[component.role] = component
+        kept = [component for component in self.components if component.role not in new]
+        return type(self)(
+            [*kept, *new.values()],
+            cosmology=self.cosmology,
+            frac_agn_definition=self.frac_agn_definition,
+        )
 
     def named_axes(self, name=None):
         """

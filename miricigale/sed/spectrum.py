@@ -105,11 +105,17 @@ def _flux_unit(unit):
 
 
 class _Flux(u.Quantity):
-    """The spectrum by the name ``flux``, whose call says what gives the flux in a band."""
+    """The spectrum by the name ``flux``, whose call is the flux in a band."""
 
-    def __call__(self, *_):
-        msg = "SED.flux is the spectrum (fnu); synthetic_flux(band) gives the flux in a band"
-        raise TypeError(msg)
+    def __call__(self, band):
+        return self._sed.synthetic_flux(band)
+
+    @classmethod
+    def of(cls, sed):
+        """The flux densities of an SED."""
+        flux = sed.fnu.view(cls)
+        flux._sed = sed
+        return flux
 
 
 class Parts(dict):
@@ -214,7 +220,7 @@ class SED(Frozen, WithTable):
         if "meta" not in self.__dict__:
             return None
         if name == "flux":
-            return self.fnu.view(_Flux)
+            return _Flux.of(self)
         return (self.derived | self.parameters).get(name)
 
     def _value_names(self):

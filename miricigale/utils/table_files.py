@@ -140,6 +140,8 @@ TABLE_FORMATS = {
     ".hdf5": "hdf5",
     ".parquet": "parquet",
 }
+#: Those that tables are written in: plain text keeps the units too.
+_WRITTEN_FORMATS = TABLE_FORMATS | {".txt": "ascii.ecsv", ".dat": "ascii.ecsv"}
 #: What astropy must know further to write a format.
 _OPTIONS = {
     "hdf5": {"path": "table", "serialize_meta": True},
@@ -169,7 +171,8 @@ def write_table(table, path, *, overwrite=False):
     table : `~astropy.table.Table`
         The table.
     path : path-like
-        FITS (or ``.fits.gz``), ECSV, CSV, VOTable (``.xml``), HDF5 (with h5py) or parquet (with pyarrow).
+        FITS (or ``.fits.gz``), ECSV (also as ``.txt`` and ``.dat``), CSV, VOTable (``.xml``), HDF5 (with h5py) or
+        parquet (with pyarrow).
     overwrite : bool, optional
         Whether a file that is there is replaced.
 
@@ -181,8 +184,8 @@ def write_table(table, path, *, overwrite=False):
         If the file is there and ``overwrite`` is not set.
     """
     path = Path(path)
-    form = TABLE_FORMATS.get(Path(path.name.lower().removesuffix(".gz")).suffix)
-    wanted = f"a file ending in one of {', '.join(TABLE_FORMATS)}"
+    form = _WRITTEN_FORMATS.get(Path(path.name.lower().removesuffix(".gz")).suffix)
+    wanted = f"a file ending in one of {', '.join(_WRITTEN_FORMATS)}"
     check_that(form is not None, "path", wanted, str(path))
     if form == "parquet":
         require("pyarrow", extra="parquet")

@@ -604,6 +604,20 @@ def test_what_a_session_completes_are_components():
     assert {model[name].name for name in names} == {one.name for one in model.components}
 
 
+def test_components_take_the_place_of_those_of_their_role():
+    model = SEDModel.yang2021(libraries="bundled", cosmology=FlatLambdaCDM(70, 0.3))
+    other = model.replace("smc", DelayedSFH(tau=3.0))
+    assert other["attenuation"].name == "smc"
+    assert other.defaults["tau"] == 3.0
+    assert other["agn"] is model["agn"]
+    assert other.cosmology is model.cosmology
+    assert other.preset is None
+    without = SEDModel(["delayed", "bc03"])
+    assert without.replace("calzetti").component("attenuation").name == "calzetti"
+    refuses("'components' must be", model.replace, 3, error=(TypeError, ValueError))
+    refuses("no .*'smmc'", model.replace, "smmc", error=KeyError)
+
+
 def test_components_are_indexed_by_name_role_and_number():
     model = SEDModel.yang2021(libraries="bundled")
     assert model[0] is model["sfh"] is model.components[0]

@@ -215,6 +215,11 @@ def test_magnitudes_of_several_bands_are_those_of_each(flat):
     assert np.isnan(dark.magnitudes(bands).value).all()
 
 
+def test_the_flux_is_an_array_and_that_of_a_band(flat):
+    assert_quantity_allclose(flat.flux, flat.fnu)
+    assert flat.flux("F770W") == flat.synthetic_flux("F770W")
+
+
 @pytest.mark.parametrize("flux", [10 * u.uJy, 1e-2 * u.mJy, (23.9 - 2.5) * u.ABmag])
 def test_spectra_are_scaled_to_a_flux_in_a_band(flat, flux):
     scaled = flat.normalize(flux, "F770W")

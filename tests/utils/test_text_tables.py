@@ -7,12 +7,12 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import QTable, Table
 
 from helpers.errors import refuses
 from miricigale.utils.exceptions import CatalogWarning, DataError
 from miricigale.utils.row_files import open_rows
-from miricigale.utils.table_files import read_table
+from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.tables import as_table
 
 SEXTRACTOR = """#   1 NUMBER       Running object number
@@ -215,3 +215,13 @@ def test_tables_between_bars_are_read(rule, tmp_path):
     table = read_table(tmp_path / "c.md", wanted="a catalog")
     assert table["id"].tolist() == [7, 9]
     assert table["f"].tolist() == [2.5, 3.5]
+
+
+@pytest.mark.parametrize("name", ["t.txt", "t.dat"])
+def test_tables_in_plain_text_keep_their_units(tmp_path, name):
+    table = QTable({"id": [1, 2], "flux": [1.5, 2.5] * u.uJy}, meta={"seed": 3})
+    write_table(table, tmp_path / name)
+    back = read_table(tmp_path / name, wanted="a table")
+    assert back["flux"].unit == u.uJy
+    assert back["flux"].value.tolist() == [1.5, 2.5]
+    assert back.meta["seed"] == 3
