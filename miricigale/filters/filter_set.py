@@ -82,6 +82,11 @@ class FilterSet(WithTable):
         """Pivot wavelengths, um, shape (n_filters,)."""
         return u.Quantity([f.pivot for f in self.filters]).to(WAVE)
 
+    @property
+    def widths(self):
+        """Rectangular widths, um, shape (n_filters,)."""
+        return u.Quantity([f.width for f in self.filters]).to(WAVE)
+
     def __len__(self):
         return len(self.filters)
 
@@ -158,13 +163,13 @@ class FilterSet(WithTable):
             weights.append(band.weights(wave, tolerance=tolerance))
         return np.stack(weights)
 
-    def synthetic_fluxes(self, sed):
+    def synthetic_fluxes(self, sed, flux=None):
         """
         Mean flux densities of a spectrum; see `Filter.synthetic_flux`.
 
         Parameters
         ----------
-        sed : object
+        sed, flux
             See `Filter.synthetic_flux`.
 
         Returns
@@ -182,12 +187,12 @@ class FilterSet(WithTable):
         """
         if are_spectra(sed):
             return u.Quantity([self.synthetic_fluxes(spectrum) for spectrum in sed])
-        wave, fnu = spectrum_arrays(sed, self.filters)
+        wave, fnu = spectrum_arrays(sed if flux is None else (sed, flux), self.filters)
         return self.weights(wave) @ fnu * FNU
 
-    def synthetic_magnitudes(self, sed):
+    def synthetic_magnitudes(self, sed, flux=None):
         """AB magnitudes of a spectrum, NaN where the flux is not positive; see `synthetic_fluxes`."""
-        return ab_magnitude(self.synthetic_fluxes(sed)) * u.ABmag
+        return ab_magnitude(self.synthetic_fluxes(sed, flux)) * u.ABmag
 
     def plot(self, ax=None, **kwargs):
         """

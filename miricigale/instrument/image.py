@@ -83,6 +83,16 @@ class Image(Interactive, CCDData):
         return (np.sqrt(np.prod(scales)) * u.deg).to(ANGLE)
 
     @property
+    def filter(self):
+        """Name of the filter; None if ``meta`` has none."""
+        return self.meta.get("filter")
+
+    @property
+    def pixel_area(self):
+        """Area of a pixel, arcsec2: that of the mean scale."""
+        return self.pixel_scale**2
+
+    @property
     def err(self):
         """Standard deviations as an array, in the unit of the image; None without an uncertainty."""
         if self.uncertainty is None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from miricigale.depth import sky_background
 from miricigale.filters.band_names import find_filter
+from miricigale.filters.band_table import BandTable
 from miricigale.instrument import Exposure, aperture, pixel_area_map
 from miricigale.instrument.header_wcs import as_wcs
 from miricigale.instrument.image import Image
@@ -173,7 +174,8 @@ class Scene(WithTable):
         if isinstance(catalog, str) and catalog in resources():
             catalog = read_catalog(catalog)
         sources = as_sources(catalog, self._filter)
-        self._catalog = check_catalog(sources, filters=[self._filter], wcs=wcs)
+        catalog = check_catalog(sources, filters=[self._filter], wcs=wcs)
+        self._catalog = BandTable(catalog, copy=False)
         if psf is None and (exposure is None or wcs is not exposure.wcs):
             # the model is in the axes of the detector
             raise argument_error("psf", "given for a grid that is not that of an exposure", "None")
@@ -393,7 +395,7 @@ class Scene(WithTable):
         painted, ``flux_total``, ``flux_agn`` (of it), ``flux_in_image`` and ``flags``
         (`SceneFlags`).
         """
-        return self._painted[1].copy()
+        return BandTable(self._painted[1], copy=True)
 
     def to_table(self):
         """What is in the image: `truth`."""

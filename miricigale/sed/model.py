@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.filters import FilterSet
 from miricigale.refdata import citations
@@ -324,6 +325,22 @@ class SEDModel(Interactive):
     def defaults(self):
         """Default of every parameter in its unit: dict of name to float."""
         return default_values(self._parameters)
+
+    def to_table(self):
+        """
+        Tabulate the parameters.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``name``, ``default``, ``low`` and ``high`` (bounds), ``unit`` and ``description`` of each.
+        """
+        rows = []
+        for name, parameter in self._parameters.items():
+            low, high = parameter.bounds
+            unit = str(parameter.unit)
+            rows.append((name, parameter.default, low, high, unit, parameter.description))
+        return QTable(rows=rows, names=["name", "default", "low", "high", "unit", "description"])
 
     def component(self, role):
         """The component of a role (one of `~miricigale.sed.ROLES`), or None."""

@@ -191,6 +191,8 @@ class SED(Frozen, WithTable):
         "flux_density": "fnu",
         "flux_at": "fnu_at",
         "interpolate": "fnu_at",
+        "agn_fraction": "frac_agn",
+        "uv_slope": "beta",
         "nufnu": "nu_fnu",
         "nu_f_nu": "nu_fnu",
         "lambda_flambda": "nu_fnu",
@@ -255,6 +257,11 @@ class SED(Frozen, WithTable):
     def derived(self):
         """Derived quantities of the model by name, such as ``stellar_mass``; see `SEDModel.derived_columns`."""
         return self.meta.get("derived", {})
+
+    @property
+    def ssfr(self):
+        """Specific star-formation rate of a model, for its living stars, 1/yr."""
+        return (self.sfr / self.stellar_mass).to(1 / u.yr)
 
     @property
     def rest_wavelength(self):

@@ -7,6 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
 
+from miricigale.filters.band_table import BandTable
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
 from miricigale.sed.chain import SIX, SKY, STELLAR, distinct
@@ -569,4 +570,5 @@ def _evaluate_rows(model, table, filters):
     for name, column in zip(filters.names, flux.T, strict=True):
         out[name] = column * FNU, f"model flux density in {name}"
     out |= {n: (derived[n] * entry.unit, entry.text) for n, entry in names.items()}
-    return described_table(out | {"flags": (flags, ModelFlags.describe())}, model.meta)
+    columns = out | {"flags": (flags, ModelFlags.describe())}
+    return described_table(columns, model.meta, cls=BandTable)

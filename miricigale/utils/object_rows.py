@@ -40,6 +40,8 @@ def of_id(method):
     def method_of_id(rows, *args, **kwargs):
         if rows.isscalar:
             return method(rows, *args, **kwargs)
+        if "id" in kwargs and not args:
+            args = (kwargs.pop("id"),)
         usage = f"{name} is of a single object: results.{name}(id), or results[0].{name}() by row"
         if not args or np.ndim(args[0]) > 0:
             raise TypeError(usage)

@@ -120,7 +120,7 @@ def _filled(column, n):
     return u.Quantity([column] * n)
 
 
-def described_table(columns, meta=None):
+def described_table(columns, meta=None, *, cls=None):
     """
     Make a table whose columns say what they are.
 
@@ -130,6 +130,8 @@ def described_table(columns, meta=None):
         Values and description by name; no description if that is None.
     meta : dict, optional
         Provenance.
+    cls : type, optional
+        Class of the table; `~astropy.table.QTable` by default.
 
     Returns
     -------
@@ -138,7 +140,8 @@ def described_table(columns, meta=None):
     """
     from astropy.table import QTable
 
-    table = QTable({name: values for name, (values, _) in columns.items()}, meta=meta, copy=True)
+    cls = cls or QTable
+    table = cls({name: values for name, (values, _) in columns.items()}, meta=meta, copy=True)
     for name, (_, text) in columns.items():
         table[name].info.description = text
     return table

@@ -126,6 +126,7 @@ def test_masks_and_arrays_choose_filters(filters):
     assert filters[filters.pivots > 5 * u.um].names == tuple(NAMES[2:])
     assert filters[np.array([3, 0])].names == ("miri.f770w", "megacam.u")
     assert [filters.index(name) for name in ("F770W", "megacam.u")] == [3, 0]
+    assert_quantity_allclose(filters.widths, [f.width for f in filters])
     refuses("'key' must be of one value for each of 5 filters", filters.__getitem__, [True, False])
 
 
@@ -136,6 +137,7 @@ def test_several_spectra_have_a_row_each(filters):
     assert_quantity_allclose(fluxes, np.outer([3, 6, 3], np.ones(5)) * u.uJy, rtol=1e-6)
     one_band = filters["miri.f770w"].synthetic_flux((flat, 2 * flat))
     assert_quantity_allclose(one_band, [3, 6] * u.uJy, rtol=1e-6)
+    assert_quantity_allclose(filters.synthetic_fluxes(wave, flat.fnu), 3 * u.uJy, rtol=1e-6)
     table = QTable({"lambda": wave[::-1].to(u.AA), "f_nu": np.full(700, 3e-3) * u.mJy})
     assert_quantity_allclose(filters.synthetic_fluxes(table), 3 * u.uJy, rtol=1e-6)
     # AB magnitude of 3 uJy

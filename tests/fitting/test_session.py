@@ -136,6 +136,10 @@ def test_several_columns_are_a_table(results):
     assert table.colnames == ["redshift", "mass"]
     assert_array_equal(table["mass"].value, results.mass.value)
     assert len(results[["redshift"]]) == len(results)
+    part = results.to_table(["chi2_best", "mass"])
+    names = [f"mass_{suffix}" for suffix in ("mean", "std", "p16", "p50", "p84", "best")]
+    assert part.colnames == ["chi2_best", *names, "mass_logmean"]
+    refuses("no column 'masss'", results.to_table, ["masss"], error=KeyError)
     whole = QTable(results)
     assert whole.colnames == results.to_table().colnames
     assert_array_equal(whole["mass_p50"], results.mass)

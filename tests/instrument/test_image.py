@@ -76,4 +76,6 @@ def test_errors_of_an_image_are_standard_deviations():
         np.ones((2, 2)), unit="MJy/sr", uncertainty=VarianceUncertainty(np.full((2, 2), 9.0))
     )
     assert_array_equal(image.err, 3.0)
-    assert Image(np.ones((2, 2)), unit="MJy/sr").err is None
+    plain = Image(np.ones((2, 2)), unit="MJy/sr", filter="F770W")
+    assert plain.err is None
+    assert plain.filter == "miri.f770w"

@@ -125,6 +125,7 @@ def test_a_scene_with_another_setting_is_another(exposure):
     assert_allclose(difference, 2.0, rtol=1e-6)
     assert bright.exposure is exposure
     # columns of the catalog are found
+    assert scene.catalog["F1500W" if scene.filter == "miri.f1500w" else "F770W"] == scene.flux
     assert scene.flux == scene.catalog[scene.filter]
     assert scene.sky.ra.deg == pytest.approx(53.0)
     refuses("unexpected keyword", scene.replace, sky=3, error=TypeError)

@@ -618,6 +618,25 @@ def test_components_take_the_place_of_those_of_their_role():
     refuses("no .*'smmc'", model.replace, "smmc", error=KeyError)
 
 
+def test_parameters_and_fluxes_are_tables():
+    model = SEDModel.yang2021(libraries="bundled")
+    table = model.to_table()
+    assert table["name"].tolist() == list(model.parameters)
+    age = table[table["name"] == "age"][0]
+    assert (age["default"], age["high"], age["unit"]) == (
+        1.0,
+        model.parameters["age"].bounds[1],
+        "Gyr",
+    )
+    assert age["description"] == model.parameters["age"].doc
+    fluxes = model.fluxes(redshift=[1.0], filters=["F770W"])
+    assert fluxes["F770W"] == fluxes["miri.f770w"]
+    sed = model(redshift=1.0, mass=1e10, frac_agn=0.2)
+    assert sed.agn_fraction == 0.2
+    assert sed.uv_slope == sed.derived["beta"]
+    assert_quantity_allclose(sed.ssfr * sed.stellar_mass, sed.sfr)
+
+
 def test_components_are_indexed_by_name_role_and_number():
     model = SEDModel.yang2021(libraries="bundled")
     assert model[0] is model["sfh"] is model.components[0]

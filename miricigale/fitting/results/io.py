@@ -20,7 +20,7 @@ from miricigale.utils.files import open_fits, replacing
 from miricigale.utils.folder import RecordFolder
 from miricigale.utils.named_values import attributes, subset
 from miricigale.utils.object_rows import ByID
-from miricigale.utils.options import check_data, check_names
+from miricigale.utils.options import check_data
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.tables import ascii_ids
@@ -390,7 +390,7 @@ class FitResultsFiles:
         Parameters
         ----------
         columns : list of str, optional
-            Columns to keep, all by default; memory is needed for these only.
+            As of that; memory is needed for these only.
 
         Returns
         -------
@@ -407,11 +407,7 @@ class FitResultsFiles:
     def _tables(self, columns):
         check_data(self.paths, self.path, "holds no part yet")
         for part in self.parts():
-            table = part.to_table()
-            check_names(columns or (), "column", table.colnames)
-            if columns is not None:
-                table = table[list(columns)]
-            yield table
+            yield part.to_table(columns)
 
     def write_table(self, path, *, columns=None, overwrite=False):
         """

@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters.band_names import known_filter
+from miricigale.filters.band_table import BandTable
 from miricigale.fitting.data.likelihood import FitFlags, filter_names
 from miricigale.fitting.posterior.posterior import (
     FitRows,
@@ -532,9 +533,14 @@ class FitResults(FitRows):
 
     # -------------------------------------------------------------- tables and drawings
 
-    def to_table(self):
+    def to_table(self, columns=None):
         """
         Tabulate the results.
+
+        Parameters
+        ----------
+        columns : list of str, optional
+            Columns to keep, or parameters for all columns of these; all by default.
 
         Returns
         -------
@@ -549,26 +555,42 @@ class FitResults(FitRows):
         """
         rows = self._several()
         texts = TEXTS["object"] | {"flags": FitFlags.describe()}
-        columns = {n: (getattr(rows, FIELDS.get(n, n)), text) for n, text in texts.items()}
-        columns = {n: value for n, value in columns.items() if value[0] is not None}
+        table = {n: (getattr(rows, FIELDS.get(n, n)), text) for n, text in texts.items()}
+        table = {n: value for n, value in table.items() if value[0] is not None}
         for name in rows.parameters:
             unit = rows.unit(name)
             meaning = rows._meaning(name)
             percentiles = rows.percentile(name, LEVELS)
             parts = [rows.mean(name), rows.std(name), *percentiles.T, rows.best[name]]
             for (suffix, text), value in zip(TEXTS["parameter"].items(), parts, strict=True):
-                columns[f"{name}_{suffix}"] = (value, f"{text} of {meaning}")
+                table[f"{name}_{suffix}"] = (value, f"{text} of {meaning}")
             if rows.extensive(name):
                 log_mean = rows.moments[:, rows._quantity(name), 2] * u.dex
                 text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
-                columns[f"{name}_logmean"] = (log_mean, text)
+                table[f"{name}_logmean"] = (log_mean, text)
             if name == "redshift" and not rows.redshift_fixed:
-                columns["redshift_odds"] = (rows.redshift_odds, ODDS)
+                table["redshift_odds"] = (rows.redshift_odds, ODDS)
         if rows.outlier is not None:
             for name in rows.fitted_filters:
                 value = rows.outlier[:, rows.filters.index(name)]
-                columns[f"{name}_outlier"] = (value, f"how likely {name} is wrong")
-        return described_table(columns, dict(self.meta))
+                table[f"{name}_outlier"] = (value, f"how likely {name} is wrong")
+        return described_table(self._chosen(table, columns), dict(self.meta), cls=BandTable)
+
+    def _chosen(self, table, names):
+        """Return columns of a table by name, or all of some parameters."""
+        if names is None:
+            return table
+        chosen = {}
+        for name in names:
+            if self._named(name) in self.parameters:
+                name = self._named(name)
+                of_name = [f"{name}_{suffix}" for suffix in TEXTS["parameter"]]
+                of_name = [column for column in [*of_name, f"{name}_logmean"] if column in table]
+            else:
+                check_names([name], "column", table)
+                of_name = [name]
+            chosen |= {column: table[column] for column in of_name}
+        return chosen
 
     def predict(self, filters=None):
         """
@@ -604,7 +626,7 @@ class FitResults(FitRows):
                 (f"{name}_best", rows.best_flux, "flux of the best model"),
             ):
                 columns[column] = (array[:, self.filters.index(name)] * FNU, text)
-        return described_table(columns, dict(self.meta))
+        return described_table(columns, dict(self.meta), cls=BandTable)
 
     samples = drawing.samples
     to_arviz = inference_data.of_results

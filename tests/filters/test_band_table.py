@@ -1,0 +1,38 @@
+"""Columns of tables by any name of their band."""
+
+import pickle
+
+import astropy.units as u
+import pytest
+from astropy.table import QTable, hstack
+
+from helpers.errors import refuses
+from miricigale.filters.band_table import BandTable
+
+
+@pytest.fixture
+def table():
+    columns = {"id": [1, 2], "miri.f770w": [3, 4] * u.uJy, "miri.f770w_err": [0.1, 0.2] * u.uJy}
+    return BandTable(columns | {"my_band": [5, 6]})
+
+
+def test_any_name_of_a_band_finds_its_column(table):
+    for name in ("F770W", "JWST/MIRI.F770W", "jwst_f770w", "miri.f770w"):
+        assert table[name].value.tolist() == [3, 4]
+        assert table[f"{name}_err"][1] == 0.2 * u.uJy
+    assert table["my_band"].tolist() == [5, 6]
+    assert table[["id", "F770W"]].colnames == ["id", "miri.f770w"]
+    assert isinstance(table[:1], BandTable)
+    refuses("F1000W", table.__getitem__, "F1000W", error=KeyError)
+
+
+def test_it_is_a_table_of_astropy_otherwise(table, tmp_path):
+    table["F770W"] = [7, 8] * u.uJy
+    # what is set is named as it is said
+    assert table.colnames[-1] == "F770W"
+    assert table["F770W"][0] == 7 * u.uJy
+    assert pickle.loads(pickle.dumps(table))["F770W_err"][0] == 0.1 * u.uJy
+    table.remove_column("F770W")
+    table.write(tmp_path / "t.ecsv")
+    assert QTable.read(tmp_path / "t.ecsv").colnames == table.colnames
+    assert hstack([QTable({"x": [1, 2]}), table])["miri.f770w"][1] == 4 * u.uJy
