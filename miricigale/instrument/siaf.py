@@ -101,7 +101,7 @@ def aperture(name="FULL"):
     Parameters
     ----------
     name : str, optional
-        One of `subarrays`.
+        One of `subarrays`, or its name in the SIAF, such as ``"MIRIM_FULL"``.
 
     Returns
     -------
@@ -119,6 +119,7 @@ def aperture(name="FULL"):
     (512, 512)
     """
     siaf = table("siaf")
+    name = name.removeprefix("MIRIM_")
     check_names([name], "sub-array", siaf["subarrays"])
     row = siaf["subarrays"][name]
     nx, ny = row["size"]

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
 
+from miricigale.filters.band_names import find_filter
 from miricigale.psf import _core
 from miricigale.psf.optics import jwst_constants
 from miricigale.utils.options import check_choice
@@ -53,24 +54,25 @@ def cruciform_fraction(filter_name, *, calibration="flight"):
     Parameters
     ----------
     filter_name : str
-        Such as ``"miri.f560w"``; zero for filters without a cruciform.
+        Any name of the filter, such as ``"F560W"``.
     calibration : {"flight", "stpsf"}, optional
         See `cruciform`.
 
     Returns
     -------
     fraction : float
-        Scattered over scattered plus direct light.
+        Scattered over scattered plus direct light; zero for filters without a cruciform.
 
     Examples
     --------
     >>> from miricigale.psf import cruciform_fraction
-    >>> for name in ("miri.f560w", "miri.f770w", "miri.f2100w"):
+    >>> for name in ("F560W", "F770W", "F2100W"):
     ...     print(f"{name} {cruciform_fraction(name):.3f}")
-    miri.f560w 0.153
-    miri.f770w 0.055
-    miri.f2100w 0.000
+    F560W 0.153
+    F770W 0.055
+    F2100W 0.000
     """
+    filter_name = find_filter(filter_name) or filter_name
     inner = jwst_constants()["cruciform_inner_radius"]
     outside = math.exp(-inner / _FOLDING)
     integral = 2 * _FOLDING * (0.5 * (1 - outside) + outside)

@@ -270,3 +270,8 @@ def test_nodes_of_fits_lie_evenly_about_the_middle_of_the_image():
         assert_allclose(np.sort(nodes.ravel()), np.sort(n - 1 - nodes.ravel()), atol=1e-9)
         assert -0.5 < nodes.min() < -0.4
         assert n - 0.6 < nodes.max() < n - 0.5
+
+
+def test_subarrays_have_their_names_of_the_siaf_too():
+    assert aperture("MIRIM_SUB256") == aperture("SUB256")
+    assert aperture("MIRIM_FULL").name == "FULL"

@@ -117,4 +117,5 @@ def test_in_flight_f560w_scatters_about_twice_as_much():
     flight = cruciform_fraction("miri.f560w")
     stpsf = cruciform_fraction("miri.f560w", calibration="stpsf")
     assert flight / (1 - flight) == pytest.approx(2 * stpsf / (1 - stpsf))
+    assert cruciform_fraction("F560W") == flight
     assert cruciform_fraction("miri.f2100w") == 0
