@@ -104,8 +104,8 @@ class Parameter:
 
         Parameters
         ----------
-        value : float or `~astropy.units.Quantity`
-            A bare number is taken in the declared unit.
+        value : float, `~astropy.units.Quantity` or str
+            A bare number is taken in the declared unit; text is a quantity, such as ``"300 Myr"``.
 
         Raises
         ------
@@ -114,6 +114,8 @@ class Parameter:
         ValueError
             If it is not one finite number inside the bounds, or a logarithm.
         """
+        if isinstance(value, str):
+            value = self._read(value)
         number = self.convert(value)
         check_that(np.ndim(number) == 0, self.name, "one number", f"shape {np.shape(number)}")
         if number is np.ma.masked or np.asarray(number).dtype.kind not in "iuf":
@@ -164,6 +166,16 @@ class Parameter:
         if isinstance(value, u.LogQuantity):
             value = value.physical
         return self._quantity(value, value.unit).to_value(self.unit)
+
+    def _read(self, text):
+        """Return the quantity that text is; numbers without a unit in quotes are slips."""
+        try:
+            value = u.Quantity(text)
+        except TypeError:
+            value = None
+        if value is None or value.unit == u.dimensionless_unscaled:
+            raise argument_error(self.name, "one number", repr(text))
+        return value
 
     def _refuse_logarithms(self, value):
         """Refuse bare numbers that are logarithms rather than values."""

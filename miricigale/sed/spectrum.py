@@ -312,6 +312,15 @@ class SED(Frozen, WithTable):
         check_that(alike, "other", "an SED at the same redshift and wavelengths", other)
         return SED(self.wave, self.fnu + other.fnu, redshift=self.redshift)
 
+    def __radd__(self, other):
+        # sum(...) begins with 0
+        if isinstance(other, int) and other == 0:
+            return self
+        return NotImplemented
+
+    def __neg__(self):
+        return self * -1.0
+
     def __sub__(self, other):
         if not isinstance(other, SED):
             return NotImplemented

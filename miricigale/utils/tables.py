@@ -97,6 +97,9 @@ def as_table(data, argument):
         return region_table(data)
     if is_frame(data):
         data = frame_columns(data, argument)
+    is_records = isinstance(data, (list, tuple)) and len(data) > 0
+    if is_records and all(isinstance(row, Mapping) for row in data):
+        return QTable(rows=list(data))
     try:
         if isinstance(data, Mapping):
             shape = np.broadcast_shapes((1,), *map(np.shape, data.values()))
@@ -106,7 +109,7 @@ def as_table(data, argument):
             return QTable(data, copy=False)
     except ValueError as err:
         raise argument_error(argument, "a table with columns of one length", str(err)) from None
-    wanted = "a table, a dict of columns, a structured array, a DataFrame or the path of a table"
+    wanted = "a table, a dict of columns, a list of dicts, a structured array, a DataFrame or the path of a table"
     raise argument_error(argument, wanted, type(data).__name__)
 
 

@@ -629,6 +629,12 @@ def test_parameters_and_fluxes_are_tables():
         "Gyr",
     )
     assert age["description"] == model.parameters["age"].doc
+    records = [{"redshift": 1.0, "mass": 1e10}, {"redshift": 2.0, "mass": 3e10}]
+    columns = {"redshift": [1.0, 2.0], "mass": [1e10, 3e10]}
+    of_records = model.fluxes(records, ["F770W"])
+    assert_quantity_allclose(of_records["F770W"], model.fluxes(columns, ["F770W"])["F770W"])
+    assert model(redshift=1.0, age="300 Myr").parameters["age"] == 0.3 * u.Gyr
+    refuses("'age' must be one number, got 'old'", model, redshift=1.0, age="old")
     fluxes = model.fluxes(redshift=[1.0], filters=["F770W"])
     assert fluxes["F770W"] == fluxes["miri.f770w"]
     sed = model(redshift=1.0, mass=1e10, frac_agn=0.2)
