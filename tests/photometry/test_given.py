@@ -204,6 +204,10 @@ def test_errors_of_several_exposures_are_those_of_each():
         assert both.limiting_flux(exposure.filter) == limit
     refuses("no band of this error model None", both.limiting_flux, error=KeyError)
     single = ErrorModel.from_exposure(short)
+    # columns are found by any name of the band
+    fluxes = QTable({"id": [1], "miri.f1500w": [9.0] * u.uJy})
+    perturbed = single.perturb(fluxes, seed=1)
+    assert perturbed["F1500W_err"] == single.sigma(9 * u.uJy)
     # a model of one band needs no name
     assert single.limiting_magnitude() == single.limiting_magnitude("F1500W")
     limit = single.limiting_flux(n_sigma=7)

@@ -9,6 +9,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters.band_names import find_filter
+from miricigale.filters.band_table import BandTable
 from miricigale.instrument import Exposure
 from miricigale.instrument.published_tables import imager_filter
 from miricigale.photometry.errors.error_curves import (
@@ -433,7 +434,7 @@ class ErrorModel(WithTable):
         for name in filters:
             relative = _relative_noise(noise, name, len(table))
             table[error_column(name)] = relative * self.sigma(table[name], name)
-        return table
+        return BandTable(table, copy=False)
 
     def perturb(self, photometry, *, seed, filters=None):
         """
@@ -464,7 +465,7 @@ class ErrorModel(WithTable):
         seed = check_seed(seed)
         for name in filters:
             add_noise(table, name, self.sigma(table[name], name), seed)
-        return table
+        return BandTable(table, copy=False)
 
     def to_table(self):
         """
