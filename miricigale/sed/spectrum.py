@@ -399,6 +399,10 @@ class SED(Frozen, WithTable):
             parts[name] = part.redshifted(redshift, cosmology=cosmology)
         return self.replace(wave=self.wave * stretch, fnu=fnu, redshift=redshift, components=parts)
 
+    def rest_frame(self, *, cosmology=COSMOLOGY):
+        """Return the source at redshift 0, at 10 pc; see `redshifted`."""
+        return self.redshifted(0.0, cosmology=cosmology)
+
     def synthetic_flux(self, band):
         """Mean flux density in a band; see `~miricigale.filters.Filter.synthetic_flux`."""
         return as_filter(band).synthetic_flux(self)
@@ -478,7 +482,7 @@ class SED(Frozen, WithTable):
         >>> print(f"{sed.absolute_magnitude('2MASS J'):.1f}")
         -21.6 mag(AB)
         """
-        return self.redshifted(0.0, cosmology=cosmology).synthetic_magnitude(band)
+        return self.rest_frame(cosmology=cosmology).synthetic_magnitude(band)
 
     def luminosity(self, low=None, high=None, *, cosmology=COSMOLOGY):
         """

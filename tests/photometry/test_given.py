@@ -148,6 +148,7 @@ def test_results_are_indexed_like_their_table(images, psfs, sky):
     assert list(result.columns) == result.to_table().colnames
     frame = result.to_pandas()
     assert_allclose(frame["ra"], sky.ra.deg)
+    assert_allclose(result.ra.deg, sky.ra.deg)
     assert_array_equal(QTable(result)["flux"].value, result.flux.value)
     assert list(frame.columns[:3]) == ["id", "ra", "dec"]
     assert_allclose(result.magnitude.value, 23.9 - 2.5 * np.log10(result.flux.value))

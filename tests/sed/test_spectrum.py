@@ -264,6 +264,9 @@ def test_tables_and_axes_of_a_spectrum(flat):
     ax = moved.plot(rest_frame=True)
     assert_allclose(ax.lines[-1].get_xdata(), moved.rest_wavelength.value)
     assert ax.get_xlabel().startswith("rest wavelength")
+    assert moved.rest_frame().redshift == 0
+    assert_quantity_allclose(moved.rest_frame().wave, moved.rest_wavelength)
+    assert_quantity_allclose(moved.rest_frame().luminosity(), moved.luminosity())
 
 
 @pytest.mark.parametrize(
