@@ -303,6 +303,9 @@ def field(folder):
         ):
             loose = np.array([loose_chi2(result, k, **form) for k in bright])
             print(f"  {np.sum(loose < 2)} {what}: {np.round(np.sort(loose), 2)}")
+        print(
+            f"  scatter of pixels in chi2: {100 * result.meta['pixel_scatter']:.1f} % of the light"
+        )
         print(f"  chi2 {np.round(np.sort(chi2), 2)}; pulls {pulls:.3f}, 5 sigma {depth:.1f} nJy")
         ratio = [round(light_ratio(result, k), 3) for k in bright[np.argsort(-snr[bright])]]
         print(f"  light over the model's within 0.5 arcsec, brightest first: {ratio}")

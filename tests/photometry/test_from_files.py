@@ -407,3 +407,8 @@ def test_a_real_field_agrees_with_another_program(data_file, tmp_path, capsys):
     assert 0.97 < np.median(ours[bright] / theirs[bright]) < 1.10
     faint = (ours < 10 * error) & np.isfinite(theirs)
     assert np.abs(np.median(((ours - theirs) / error)[faint])) < 0.5
+    # residuals of bright sources are noise and resampling; no flux is negative
+    assert np.nanmin(ours / error) > -5
+    bright = ours > 20 * error
+    assert np.count_nonzero(bright) >= 9
+    assert np.mean(table["miri.f770w_chi2"][bright] < 2) > 0.84

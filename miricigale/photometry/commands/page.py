@@ -184,6 +184,7 @@ def _summary(band):
         "n_detected": np.count_nonzero(good & (result.snr > 5)),
         "depth": np.nan,
         "rms": _pulls_rms(band.pulls),
+        "scatter": 100 * result.meta.get("pixel_scatter", 0.0) or np.nan,
         "background": Missing("not fitted"),
         "offset": Missing("no light"),
     }

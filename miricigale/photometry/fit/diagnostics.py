@@ -4,6 +4,7 @@ import numpy as np
 
 from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.detection.residual_sources import ResidualPeaks, residual_peaks
+from miricigale.photometry.fit.pixel_scatter import pixel_scatter
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.templates.normal_equations import noise_correlation, stated_correlation
 from miricigale.utils.parallel import chunks
@@ -24,6 +25,7 @@ class Diagnostics:
     model: np.ndarray
     residual: np.ndarray
     correlation: np.ndarray | None  # Of the noise; None where it is taken as white.
+    pixel_scatter: float  # Of `pixel_scatter`.
     #: (n,): Of each row of the bank; NaN where not fitted, and for second components.
     chi2: np.ndarray
     residual_fraction: np.ndarray
@@ -35,16 +37,27 @@ class Diagnostics:
     peaks: ResidualPeaks  # Light that no template explains.
 
 
-def diagnose(fit, xy):
-    """Compare a `TemplateFit` with its image; ``xy``, (n, 2), are all known sources, NaN far outside."""
+def diagnose(fit, xy, scatter=None):
+    """
+    Compare a `TemplateFit` with its image.
+
+    ``xy``, (n, 2), are all known sources, NaN far outside; ``scatter`` is the scatter of pixels over their light,
+    which is measured by default.
+    """
     model = fit.model()
     residual = fit.residual(model)
     correlation = None
     if fit.settings.errors.correlated_noise and len(fit.rows):
         correlation = _correlation(fit, residual, model)
+    if scatter is None:
+        scatter = pixel_scatter(fit, residual, model)
+    inverse_sigma = fit.inverse_sigma
+    if scatter > 0:
+        # noise, and what resampling does to the light of sources
+        inverse_sigma = inverse_sigma / np.hypot(1.0, scatter * model * inverse_sigma)
     # the image is its model and the residual
     chi2, residual_light, core_light, core, rim = _statistics(
-        fit, residual, residual + fit.arrays.usable * model
+        fit, residual, residual + fit.arrays.usable * model, inverse_sigma
     ).T
     with np.errstate(divide="ignore", invalid="ignore"):
         residual_light = residual_light / (fit.total * core)
@@ -67,7 +80,7 @@ def diagnose(fit, xy):
         # what the high-resolution image shows is not what is fitted here
         poor[fit.rows] |= fit.free.strain > POOR_STRAIN
     return Diagnostics(
-        model, residual, correlation, chi2, residual_light, rim, core_flux, poor, peaks
+        model, residual, correlation, scatter, chi2, residual_light, rim, core_flux, poor, peaks
     )
 
 
@@ -90,12 +103,12 @@ def _correlation(fit, residual, model):
     return correlation
 
 
-def _statistics(fit, residual, light):
+def _statistics(fit, residual, light, inverse_sigma):
     """
     Sum up the images where each template is, shape (n, 5).
 
-    Chi2, residual, light and template of each template's core (see the kernel), and the part of the template that
-    is on the rim.
+    Chi2 with 1 over the deviations of pixels, residual, light and template of each template's core (see the
+    kernel), and the part of the template that is on the rim.
     """
     n = len(fit.bank.order)
     statistics = np.full((n, 4), np.nan)
@@ -109,7 +122,7 @@ def _statistics(fit, residual, light):
                 rows = slice(block.first + part.start, block.first + part.stop)
                 values, box, start = block.stamps_of(part)
                 residual_statistics(
-                    values, box, start, residual, light, fit.inverse_sigma, statistics[rows]
+                    values, box, start, residual, light, inverse_sigma, statistics[rows]
                 )
                 if has_rim:
                     rim_light[rows] = _light_on(rim, values, box, start)

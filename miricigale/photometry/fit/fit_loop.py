@@ -125,7 +125,8 @@ def _split(fit, diagnostics, added, poor, new_xy):
     for _ in range(2):
         split_fit = added.fit(chosen, new_xy)
         split_fit.free_templates(added.catalog.fitted)
-        split_diagnostics = diagnose(split_fit, xy)
+        # chi2 of both by the same measure
+        split_diagnostics = diagnose(split_fit, xy, diagnostics.pixel_scatter)
         better = poor[chi2(split_fit, split_diagnostics) < before]
         if not len(better):
             return fit, diagnostics

@@ -193,6 +193,7 @@ def package(fit, diagnostics, new_xy, catalog, meta):
             pixel_scale=round(fit.scale, 6),
             correlated_noise=diagnostics.correlation is not None,
             measured_noise=fit.arrays.measured_noise,
+            pixel_scatter=round(diagnostics.pixel_scatter, 4),
             **_registration(fit, diagnostics, common, np.sum(flux > _BRIGHT_SNR * flux_err[0])),
             **evidence,
         ),

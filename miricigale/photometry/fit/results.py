@@ -118,7 +118,8 @@ class ForcedPhotometryResult(Tabular):
     coverage : `~numpy.ndarray`, shape (n,)
         Fraction of the template's light on usable pixels.
     chi2 : `~numpy.ndarray`, shape (n,)
-        Template-weighted mean of (residual / sigma)^2, about 1 for a good fit.
+        Template-weighted mean of (residual / sigma)^2, about 1 for a good fit. Sigma is the noise and, of the
+        light, the part ``meta["pixel_scatter"]`` in each pixel, which resampling causes.
     residual_fraction : `~numpy.ndarray`, shape (n,)
         Light left below the template's core over what the fit took there.
     template : str `~numpy.ndarray`, shape (n,)

@@ -41,8 +41,8 @@ class ForcedFlags(Flags):
     POOR_FIT = (
         256,
         (
-            "Residuals below the template are more than noise (chi2 above 2, and above twice the "
-            "measured noise), or the template had to change by far more than the high-resolution "
+            "Residuals below the template are more than noise and resampling (chi2 above 2, and above "
+            "twice the measured noise), or the template had to change by far more than the high-resolution "
             "image leaves open."
         ),
     )
