@@ -147,10 +147,10 @@ def test_errors_are_those_of_the_direct_convolution(tools, monkeypatch, max_byte
     assert found.noise_correlation.shape[0] >= 7
     seen = []
 
-    def direct(*args):
+    def direct(*args, **options):
         expected = direct_sandwich(*args[:3])
         scale = np.sqrt(expected.diagonal())
-        found, projection = sandwich_matrix(*args)
+        found, projection = sandwich_matrix(*args, **options)
         difference = (found - expected).toarray()
         seen.append(np.abs(difference / scale[:, None] / scale).max())
         return expected, projection

@@ -12,6 +12,7 @@ from miricigale.photometry._core.stamps import (
     pair_products,
     projections,
     residual_statistics,
+    scale_stamps,
     whiten_stamps,
 )
 
@@ -148,3 +149,19 @@ def test_grids_along_each_other_are_sampled_as_grids_that_are_turned():
     assert np.count_nonzero(straight[: start[1]]) < start[1]
     assert_allclose(nearly, straight, atol=1e-6)
     assert_allclose(turned, straight, atol=1e-4)
+
+
+def test_scaled_stamps_are_zero_beyond_the_image():
+    box = boxes(40, 8)
+    # as those that are spread: beyond the image on all sides
+    box = box + np.array([-6, -6, 12, 12], np.int32)
+    values, start = flat(box, 9)
+    image = np.random.default_rng(10).random(SHAPE).astype(np.float32)
+    expected = values.copy()
+    wide = np.pad(image, 10)
+    for (y, x, ny, nx), first in zip(box, start, strict=False):
+        part = wide[y + 10 : y + 10 + ny, x + 10 : x + 10 + nx]
+        expected[first : first + ny * nx] *= part.ravel()
+    assert box[:, :2].min() < 0
+    scale_stamps(values, box, start, image)
+    assert_array_equal(values, expected)

@@ -169,6 +169,26 @@ def whiten_stamps(values, box, start, inverse_sigma, out, sums):
 
 
 @njit()
+def scale_stamps(values, box, start, image):
+    """Multiply stamps by an image in place; what they have beyond the image is zero."""
+    for k in range(box.shape[0]):
+        nx = box[k, 3]
+        for y in range(box[k, 2]):
+            n = start[k] + y * nx
+            row = values[n : n + nx]
+            if box[k, 0] + y < 0 or box[k, 0] + y >= image.shape[0]:
+                row[:] = 0
+                continue
+            before = max(-box[k, 1], 0)
+            end = min(nx, image.shape[1] - box[k, 1])
+            row[:before] = 0
+            row[max(end, before) :] = 0
+            weight = image[box[k, 0] + y]
+            for x in range(before, end):
+                row[x] *= weight[box[k, 1] + x]
+
+
+@njit()
 def add_model(image, values, box, start, flux):
     """Add stamps times their fluxes to an image, in the order of the stamps."""
     for k in range(box.shape[0]):

@@ -9,6 +9,7 @@ import scipy.spatial
 from astropy.stats import gaussian_sigma_to_fwhm, mad_std
 from scipy.special import ndtr
 
+from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.values import value_class
 
@@ -70,12 +71,24 @@ def residual_peaks(fit, residual, model, xy):
     sampled = [part for part in chunks(len(residual), _ROWS // 8) if inverse_sigma[part].any()]
     sampled = sampled[:: max(1, residual.size // _SOME)]
     strips = parallel_map(matched.rows, sampled, executor=executor)
-    snr = np.concatenate([strip_snr for strip_snr, _ in strips])
-    power = np.concatenate([strip_power for _, strip_power in strips])
-    is_usable = np.concatenate([inverse_sigma[part] for part in sampled]) > 0
-    matched.min_power = 0.25 * np.median(power[is_usable])
+    # images as large as the residual are dropped as soon as they are used
+    power = np.concatenate(
+        [
+            strip_power[inverse_sigma[part] > 0]
+            for part, (_, strip_power) in zip(sampled, strips, strict=True)
+        ]
+    )
+    matched.min_power = 0.25 * np.median(power, overwrite_input=True)
+    del power
+    snr = np.concatenate(
+        [strip_snr[strip_power > matched.min_power] for strip_snr, strip_power in strips]
+    )
+    del strips
+    return_freed_memory()
     # what is a thousandth of the stated noise is that of the arithmetic
-    limit = LEFT_SNR * max(mad_std(snr[power > matched.min_power]), 1e-3)
+    limit = LEFT_SNR * max(mad_std(snr), 1e-3)
+    del snr
+    return_freed_memory()
     reach = int(np.ceil(width))
 
     def find(part):

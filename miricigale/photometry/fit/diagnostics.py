@@ -7,6 +7,7 @@ from miricigale.photometry.detection.residual_sources import ResidualPeaks, resi
 from miricigale.photometry.fit.pixel_scatter import pixel_scatter
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.templates.normal_equations import noise_correlation, stated_correlation
+from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import chunks
 from miricigale.utils.values import value_class
 
@@ -44,11 +45,14 @@ def diagnose(fit, xy, scatter=None):
     ``xy``, (n, 2), are all known sources, NaN far outside; ``scatter`` is the scatter of pixels over their light,
     which is measured by default.
     """
+    # what the fit has freed
+    return_freed_memory()
     model = fit.model()
     residual = fit.residual(model)
     correlation = None
     if fit.settings.errors.correlated_noise and len(fit.rows):
         correlation = _correlation(fit, residual, model)
+    return_freed_memory()
     if scatter is None:
         scatter = pixel_scatter(fit, residual, model)
     inverse_sigma = fit.inverse_sigma
@@ -59,6 +63,7 @@ def diagnose(fit, xy, scatter=None):
     chi2, residual_light, core_light, core, rim = _statistics(
         fit, residual, residual + fit.arrays.usable * model, inverse_sigma
     ).T
+    return_freed_memory()
     with np.errstate(divide="ignore", invalid="ignore"):
         residual_light = residual_light / (fit.total * core)
         core_flux = core_light / core

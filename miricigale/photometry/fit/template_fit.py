@@ -139,12 +139,18 @@ def _sandwich(fit, correlation):
     keep = fit.rows
     white = list(map(fit.arrays.whitened, fit.columns))
     spread = [_spread(fit, image, correlation) for image in white]
-    middle, border = sandwich_matrix(fit.bank, fit.inverse_sigma, correlation, spread)
+    # what the diagnostics, and these transforms, have freed
+    return_freed_memory()
+    if fit.free is not None:
+        # stamps are dropped where they are not needed any more, those of the changes first
+        changes = fit.free.change_sandwich(fit, correlation, spread)
+        return_freed_memory()
+    middle, border = sandwich_matrix(fit.bank, fit.inverse_sigma, correlation, spread, last=True)
     return_freed_memory()
     middle = middle[keep][:, keep]
     border = border[keep]
     if fit.free is not None:
-        middle, border = fit.free.sandwich(fit, correlation, middle, border, spread)
+        middle, border = fit.free.sandwich(middle, border, changes)
     return middle, border, inner_products(white, spread)
 
 

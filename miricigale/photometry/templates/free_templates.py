@@ -102,19 +102,23 @@ class FreeTemplates:
         matrix = (self.fit.matrix - scipy.sparse.diags_array(self.prior)).tocsr()
         return matrix, self.fit.border, self.fit.corner
 
-    def sandwich(self, fit, correlation, middle, border, images):
+    def change_sandwich(self, fit, correlation, images):
         """
-        Extend the sandwich of correlated noise of the templates, ``middle`` and ``border``, by the changes.
+        Sum what correlated noise does to the changes; their stamps are dropped.
 
         ``fit`` is that of the templates; the rest is as for
-        `~miricigale.photometry.templates.normal_equations.sandwich_matrix`.
+        `~miricigale.photometry.templates.normal_equations.sandwich_matrix`. Returns products of the fitted
+        rows with the changes, products of the changes, and their projections.
         """
-        inverse_sigma = fit.inverse_sigma
         cross, changes, change_border = change_matrices(
-            fit.bank, self.bank, inverse_sigma, images, correlation
+            fit.bank, self.bank, fit.inverse_sigma, images, correlation, last=True
         )
-        return_freed_memory()
-        matrix = joined_matrix(middle, cross[fit.rows], changes, self.basis)
+        return cross[fit.rows], changes, change_border
+
+    def sandwich(self, middle, border, change_sandwich):
+        """Extend the sandwich of the templates, ``middle`` and ``border``, by that of the changes."""
+        cross, changes, change_border = change_sandwich
+        matrix = joined_matrix(middle, cross, changes, self.basis)
         return matrix, _right_side(border, change_border, self.basis)
 
 

@@ -16,11 +16,13 @@ from miricigale.photometry._core.stamps import (
     find_pairs,
     pair_products,
     projections,
+    scale_stamps,
     whiten_stamps,
 )
 from miricigale.photometry.images.arrays import stamp_starts
 from miricigale.photometry.templates.templates import Block, batches
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
 from miricigale.utils.values import value_class
@@ -205,6 +207,17 @@ def _whitened(bank, block, inverse_sigma):
     return white, sums
 
 
+def _weighted(bank, block, inverse_sigma):
+    """Divide a block's stamps by the noise in place: products with stamps as they are then have all weights."""
+
+    def scale(part):
+        values, box, start = block.stamps_of(part)
+        scale_stamps(values, box, start, inverse_sigma)
+
+    bank.map(scale, block.parts())
+    return block
+
+
 def _projected(bank, block, images):
     """Sum a block's stamps times images, shape (n, len(images))."""
     out = np.empty((len(images), len(block.box)))
@@ -229,13 +242,14 @@ def _products(bank, left_block, right_block, pairs):
     return out
 
 
-def _walk(bank, inverse_sigma, images, spread=None, crossing=None):
+def _walk(bank, inverse_sigma, images, spread=None, crossing=None, last=False):
     """
     Sum products of all pairs of the whitened stamps, and their projections on images.
 
-    At most those blocks are in memory that can still overlap. ``spread`` is what is done to the right-hand block
-    of a pair; stamps grow by its ``lag``. ``crossing`` (`_Crossing`) gets all right-hand blocks. Returns the
-    matrix, (n, n), the projection, and the stamps' sums.
+    At most those blocks are in memory that can still overlap. The right-hand block of a pair has the weights of
+    both, so that the left-hand ones are those of the bank. ``spread`` is what is done to it between these; stamps
+    grow by its ``lag``. ``crossing`` (`_Crossing`) gets all right-hand blocks. ``last``: whether the bank's stamps
+    are not needed after that. Returns the matrix, (n, n), the projection, and the stamps' sums.
     """
     n = len(bank.order)
     grow = 0 if spread is None else spread.lag
@@ -245,21 +259,22 @@ def _walk(bank, inverse_sigma, images, spread=None, crossing=None):
     sums = np.empty((n, 4))
     projection = np.empty((n, len(images)))
     live = []
-    for block in bank.blocks():
+    for block in bank.blocks(last=last):
         rows = slice(block.first, block.last)
         # stamps over the noise, and their projections
         white, sums[rows] = _whitened(bank, block, inverse_sigma)
         projection[rows] = _projected(bank, white, images)
-        mine = white
         diagonal[rows] = sums[rows, 3]
         if spread is not None:
-            mine = spread(white)
+            white = spread(white)
+        mine = _weighted(bank, white, inverse_sigma)
+        if spread is not None:
             diagonal_pairs = np.repeat(np.arange(len(block.box), dtype=np.int32), 2).reshape(-1, 2)
-            diagonal[rows] = _products(bank, white, mine, diagonal_pairs)
+            diagonal[rows] = _products(bank, block, mine, diagonal_pairs)
         if crossing is not None:
             crossing.add(mine)
         live = [held for held in live if held.end + grow > block.box[0, 0]]
-        live.append(white)
+        live.append(block)
         for left_block in live:
             # pairs whose stamps are in these two blocks
             low, high = np.searchsorted(pairs[:, 0], [left_block.first, left_block.last])
@@ -269,6 +284,9 @@ def _walk(bank, inverse_sigma, images, spread=None, crossing=None):
             if len(met):
                 local = pairs[met] - np.array([left_block.first, block.first], pairs.dtype)
                 products[met] = _products(bank, left_block, mine, local)
+        if last:
+            # what was dropped on the way
+            return_freed_memory()
     # the matrix is symmetric: each pair stands twice
     i, j = pairs.T.astype(np.int64)
     places = np.concatenate([np.arange(n), i, j]), np.concatenate([np.arange(n), j, i])
@@ -301,15 +319,15 @@ def normal_matrix(bank, inverse_sigma, images=()):
     return matrix, projection, sums[:, 2], sums[:, :2]
 
 
-def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
+def sandwich_matrix(bank, inverse_sigma, correlation, images=(), *, last=False):
     """
     Build A^T W C W A, (n, n), and its projection: what correlated noise does to the right-hand side.
 
-    ``correlation``, (2 m + 1, 2 m + 1), is the covariance of the whitened noise by separation; the rest is as
-    in `normal_matrix`. Stamps are convolved with it by transforms in single precision, that of the
-    correlation made once for each padded shape.
+    ``correlation``, (2 m + 1, 2 m + 1), is the covariance of the whitened noise by separation, ``last`` whether
+    the stamps are not needed after that; the rest is as in `normal_matrix`. Stamps are convolved with it by
+    transforms in single precision, that of the correlation made once for each padded shape.
     """
-    return _walk(bank, inverse_sigma, images, _Spread(correlation, bank))[:2]
+    return _walk(bank, inverse_sigma, images, _Spread(correlation, bank), last=last)[:2]
 
 
 class _Spread:
@@ -347,7 +365,7 @@ class _Spread:
         return Block(block.first, box, start, values)
 
 
-def change_matrices(bank, change_bank, inverse_sigma, images, correlation=None):
+def change_matrices(bank, change_bank, inverse_sigma, images, correlation=None, *, last=False):
     """
     Build the normal equations of changes of templates: their products with the templates, and with each other.
 
@@ -359,6 +377,8 @@ def change_matrices(bank, change_bank, inverse_sigma, images, correlation=None):
         As for `normal_matrix`.
     correlation : `~numpy.ndarray`, optional
         As for `sandwich_matrix`: if given, the stamps of the changes are convolved with it.
+    last : bool, optional
+        Whether the changes' stamps are not needed after that: they are dropped on the way.
 
     Returns
     -------
@@ -373,17 +393,16 @@ def change_matrices(bank, change_bank, inverse_sigma, images, correlation=None):
     if correlation is not None:
         spread = _Spread(correlation, change_bank)
     # both in one walk, in which each stamp is whitened and convolved once
-    crossing = _Crossing(bank, inverse_sigma)
-    matrix, projection, _ = _walk(change_bank, inverse_sigma, images, spread, crossing)
+    crossing = _Crossing(bank)
+    matrix, projection, _ = _walk(change_bank, inverse_sigma, images, spread, crossing, last)
     return crossing.matrix(len(change_bank.order)), matrix, projection
 
 
 class _Crossing:
-    """Sums products of the whitened stamps of a bank with blocks of another one, as both go down the image."""
+    """Sums products of the stamps of a bank with weighted blocks of another one, as both go down the image."""
 
-    def __init__(self, bank, inverse_sigma):
+    def __init__(self, bank):
         self._bank = bank
-        self._inverse_sigma = inverse_sigma
         self._waiting = bank.blocks()
         self._live = []
         self._rows = []
@@ -399,7 +418,7 @@ class _Crossing:
             left_block = next(self._waiting, None)
             if left_block is None:
                 break
-            live.append(_whitened(bank, left_block, self._inverse_sigma)[0])
+            live.append(left_block)
         self._live = live
         for left_block in live:
             pairs = cross_pairs(left_block.box, right_block.box)

@@ -19,6 +19,7 @@ from miricigale.photometry._core.stamps import add_model
 from miricigale.photometry.detection.cutouts import RIM, convolve_padded
 from miricigale.photometry.images.arrays import stamp_starts
 from miricigale.utils.caching import cached
+from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import parallel_map
 from miricigale.utils.values import value_class
 
@@ -360,8 +361,14 @@ class TemplateBank:
             part = flux[block.first : block.last]
             add_model(image, block.values, block.box, block.start, part)
 
-    def blocks(self):
-        """Yield all templates in order, as `Block` of some 16 MB each."""
+    def blocks(self, *, last=False):
+        """Yield all templates in order, as `Block` of some 16 MB each, dropped if it is the ``last`` time."""
+        if self._kept is not None and last:
+            blocks = self._kept[::-1]
+            self.forget()
+            while blocks:
+                yield blocks.pop()
+            return
         if self._kept is not None:
             yield from self._kept
             return
@@ -374,6 +381,7 @@ class TemplateBank:
             if keep and self.once:
                 for source in self.order[rows]:
                     self.sources.cutout[source] = _DROPPED
+                return_freed_memory()
             yield block
         if keep:
             self._kept = blocks
