@@ -60,7 +60,8 @@ def residual_peaks(fit, residual, model, xy):
     source's own. Of two peaks within 0.7 full widths the brighter one counts.
     """
     inverse_sigma = fit.inverse_sigma
-    width = fit.psf_width
+    # no number of numpy, with which images would be in double precision
+    width = float(fit.psf_width)
     full_width = 2.0 * np.sqrt(2.0 * np.log(2.0)) * width
     placed = xy[np.isfinite(xy).all(axis=1)]
     if not inverse_sigma.any():
