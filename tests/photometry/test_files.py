@@ -60,7 +60,9 @@ def test_names_say_what_is_written(result, tmp_path):
     assert table["flux_err"].info.description == "1-sigma error of the flux"
     result.write(tmp_path / "r.csv")
     assert_array_equal(QTable.read(tmp_path / "r.csv")["flux"], result.flux.value)
-    for name in ("r.txt", "r"):
+    result.write(tmp_path / "r.txt")
+    assert_array_equal(QTable.read(tmp_path / "r.txt", format="ascii.ecsv")["flux"], result.flux)
+    for name in ("r.doc", "r"):
         refuses(r"a file ending in one of \.fits", result.write, tmp_path / name)
         assert not (tmp_path / name).exists()
     with pytest.raises(IORegistryError):
