@@ -137,7 +137,7 @@ class FitResults(FitRows):
     >>> results
     <FitResults of 2 objects, 2 fitted, 4 bands>
     >>> results["b"].mean("redshift").round(2)
-    <Quantity 1.03>
+    <Quantity 1.02>
     >>> edges, weights = results["b"].distribution("redshift")
     """
 
