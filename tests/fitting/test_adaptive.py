@@ -392,6 +392,9 @@ def test_errors_of_percentiles_are_those_of_order_statistics():
     assert percentile_error(two_peaks, equal) > 0.4
     assert percentile_error(np.where(np.arange(n) < 0.3 * n, 0.0, normal), equal) < 0.1
     assert percentile_error(np.ones(n), equal) == 0
+    # nothing for most, and much for the others: no overflow
+    dust = np.where(np.arange(n) < 0.84 * n, 1e-300 * np.exp(normal), 1e37)
+    assert percentile_error(dust, equal) > 1
 
 
 def test_percentiles_between_peaks_get_more_models(fitter, table):

@@ -17,6 +17,8 @@ DERIVED_LEVELS = frozen_array(
 )
 #: Levels of the 68 % interval and of its middle.
 _INTERVAL = frozen_array([0.16, 0.5, 0.84])
+#: Largest error of a percentile that is told, in units of half of that interval.
+_LARGEST_ERROR = 1e3
 #: Values of a shape quantity closer than this part of their range are one.
 _SAME = 1e-9
 #: Shape quantities whose outermost cells end at 0.
@@ -121,7 +123,9 @@ def percentile_error(values, weight):
     share_error = np.sqrt(np.square(1.0 - _INTERVAL) * below + np.square(_INTERVAL) * above)
     smaller = np.interp(_INTERVAL - share_error, middles, values)
     larger = np.interp(_INTERVAL + share_error, middles, values)
-    return float(np.max(larger - smaller)) / (2.0 * half_width)
+    spread = 0.5 * np.max(larger - smaller)
+    # half an interval may be as good as nothing, where most models have no dust
+    return float(min(spread, _LARGEST_ERROR * half_width) / half_width)
 
 
 def put_draws(results, new, i, values):
