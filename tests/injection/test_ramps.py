@@ -81,6 +81,22 @@ def test_injected_flux_is_conserved_through_a_ramp(exposure, linear):
     assert_allclose(np.sum((gained * area)[seen]), np.sum((light * area)[seen]), rtol=1e-3)
 
 
+def test_a_star_on_the_first_pixel_has_its_light(exposure):
+    image = np.full(exposure.shape, SKY.value) * SKY.unit
+    detector = Detector.miri_imager().without(CosmicRays, InterpixelCapacitance)
+    ramp = detector.expose(image, exposure, seed=1)
+    blind = (ramp.pixel_dq & int(DQ.REFERENCE_PIXEL)) != 0
+    first_y, first_x = np.argwhere(~blind)[0]
+    gained = []
+    for x, y in ((first_x, first_y), (30, 30)):
+        sources = stars(exposure, [(float(x), float(y))], 300.0)
+        data = inject_ramp(ramp, sources, Reducer(), Photons(1))
+        counts = data[0, :, y, x].astype(float) - ramp.data[0, :, y, x]
+        gained.append(np.diff(counts).mean())
+    # pixels differ by their flat
+    assert_allclose(gained[0], gained[1], rtol=0.1)
+
+
 def test_groups_that_are_averaged_on_board_hold_the_mean_of_their_frames():
     averaged = Exposure(
         "F770W", n_groups=6, subarray="SUB64", readout="FASTGRPAVG8", pointing="53 -27"
