@@ -75,7 +75,7 @@ def test_the_extra_all_is_all_that_a_user_may_need():
     above = names[: names.index("all")]
     assert everything.extras == set(above)
     numbers = {8: "eight", 9: "nine", 10: "ten"}
-    assert documented["all"] == f"the {numbers[len(above)]} above"
+    assert documented["all"] == f"the {numbers[len(above)]} extras above"
     others = set(EXTRAS) - everything.extras - {"all"}
     assert others == {"jwst", "test", "galsim", "docs", "tools"}
     assert documented["jwst"].endswith("not in ``all``")

@@ -241,7 +241,10 @@ class MatchingKernel(Interactive):
         """
         psf = instrument_psf(named_psf(psf))
         if psf.frame == "detector" and angle is None and psf.pa_aper is None:
-            wanted = "given to 'MatchingKernel.identity' for a PSF in the detector's frame"
+            wanted = (
+                "given to 'MatchingKernel.identity' for a PSF in the detector's frame, or the PSF that of the "
+                "image: psf_mosaic(miri_psf('F770W'), pixel_scale, exposure.pa_aper)"
+            )
             raise argument_error("angle", wanted, "None")
         source, target, mended = psf_pair(psf, psf, psf.cell, angles=(angle, angle))
         array = np.zeros_like(source)
