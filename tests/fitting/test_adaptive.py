@@ -13,8 +13,8 @@ from scipy.stats import multivariate_normal, multivariate_t, qmc
 
 from helpers.grids import photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, _core
-from miricigale.fitting.grid.adaptive import fitted_groups
 from miricigale.fitting.grid.peaks import redshift_peaks
+from miricigale.fitting.grid.place_sets import fitted_groups
 from miricigale.fitting.grid.points import quasi_random
 from miricigale.fitting.posterior.quantities import (
     DERIVED_LEVELS,

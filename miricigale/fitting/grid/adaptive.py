@@ -16,10 +16,10 @@ import numpy as np
 from miricigale.fitting import _core
 from miricigale.fitting.grid.labels import labels_of_ranges
 from miricigale.fitting.grid.moves import move_places, systematic
+from miricigale.fitting.grid.place_sets import Collection, WeightedPlaces, fitted_groups
 from miricigale.fitting.grid.placed_models import PlacedModels, places_to_values, thinned
 from miricigale.fitting.grid.points import quasi_random
 from miricigale.fitting.grid.proposals import MIN_WEIGHT, Places, fit_mixture
-from miricigale.utils.values import value_class
 
 #: Number of places in a round.
 ROUND_SIZE = 512
@@ -57,8 +57,6 @@ _PURSUED_SHARE = 0.06
 _SEEN = 10
 #: Weight of a label below which it is pursued no more after the rounds of labels that are not.
 _MIN_PURSUED_WEIGHT = 1e-3
-#: Smallest number of places that parts are fitted to.
-_MIN_FITTED_PLACES = 20
 #: Share of a mixture that is divided evenly among the labels, whatever their weight.
 _GUARD = 0.05
 #: Smallest share of each peak of the nodes.
@@ -90,63 +88,6 @@ _MAX_MODELS = 1536
 _HOPELESS = 0.5
 #: Number of places after which that is judged.
 _HOPELESS_TRIAL = 4096
-
-
-@value_class
-class WeightedPlaces:
-    """
-    Some of the places of a sampler with their weights, and what is wanted of them.
-
-    Parameters
-    ----------
-    rows : slice
-        Which places.
-    weight : `~numpy.ndarray`, shape (n,)
-        Weights, the largest of which is 1.
-    log_mean : float
-        Ln of the mean of the posterior over the density of the proposal.
-    effective : float
-        Effective number of the weights.
-    enough : bool
-        Whether it is, in all and in each label, peak and component that counts.
-    wanted : `~numpy.ndarray`, shape (n_labels * n_peaks,)
-        Numbers of places wanted in labels and peaks.
-    """
-
-    rows: slice
-    weight: np.ndarray
-    log_mean: float
-    effective: float
-    enough: bool
-    wanted: np.ndarray
-
-
-class _Collection:
-    """
-    Places that results rest on.
-
-    Parameters
-    ----------
-    parts : `~miricigale.fitting.grid.proposals.FittedParts`
-        What they are drawn from.
-    missing : `~numpy.ndarray`, shape (n_labels * n_peaks,)
-        How many are still wanted in labels and peaks, or shares.
-    sampler : `AdaptiveSampler`
-        Whose further places they are.
-    """
-
-    def __init__(self, parts, missing, sampler):
-        self.parts = parts
-        self.missing = missing
-        self.first = sampler.n
-        #: How many were drawn from each label and peak.
-        self.total = np.zeros(sampler.n_groups)
-        #: Densities of the parts of each peak at all places of the sampler.
-        self.density = np.zeros((len(sampler.peaks), len(sampler.label)))
-        #: `WeightedPlaces` of all of them.
-        self.sample = None
-        #: Whether they are as many as are wanted.
-        self.is_enough = False
 
 
 class AdaptiveSampler:
@@ -234,7 +175,7 @@ class AdaptiveSampler:
         adapted = self._adapt(parts, share)
         if adapted is None:
             return None
-        self.collection = _Collection(*adapted, self)
+        self.collection = Collection(*adapted, self)
         return self._models_of(self._reach(_N_TRIAL))
 
     def extend(self, factor):
@@ -283,7 +224,7 @@ class AdaptiveSampler:
             size *= 2
             self.n_fitted *= 2
             parts = self._fit(self._places(self.n_fitted), n_local=_N_LOCAL)
-            self.collection = _Collection(parts, sample.wanted, self)
+            self.collection = Collection(parts, sample.wanted, self)
         return best
 
     def _models_of(self, sample):
@@ -612,29 +553,6 @@ class AdaptiveSampler:
         return self._placed(
             place, evaluated, np.concatenate(weight), uniform, sample, converged=False
         )
-
-
-def fitted_groups(is_wanted, number):
-    """
-    Select the groups of places, such as labels in peaks, that parts are fitted to.
-
-    Parameters
-    ----------
-    is_wanted : `~numpy.ndarray` of bool, shape (n_groups,)
-        Groups that have weight, or that are pursued whatever their weight.
-    number : `~numpy.ndarray` of int, shape (n_groups,)
-        Number of places of each.
-
-    Returns
-    -------
-    groups : `~numpy.ndarray` of int
-        Those that are wanted and have places enough to show a shape. If there are none, the wanted ones with any
-        place, whose parts have the shape of all places, and the others that show one.
-    """
-    has_shape = number >= _MIN_FITTED_PLACES
-    if np.any(is_wanted & has_shape):
-        return np.flatnonzero(is_wanted & has_shape)
-    return np.flatnonzero((is_wanted | has_shape) & (number > 0))
 
 
 def _with_columns(table, n):

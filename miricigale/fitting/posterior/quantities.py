@@ -17,7 +17,7 @@ DERIVED_LEVELS = frozen_array(
 )
 #: Levels of the 68 % interval and of its middle.
 _INTERVAL = frozen_array([0.16, 0.5, 0.84])
-#: Largest error of a percentile that is told, in units of half of that interval.
+#: Largest error of a percentile that is reported, in units of half of the 68 % interval.
 _LARGEST_ERROR = 1e3
 #: Values of a shape quantity closer than this part of their range are one.
 _SAME = 1e-9
