@@ -38,6 +38,7 @@ from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_kind, check_names, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import SURFACE_BRIGHTNESS
@@ -61,6 +62,7 @@ def _effect_class(name):
     return classes[bare]
 
 
+@takes_other_keywords
 @value_class
 class Detector(Interactive):
     """
@@ -231,6 +233,7 @@ class Detector(Interactive):
     def _facts(self):
         return {type(effect).__name__: effect for effect in self.effects}
 
+    @takes_other_keywords
     def expose(
         self, image, exposure=None, *, seed=None, previous=None, n_threads=None, progress_bar=False
     ):

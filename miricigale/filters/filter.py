@@ -18,6 +18,7 @@ from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.table_files import table_suffix, write_table
 from miricigale.utils.units import (
     FNU,
@@ -38,6 +39,7 @@ VERSION = 1
 UNCOVERED = 1e-4
 
 
+@takes_other_keywords
 @value_class
 class Filter(Frozen, WithTable):
     """
@@ -291,11 +293,13 @@ class Filter(Frozen, WithTable):
         return self.bounds[1]
 
     @classmethod
+    @takes_other_keywords
     def from_file(cls, path, *, name=None, unit=None):
         """Return the filter of a file; see `read`."""
         return cls.read(path, name=name, unit=unit)
 
     @classmethod
+    @takes_other_keywords
     def read(cls, path, *, name=None, unit=None):
         r"""
         Read a filter from a file.

@@ -31,6 +31,7 @@ from miricigale.sed import ModelGrid, SEDModel
 from miricigale.sed.presets import grid_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import check_count
 
@@ -183,6 +184,7 @@ class BayesFitter(CatalogFits):
     >>> results = fitter.fit(photometry, seed=1)  # doctest: +SKIP
     """
 
+    @takes_other_keywords
     def __init__(
         self,
         model=None,
@@ -423,6 +425,7 @@ class BayesFitter(CatalogFits):
         names = ", ".join(self.priors)
         return f"<BayesFitter of {self.model!r}, {bands}, {self._engine_name}, free: {names}>"
 
+    @takes_other_keywords
     def fit(
         self,
         photometry,

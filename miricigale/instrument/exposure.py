@@ -18,6 +18,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import check_count, scalar
 from miricigale.utils.values import value_class
@@ -167,6 +168,7 @@ class Exposure(Interactive):
     roll: u.Quantity | None
     dither: int
 
+    @takes_other_keywords
     def __init__(
         self,
         filter,

@@ -45,6 +45,7 @@ from miricigale.utils.options import (
     check_positive,
     check_that,
 )
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
@@ -53,6 +54,7 @@ from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 _SCALE = 0.11 * ANGLE
 
 
+@takes_other_keywords
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reducer(Interactive):
     """
@@ -409,6 +411,7 @@ class Reducer(Interactive):
             exposure = remove_stripes(exposure)
         return rate, *self.subtract_background(exposure)
 
+    @takes_other_keywords
     def run(self, ramps, *, wcs=None, pixel_scale=_SCALE, align=None, progress_bar=False):
         """
         Reduce the dithers of one filter.

@@ -26,6 +26,7 @@ from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import plain_floats
 from miricigale.utils.options import check_kind, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import middle_pixel
 from miricigale.utils.tables import Flags, described_columns
@@ -132,6 +133,7 @@ class Scene(WithTable):
 
     _parts = ("exposure",)
 
+    @takes_other_keywords
     def __init__(
         self,
         catalog,
@@ -159,7 +161,8 @@ class Scene(WithTable):
                 filter = exposure.filter
             if wcs is None:
                 wcs = exposure.wcs
-        check_that(filter is not None, "filter", "given, or an exposure", "None")
+        example = "Scene(catalog, Exposure('F770W', 1000 * u.s, pointing='53.1 -27.8'))"
+        check_that(filter is not None, "filter", f"given, or an exposure: {example}", "None")
         wanted = (
             "given, or an exposure (instrument.north_up_wcs makes one of center, scale and shape)"
         )
@@ -414,6 +417,7 @@ class Scene(WithTable):
         """
         self.render().write(path, overwrite=overwrite)
 
+    @takes_other_keywords
     def render(self):
         """
         Make the image.

@@ -22,7 +22,19 @@ from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
 from miricigale.utils.named_values import without_none
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import WAVE
+
+
+def _single_models(parameters):
+    """Parameters of each model, of parameters some of which are arrays of one length."""
+    arrays = {name: value for name, value in parameters.items() if np.ndim(value) == 1}
+    lengths = {name: len(value) for name, value in arrays.items()}
+    got = ", ".join(f"{length} of {name!r}" for name, length in lengths.items())
+    check_that(len(set(lengths.values())) == 1, "parameters", "arrays of one length", got)
+    n_models = next(iter(lengths.values()))
+    for row in range(n_models):
+        yield parameters | {name: value[row] for name, value in arrays.items()}
 
 
 class SEDModel(Interactive):
@@ -489,11 +501,12 @@ class SEDModel(Interactive):
         **parameters
             Any of `parameters`, as quantities or numbers in their units; or parameters of CIGALE, such as
             ``tau_main`` or ``sfh.tau_main``, whose numbers are in CIGALE's units (Myr). ``mass`` is the mass
-            formed; ``stellar_mass``, that of living stars, can stand in its place.
+            formed; ``stellar_mass``, that of living stars, can stand in its place. Arrays, all of one length,
+            are several models.
 
         Returns
         -------
-        sed : `SED`
+        sed : `SED`, or list of `SED` where a parameter is an array
             As observed, with its ``components``, ``parameters`` and ``derived`` quantities.
 
         Raises

@@ -24,7 +24,7 @@ class UnknownAttributeError(AttributeError):
 
     Parameters
     ----------
-    owner : object
+    owner : object or type
         What was asked.
     name : str
         The attribute.
@@ -32,12 +32,19 @@ class UnknownAttributeError(AttributeError):
 
     def __init__(self, owner, name):
         # not `obj`, by which Python would append a suggestion of its own
-        super().__init__(f"{type(owner).__name__!r} object has no attribute {name!r}", name=name)
+        if isinstance(owner, type):
+            what = f"class {owner.__name__!r}"
+        else:
+            what = f"{type(owner).__name__!r} object"
+        super().__init__(f"{what} has no attribute {name!r}", name=name)
         self._owner = owner
 
     def __str__(self):
         message = self.args[0]
-        hint = attribute_hint(type(self._owner), self.name, dir(self._owner))
+        cls = self._owner
+        if not isinstance(cls, type):
+            cls = type(cls)
+        hint = attribute_hint(cls, self.name, dir(self._owner))
         if hint:
             return f"{message}; {hint}"
         return message
@@ -78,12 +85,9 @@ def attribute_hint(cls, name, names):
     if name in sentences:
         return sentences[name]
     public = [candidate for candidate in names if not candidate.startswith("_")]
-    close = difflib.get_close_matches(name, public, n=1, cutoff=_ALIKE)
-    if close:
-        return f"did you mean {close[0]!r}?"
-    near = names_sharing_words(name, public)
+    near = near_names(name, public)
     if near:
-        return f"did you mean {' or '.join(map(repr, near[:_MAX_NAMES]))}?"
+        return f"did you mean {' or '.join(map(repr, near))}?"
     near = names_sharing_words(name, sentences)
     if near:
         return sentences[near[0]]
@@ -92,6 +96,14 @@ def attribute_hint(cls, name, names):
     if len(public) <= _MAX_LISTED:
         return f"it has {', '.join(public)}"
     return ""
+
+
+def near_names(name, candidates):
+    """Return the name that is spelled alike, else those that share most words; a few at most, or none."""
+    close = difflib.get_close_matches(name, candidates, n=1, cutoff=_ALIKE)
+    if close:
+        return close
+    return names_sharing_words(name, candidates)[:_MAX_NAMES]
 
 
 def names_sharing_words(name, candidates):

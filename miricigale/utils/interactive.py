@@ -1,5 +1,6 @@
 """What objects share in interactive sessions: other names of attributes, completion, a table in notebooks."""
 
+import abc
 import html
 import operator
 
@@ -9,7 +10,26 @@ from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import sky_as_angles
 
 
-class Interactive:
+class _Hinted(abc.ABCMeta):
+    """
+    Type of classes that say what to write instead of an attribute that they do not have.
+
+    Names that are usual elsewhere for constructors, such as ``from_catalog``, stand for the class itself. It is an
+    `abc.ABCMeta` as the type of `~astropy.nddata.NDData` is, from which some classes are derived too.
+    """
+
+    def __getattr__(cls, name):
+        # copies and notebooks ask for private names that need not be there
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name in declared("miricigale.utils", "other_names.toml")["constructors"].get(
+            cls.__name__, ()
+        ):
+            return cls
+        raise UnknownAttributeError(cls, name)
+
+
+class Interactive(metaclass=_Hinted):
     """
     Base of classes that are used in sessions.
 

@@ -80,7 +80,10 @@ class _ByName(dict):
             raise unknown_name("parameter", name, self)
         raise KeyError(name)
 
-    def __call__(self, name):
+    def __call__(self, name, *others):
+        if others:
+            msg = f"takes a name alone: results.loc[id].pdf({name!r}) is that of one object"
+            raise TypeError(msg)
         return self[name]
 
 

@@ -128,4 +128,4 @@ def test_a_scene_with_another_setting_is_another(exposure):
     assert scene.catalog["F1500W" if scene.filter == "miri.f1500w" else "F770W"] == scene.flux
     assert scene.flux == scene.catalog[scene.filter]
     assert scene.sky.ra.deg == pytest.approx(53.0)
-    refuses("unexpected keyword", scene.replace, sky=3, error=TypeError)
+    refuses("has no argument 'nebula'; it has cat", scene.replace, nebula=3, error=TypeError)

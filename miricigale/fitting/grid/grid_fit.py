@@ -93,7 +93,7 @@ class GridFit:
         elif axes is not None:
             raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
         elif not isinstance(model, ModelGrid):
-            wanted = "a ModelGrid, an SEDModel or a list of bands"
+            wanted = "a ModelGrid, an SEDModel or a list of bands (fit(catalog) takes the catalog)"
             raise argument_error("model", wanted, type(model).__name__)
         if settings.agn_error and compat:
             raise argument_error("agn_error", "0 with 'compat'", f"{settings.agn_error}")

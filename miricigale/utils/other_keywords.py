@@ -1,0 +1,154 @@
+"""Keywords of calls that are usual elsewhere, and what a call with any other keyword should have been."""
+
+import dataclasses
+import functools
+import inspect
+
+from miricigale.utils.attribute_hints import near_names
+from miricigale.utils.package_tables import declared
+
+#: Key of the sentence that shows the usual call.
+_CALL = "_"
+
+
+def takes_other_keywords(target):
+    """
+    Let a function, a method or a class take keywords that are usual elsewhere.
+
+    ``other_keywords.toml`` has them by the name of the class (for its constructor), ``Class.method`` or the
+    function. Keywords of a part of a dataclass, such as ``pixfrac`` of ``Reducer(mosaics=MosaicSettings())``,
+    are taken by the class too.
+
+    Parameters
+    ----------
+    target : callable or type
+        What is called. A class keeps its type; its ``__init__`` is replaced.
+
+    Returns
+    -------
+    target : callable or type
+
+    Raises
+    ------
+    TypeError
+        In calls: for a keyword that is not known, with what to write instead; for a keyword under two names.
+
+    Examples
+    --------
+    >>> from miricigale import Exposure
+    >>> Exposure("F770W", ngroups=10) == Exposure("F770W", n_groups=10)
+    True
+    """
+    if isinstance(target, type):
+        settings = _settings_of(target)
+        target.__init__ = _renaming(target.__init__, target.__name__, settings)
+        return target
+    return _renaming(target, target.__qualname__.removesuffix(".__init__"), {})
+
+
+def _renaming(function, label, settings):
+    """Return the function, which takes the other keywords of a label and those of settings."""
+    parameters = dict(inspect.signature(function).parameters)
+    owner = next((name for name in ("self", "cls") if name in parameters), None)
+    parameters.pop(owner, None)
+    names = list(parameters)
+    kinds = [parameter.kind for parameter in parameters.values()]
+    n_owners = 0 if owner is None else 1
+    n_most = kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    takes_any_number = inspect.Parameter.VAR_POSITIONAL in kinds
+
+    @functools.wraps(function)
+    def call(*args, **keywords):
+        n_args = len(args) - n_owners
+        if n_args > n_most and not takes_any_number:
+            raise TypeError(_too_many(label, names[:n_most], n_args))
+        if not keywords.keys() <= parameters.keys():
+            keywords = _our_keywords(keywords, label, names, settings)
+        twice = sorted(keywords.keys() & set(names[:n_args]))
+        if twice:
+            raise TypeError(_given_twice(twice[0], label))
+        return function(*args, **keywords)
+
+    return call
+
+
+def _our_keywords(keywords, label, names, settings):
+    """Keywords of a call by our names."""
+    other_names = declared("miricigale.utils", "other_keywords.toml").get(label, {})
+    ours = {}
+    values = {}
+    for keyword, value in keywords.items():
+        name = keyword if keyword in names else other_names.get(keyword, keyword)
+        owners = [part for part, kind in settings.items() if name in _field_names(kind)]
+        if name in names:
+            if name in ours:
+                msg = f"{label}() got {name!r} twice, once as {keyword!r}"
+                raise TypeError(msg)
+            ours[name] = value
+        elif len(owners) == 1:
+            values.setdefault(owners[0], {})[name] = value
+        else:
+            raise TypeError(_unknown_keyword(keyword, label, names, settings))
+    for part, fields in values.items():
+        if part in ours:
+            wanted = f"{settings[part].__name__}({', '.join(fields)}, ...)"
+            names_given = ", ".join(map(repr, fields))
+            msg = f"{label}() got {names_given} besides {part!r}: give {part}={wanted}"
+            raise TypeError(msg)
+        ours[part] = settings[part](**fields)
+    return ours
+
+
+def _settings_of(cls):
+    """Classes of the parts of a dataclass that are dataclasses with values of their own, by name."""
+    if not dataclasses.is_dataclass(cls):
+        return {}
+    factories = {field.name: field.default_factory for field in dataclasses.fields(cls)}
+    return {name: kind for name, kind in factories.items() if dataclasses.is_dataclass(kind)}
+
+
+def _field_names(kind):
+    return [field.name for field in dataclasses.fields(kind)]
+
+
+def _sentences(label):
+    """Sentences for calls of a label, by keyword."""
+    return declared("miricigale.utils", "other_keywords.toml")["hints"].get(label, {})
+
+
+def _with_call(message, label):
+    """Return a message with the sentence on calls of a label, if there is one."""
+    sentence = _sentences(label).get(_CALL)
+    if sentence is None:
+        return message
+    return f"{message}; {sentence}"
+
+
+def _given_twice(name, label):
+    """Return what to say of an argument that is given by its place and by its name."""
+    return _with_call(f"{label}() got {name!r} twice, by its place and by its name", label)
+
+
+def _too_many(label, names, n_args):
+    """Return what to say of a call with more arguments without a keyword than it has."""
+    takes = "takes arguments by keyword alone"
+    if names:
+        takes = f"takes {', '.join(names)} without a keyword"
+    return _with_call(f"{label}() {takes}, got {n_args} without", label)
+
+
+def _unknown_keyword(keyword, label, names, settings):
+    """Return what to say of a keyword that a call does not have."""
+    message = f"{label}() has no argument {keyword!r}"
+    sentences = _sentences(label)
+    if keyword in sentences:
+        return f"{message}; {sentences[keyword]}"
+    every_name = list(names)
+    for kind in settings.values():
+        every_name += _field_names(kind)
+    close = near_names(keyword, every_name)
+    if close:
+        return f"{message}; did you mean {' or '.join(map(repr, close))}?"
+    if _CALL in sentences:
+        return _with_call(message, label)
+    return f"{message}; it has {', '.join(names)}"

@@ -1,0 +1,95 @@
+"""Keywords that are usual elsewhere: each is one of ours, or ends in a sentence with the right call."""
+
+import inspect
+import operator
+import re
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+import miricigale
+from helpers.errors import refuses
+from miricigale import BayesFitter, Detector, Exposure, Filter, ForcedPhotometer, Reducer, Scene
+from miricigale.reduction import MosaicSettings
+from miricigale.utils.other_keywords import takes_other_keywords
+from miricigale.utils.package_tables import declared
+
+DECLARED = declared("miricigale.utils", "other_keywords.toml")
+OTHER_KEYWORDS = {label: names for label, names in DECLARED.items() if label != "hints"}
+
+
+def called(label):
+    """Return what a label of the table stands for: a class or one of its methods."""
+    return operator.attrgetter(label)(miricigale)
+
+
+@pytest.mark.parametrize("label", OTHER_KEYWORDS)
+def test_other_keywords_are_of_arguments(label):
+    parameters = inspect.signature(called(label)).parameters
+    for other, ours in OTHER_KEYWORDS[label].items():
+        assert other not in parameters, other
+        is_setting = label == "Reducer" and ours in MosaicSettings.__dataclass_fields__
+        assert ours in parameters or is_setting, (other, ours)
+
+
+@pytest.mark.parametrize("label", DECLARED["hints"])
+def test_sentences_are_of_keywords_that_there_are_not(label):
+    parameters = inspect.signature(called(label)).parameters
+    for wrong, sentence in DECLARED["hints"][label].items():
+        assert wrong not in parameters, wrong
+        assert wrong not in OTHER_KEYWORDS.get(label, {}), wrong
+        for path in re.findall(r"miricigale((?:\.\w+)+)", sentence):
+            operator.attrgetter(path[1:])(miricigale)
+
+
+def test_calls_with_other_keywords_are_those_with_ours():
+    ours = Exposure("F770W", readout="SLOWR1", n_groups=10, n_integrations=2, roll=3 * u.deg,
+                    pointing="53 -27")  # fmt: skip
+    theirs = Exposure("F770W", readpatt="SLOWR1", ngroups=10, nints=2, pa=3 * u.deg, coord="53 -27")
+    assert repr(theirs) == repr(ours)
+    curve = np.array([0.0, 1.0, 0.0])
+    wave = np.array([9.0, 10.0, 11.0]) * u.um
+    band = Filter(wavelength=wave, transmission=curve, name="box")
+    assert band.pivot == Filter(wave, curve, "box").pivot
+    flat = {"frac_agn": np.ones_like}
+    fitter = BayesFitter(bands=["F770W", "F1500W"], prior=flat)
+    assert repr(fitter.priors) == repr(BayesFitter(["F770W"], priors=flat).priors)
+
+
+def test_settings_of_parts_are_keywords_of_the_whole():
+    assert Reducer(pixfrac=0.8).mosaics == MosaicSettings(pixfrac=0.8)
+    assert Reducer(outlier_snr=4.0).mosaics.outlier_threshold == 4.0
+    refuses("got 'pixfrac' besides 'mosaics': give mosaics=MosaicSettings", Reducer, pixfrac=0.8,
+            mosaics=MosaicSettings(), error=TypeError)  # fmt: skip
+    refuses("'pixfrac' must be", Reducer, pixfrac=-1)
+
+
+def test_other_calls_say_what_is_meant():
+    refuses(r"no argument 'ndither'; Exposure\(...\).dithered\(4\)", Exposure, "F770W", n_groups=9,
+            ndither=4, error=TypeError)  # fmt: skip
+    refuses("got 'n_groups' twice, once as 'ngroups'", Exposure, "F770W", n_groups=9, ngroups=9,
+            error=TypeError)  # fmt: skip
+    refuses("no argument 'jump_thresold'; did you mean 'jump_threshold'", Reducer, jump_thresold=4,
+            error=TypeError)  # fmt: skip
+    refuses(r"got 3 without; .*measure\(image, positions\)", ForcedPhotometer, 1, 2, 3,
+            error=TypeError)  # fmt: skip
+    refuses("expose.scene, seed=1. takes the seed", Detector, seed=1, error=TypeError)
+
+    @takes_other_keywords
+    def width(wave, *, power=1):
+        return wave * power
+
+    assert width(2, power=3) == 6
+    refuses("has no argument 'n'; it has wave, power", width, 2, n=3, error=TypeError)
+    refuses("takes wave without a keyword, got 2 without$", width, 2, 3, error=TypeError)
+
+
+def test_classes_say_what_is_meant_too():
+    assert Scene.from_catalog is Scene
+    with pytest.raises(AttributeError, match=r"class 'Reducer' has no .*; run takes files: Red"):
+        operator.attrgetter("from_files")(Reducer)
+    assert not hasattr(Reducer, "_any")
+    assert set(declared("miricigale.utils", "other_names.toml")["constructors"]) <= set(
+        miricigale.__all__
+    )
