@@ -10,7 +10,7 @@ from scipy.signal import fftconvolve
 
 from miricigale.filters import Filter
 from miricigale.psf import _core
-from miricigale.psf.model import from_photutils, make_psf
+from miricigale.psf.model import from_photutils, instrument_psf, make_psf
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
 from miricigale.psf.wiener import checked_square, gaussian_gain
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
@@ -22,7 +22,9 @@ _log = logging.getLogger(__name__)
 
 
 def named_psf(psf):
-    """A PSF of a file or of the name of a filter; anything else itself."""
+    """Return the PSF of a file, of the name of a filter, or of a pair of PSF and pixel; anything else itself."""
+    if isinstance(psf, tuple):
+        return instrument_psf(psf)
     is_path = isinstance(psf, os.PathLike)
     if is_path or (isinstance(psf, str) and os.path.isfile(split_extension(psf)[0])):
         from miricigale.psf.files import read_psf

@@ -128,7 +128,8 @@ class MatchingKernel(Interactive):
         ----------
         hi, lo : `~photutils.psf.ImagePSF`, `~numpy.ndarray`, str or other
             The sharp and the wide PSF; text is a file for `read_psf` or a filter that has a model
-            (`filter_psf`). An array, and a functional model of photutils, is taken as sampled on the
+            (`filter_psf`), and ``(array, 0.03 * u.arcsec)`` an array with its pixel. An array alone, and a
+            functional model of photutils, is taken as sampled on the
             image's grid (pixel and orientation), its sum the fraction of light it holds. Cores that do
             not stand on the center (by more than 0.01 pixel) are brought there, arrays with
             an even number of pixels to an odd one; ``meta["centering"]`` has the shifts.

@@ -330,15 +330,16 @@ def instrument_psf(psf, argument="psf"):
 
     Parameters
     ----------
-    psf : `InstrumentPSF`
-        One of photutils' own does not: `from_photutils` takes it with what it lacks.
+    psf : `InstrumentPSF` or tuple
+        One of photutils' own, or an array, does not: `from_photutils` takes it with what it lacks, and so does
+        a pair of it and its pixel, ``(psf, 0.11 * u.arcsec)``, on the sky and north up.
     argument : str, optional
         The argument's name for messages.
 
     Returns
     -------
     psf : `InstrumentPSF`
-        The same.
+        The same, or that of the pair.
 
     Raises
     ------
@@ -353,14 +354,20 @@ def instrument_psf(psf, argument="psf"):
     >>> instrument_psf(ImagePSF(np.ones((5, 5))))
     Traceback (most recent call last):
     ...
-    ValueError: 'psf' must be a PSF on pixels of known size ..., got ImagePSF
+    ValueError: 'psf' must be a PSF on pixels of known size, ..., got ImagePSF
     """
-    wanted = "a PSF on pixels of known size (see miricigale.psf.from_photutils and make_psf)"
+    if isinstance(psf, tuple) and len(psf) == 2:
+        values, pixel_scale = psf
+        return from_photutils(values, pixel_scale)
+    wanted = (
+        "a PSF on pixels of known size, such as one of miricigale.psf.from_photutils and make_psf, or "
+        "(psf, 0.11 * u.arcsec)"
+    )
     check_that(isinstance(psf, InstrumentPSF), argument, wanted, type(psf).__name__)
     return psf
 
 
-def make_psf(data, *, pixel_scale, frame="sky", oversampling=1, enclosed=None, **facts):
+def make_psf(data, pixel_scale, *, frame="sky", oversampling=1, enclosed=None, **facts):
     """
     Make a PSF of an array, normalized and checked.
 
@@ -501,7 +508,7 @@ def as_psf(psf, argument="psf"):
     return ImagePSF(data * (cells**2 / data.sum()), oversampling=cells)
 
 
-def from_photutils(model, *, x=None, y=None, **options):
+def from_photutils(model, pixel_scale, *, x=None, y=None, **options):
     """
     Take over a PSF from photutils (or from stpsf, which writes the gridded form).
 
@@ -509,11 +516,12 @@ def from_photutils(model, *, x=None, y=None, **options):
     ----------
     model : `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel` or what `as_psf` takes
         Normalized as photutils asks: sum ``oversampling**2`` over the infinite plane.
+    pixel_scale : `~astropy.units.Quantity`
+        Pixel of the image that it is for.
     x, y : float, optional
         Detector position at which a gridded model is evaluated; needed for those.
     **options
-        What photutils' models do not know: ``pixel_scale``, ``frame`` and the other options of
-        `make_psf`.
+        What photutils' models do not know: ``frame`` and the other options of `make_psf`.
 
     Returns
     -------
@@ -545,7 +553,7 @@ def from_photutils(model, *, x=None, y=None, **options):
         check_that(x is not None and y is not None, "x, y", "given for a GriddedPSFModel", (x, y))
         yy, xx = ((np.arange(n) - (n - 1) / 2) * (1.0 / cells) for n in model.data.shape[1:])
         data = model.evaluate(*np.meshgrid(xx + x, yy + y), 1.0, x, y)
-    return make_psf(data, oversampling=cells, **options)
+    return make_psf(data, pixel_scale, oversampling=cells, **options)
 
 
 def _half_width(data, origin):

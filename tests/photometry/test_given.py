@@ -133,7 +133,7 @@ def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
         "'kernel' must be a MatchingKernel, a KernelField, a file", ForcedPhotometer, psfs["psf"]
     )
     refuses("'angle' must be given to 'MatchingKernel.identity'", ForcedPhotometer, psf="F770W")
-    refuses("'psf' must be a PSF on pixels of known size", ForcedPhotometer, psf=np.ones((9, 9)))
+    refuses("'psf' must be a PSF on pixels of known size", ForcedPhotometer, psf=3.0)
     points = ForcedPhotometer(psf=psfs["psf"])
     refuses("'image' must be a CCDData, an NDData with unit", points.measure, np.ones((9, 9)), sky)
     refuses("'catalog' must be given without a high-resolution", points.measure, images[0])
@@ -240,3 +240,25 @@ def test_catalogs_of_pandas_with_missing_positions(images, psfs, sky):
     result = ForcedPhotometer(psf=psfs["psf"]).measure(images[0], catalog=catalog)
     assert result.id[0] == 100
     assert np.flatnonzero(~np.isfinite(result.flux.value)).tolist() == [2]
+
+
+def test_psfs_without_pixels_are_on_those_of_their_images(images, sky, flux):
+    image, highres = images
+    # the pixels' response is in the stars, which are drawn by their integrals over pixels
+    half = 20
+    y, x = np.mgrid[-half : half + 1, -half : half + 1]
+    stamps = {}
+    for scale, fwhm in FWHM.items():
+        stamps[scale] = CircularGaussianPRF(flux=1.0, fwhm=fwhm / scale)(x, y)
+    array = stamps[0.09]
+    stated = ForcedPhotometer(psf=(array, 0.09 * u.arcsec)).measure(image, sky)
+    sampled = ForcedPhotometer(psf=array).measure(image, sky)
+    assert_allclose(sampled.flux.value, stated.flux.value, rtol=1e-4)
+    assert np.all(np.abs(sampled.flux.value - flux) < 5 * sampled.flux_err.value)
+    photometer = ForcedPhotometer(psf=array, highres_psf=stamps[0.03], template="psf")
+    assert "PSFs on the pixels of the images" in repr(photometer)
+    both = photometer.measure(image, highres, catalog=sky)
+    assert np.all(np.abs(both.flux.value - flux) < 5 * both.flux_err.value)
+    refuses("'psf' must be a PSF that states its pixels for exposures", photometer.measure,
+            [image, image], highres)  # fmt: skip
+    refuses("given to measure.. where 'highres_psf'", photometer.measure, image, sky)

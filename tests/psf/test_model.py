@@ -64,7 +64,7 @@ def test_grids_are_copied_and_pickled():
 
 def test_a_plain_model_of_photutils_lacks_its_pixel():
     plain = ImagePSF(TURNED.data, oversampling=2)
-    refuses("pixels of known size .*from_photutils", encircled_energy, plain, 1 * u.arcsec)
+    refuses("pixels of known size, .*from_photutils", encircled_energy, plain, 1 * u.arcsec)
     assert instrument_psf(PSF) is PSF
 
 

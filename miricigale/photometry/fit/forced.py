@@ -14,6 +14,7 @@ from miricigale.photometry.detection.prior_catalog import detected_prior, read_c
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels, are_exposures
 from miricigale.photometry.fit.fit_loop import fit_image
 from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package, warn_of_none
+from miricigale.photometry.fit.sampled_psfs import SampledPSFs, is_sampled
 from miricigale.photometry.fit.stars import with_stars
 from miricigale.photometry.images.arrays import fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.images.flags import ForcedFlags
@@ -28,6 +29,7 @@ from miricigale.utils.interactive import Interactive
 from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, is_number, positive, to_array
 from miricigale.utils.values import value_class
@@ -96,6 +98,7 @@ class MemorySettings:
     max_bytes: float = 1.5e9
 
 
+@takes_other_keywords
 @value_class
 class ForcedPhotometer(Interactive):
     """
@@ -118,7 +121,9 @@ class ForcedPhotometer(Interactive):
     psf, highres_psf : `~photutils.psf.ImagePSF`, str or other, optional
         PSFs of the image and of the high-resolution image, in place of the kernel, in any form that
         `~miricigale.psf.MatchingKernel.from_psfs` takes; it makes the kernel. Without a high-resolution image,
-        give the PSF of the image alone: sources are then points.
+        give the PSF of the image alone: sources are then points. Arrays and models of photutils that do not state
+        their pixels are on those of the image that they belong to, in the direction of its axes, when it is
+        measured; ``(array, 0.03 * u.arcsec)`` states them.
     template : {"auto", "cutout", "psf", "sersic"}, optional
         What sources look like. ``"auto"`` cuts them from the high-resolution image where a
         segment of enough signal-to-noise belongs to them, otherwise takes a point source.
@@ -237,17 +242,21 @@ class ForcedPhotometer(Interactive):
         template = self.template
         kernel = self.kernel
         check_choice(template, "template", ("auto", "cutout", "psf", "sersic"))
-        if kernel is None and highres_psf is None:
+        if kernel is None and (is_sampled(psf) or is_sampled(highres_psf)):
+            kernel = SampledPSFs(psf, highres_psf)
+        elif kernel is None and highres_psf is None:
             kernel = MatchingKernel.identity(psf)
-            if template == "auto":
-                template = "psf"
         elif kernel is None:
             kernel = MatchingKernel.from_psfs(highres_psf, psf)
+        if psf is not None and highres_psf is None and template == "auto":
+            template = "psf"
         # the kernel that all have in common: the mean, with PSFs in any case
         mean = kernel
-        if not isinstance(kernel, MatchingKernel):
+        if isinstance(kernel, KernelField | ExposureKernels):
             mean = kernel.mean
-        is_bare = mean.source is None or mean.target is None
+        is_bare = False
+        if isinstance(mean, MatchingKernel):
+            is_bare = mean.source is None or mean.target is None
         changed = {"kernel": kernel, "template": template, "bare": is_bare, "mean_kernel": mean}
         changed["n_threads"] = thread_count(self.n_threads)
         if is_bare:
@@ -287,6 +296,7 @@ class ForcedPhotometer(Interactive):
     def _facts(self):
         return field_values(self)
 
+    @takes_other_keywords
     def measure(self, image, highres=None, segmentation=None, catalog=None, *, templates=None):
         """
         Measure all sources of a catalog.
@@ -327,6 +337,12 @@ class ForcedPhotometer(Interactive):
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
+        if isinstance(self.kernel, SampledPSFs):
+            sharp = highres
+            if isinstance(highres, (SkyCoord, Table)):
+                sharp = None
+            photometer = self.replace(kernel=self.kernel.kernel(image, sharp))
+            return photometer.measure(image, highres, segmentation, catalog, templates=templates)
         if templates is not None and not isinstance(templates, SourceTemplates):
             msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
             raise TypeError(msg)

@@ -1,0 +1,89 @@
+"""PSFs on the pixels of images that are still to come."""
+
+import dataclasses
+
+import numpy as np
+from photutils.psf import GriddedPSFModel
+
+from miricigale.instrument.sky_axes import grid_angle
+from miricigale.photometry.fit.exposure_kernels import are_exposures
+from miricigale.photometry.images.arrays import pixel_scale
+from miricigale.photometry.images.mosaics import as_mosaic
+from miricigale.psf import InstrumentPSF, MatchingKernel, from_photutils
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
+from miricigale.utils.units import ANGLE
+
+
+def is_sampled(psf):
+    """Whether a PSF is an array or a model without the size of its pixels."""
+    if isinstance(psf, (InstrumentPSF, GriddedPSFModel)):
+        return False
+    return isinstance(psf, np.ndarray) or hasattr(psf, "param_names") or hasattr(psf, "array")
+
+
+@dataclasses.dataclass(frozen=True)
+class SampledPSFs:
+    """
+    PSFs of which one at least is on the pixels of an image that is not known yet.
+
+    Parameters
+    ----------
+    psf : `~numpy.ndarray`, model of photutils or other
+        Of the image that is measured.
+    highres_psf : `~numpy.ndarray`, model of photutils or other, optional
+        Of the high-resolution image.
+    """
+
+    psf: object
+    highres_psf: object = None
+
+    def __repr__(self):
+        return "PSFs on the pixels of the images"
+
+    def kernel(self, image, highres):
+        """
+        Make the kernel on the pixels of images.
+
+        Parameters
+        ----------
+        image, highres : `~astropy.nddata.CCDData`, path-like or None
+            The image that is measured and the high-resolution image.
+
+        Returns
+        -------
+        kernel : `~miricigale.psf.MatchingKernel`
+
+        Raises
+        ------
+        ValueError
+            If there is no image that a PSF could be on the pixels of.
+        """
+        if are_exposures(image):
+            wanted = "a PSF that states its pixels for exposures, such as (psf, 0.11 * u.arcsec)"
+            raise argument_error("psf", wanted, type(self.psf).__name__)
+        image = as_mosaic(image, "image")
+        psf = _on_pixels(self.psf, image)
+        if self.highres_psf is None:
+            return MatchingKernel.identity(psf)
+        wanted = "given to measure() where 'highres_psf' does not state its pixels"
+        sampled = is_sampled(self.highres_psf)
+        check_that(highres is not None or not sampled, "highres", wanted, "None")
+        if highres is None:
+            return MatchingKernel.from_psfs(self.highres_psf, psf)
+        highres = as_mosaic(highres, "highres")
+        return MatchingKernel.from_psfs(
+            _on_pixels(self.highres_psf, highres),
+            psf,
+            pixel_scale=pixel_scale(highres.wcs) * ANGLE,
+            grid_angle=grid_angle(highres.wcs, highres.shape),
+        )
+
+
+def _on_pixels(psf, image):
+    """Return a PSF on the pixels of an image, in the direction of its axes, if it does not state its own."""
+    if not is_sampled(psf):
+        return psf
+    scale = pixel_scale(image.wcs) * ANGLE
+    angle = grid_angle(image.wcs, image.shape)
+    return from_photutils(psf, pixel_scale=scale, frame="sky", angle=angle)
