@@ -50,6 +50,8 @@ def _nearest_command(name, names):
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if close:
         return _meant(close[0])
+    if "run" in names and name in _other_names("no_commands"):
+        return f"; {_other_names('no_commands')[name]}"
     command = _other_names("commands").get(name)
     if command in names or command == "--help":
         return _meant(command)

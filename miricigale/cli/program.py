@@ -25,7 +25,8 @@ def main(argv=None):
     Returns
     -------
     status : int
-        0 if all went well, 2 for input that cannot be used, 130 if interrupted, 143 if terminated.
+        0 if all went well, 2 for input that cannot be used, 130 if interrupted, 143 if terminated, 141 if the
+        reader of its output left.
     """
     if argv is None:
         argv = sys.argv[1:]
@@ -50,7 +51,13 @@ def main(argv=None):
     try:
         _keep_output_clean()
         module, _, function = args.call.partition(":")
-        return getattr(importlib.import_module(f"miricigale.cli.{module}"), function)(args)
+        status = getattr(importlib.import_module(f"miricigale.cli.{module}"), function)(args)
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        # the reader, such as `head`, has enough; what is left in the buffer goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _STOPPED + signal.SIGPIPE
     except KeyboardInterrupt as stop:
         print(args.stopped, file=sys.stderr)
         return _STOPPED + (stop.args[0] if stop.args else signal.SIGINT)
