@@ -214,10 +214,17 @@ class Ramp(Interactive, NDData):
         return Ramp(self.data[part], self.exposure.replace(n_integrations=1), **values)
 
     def __getitem__(self, number):
+        """
+        Return an integration by its number, or counts by several indices.
+
+        ``ramp[0]`` is the first integration as a `Ramp`; ``ramp[0, -1]`` are the counts (DN) of its last group,
+        as floats: differences of groups can be negative, which the integers of ``ramp.data`` cannot.
+        """
+        if isinstance(number, tuple):
+            return self.data[number].astype(float) * u.DN
         if not isinstance(number, numbers.Integral):
-            raise argument_error(
-                "number", "that of an integration (ramp.data has pixels)", repr(number)
-            )
+            wanted = "that of an integration; ramp[0, -1] is a group, ramp[0, :, y, x] a pixel"
+            raise argument_error("number", wanted, repr(number))
         if not -len(self.data) <= number < len(self.data):
             msg = f"integration {number} of {len(self.data)}"
             raise IndexError(msg)
@@ -260,6 +267,7 @@ class Ramp(Interactive, NDData):
             gathered = np.diff(self.data[0, groups].astype(float), axis=0).min(axis=0)
             gathered[(self.pixel_dq & int(DQ.DO_NOT_USE)) != 0] = -np.inf
             pixel = np.unravel_index(np.argmax(gathered), gathered.shape)[::-1]
+        check_that(np.shape(pixel) == (2,), "pixel", "column and row, (x, y)", pixel)
         x, y = map(operator.index, pixel)
         check_that(0 <= x < nx and 0 <= y < ny, "pixel", f"(x, y) below ({nx}, {ny})", pixel)
         flags = None

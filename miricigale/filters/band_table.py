@@ -9,7 +9,8 @@ class BandTable(QTable):
     """
     A `~astropy.table.QTable` in which ``table["F770W"]`` is the column ``miri.f770w``.
 
-    So is ``table["F770W_err"]`` the column ``miri.f770w_err``, and so on with any name of a filter.
+    So is ``table["F770W_err"]`` the column ``miri.f770w_err``, and so on with any name of a filter; and
+    ``table["redshift"]`` the posterior median, ``redshift_p50``.
 
     Examples
     --------
@@ -40,4 +41,6 @@ class BandTable(QTable):
             column = "_".join([band or "", *parts[n_parts:]])
             if column in self.columns:
                 return column
+        if f"{name}_p50" in self.columns:
+            return f"{name}_p50"
         return name

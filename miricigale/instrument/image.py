@@ -58,6 +58,9 @@ class Image(Interactive, CCDData):
             self.meta["filter"] = find_filter(name) or name
 
     def __repr__(self):
+        if self.ndim == 0:
+            # a sum or a mean of pixels
+            return f"<Image {self.data} {self.unit}>"
         facts = [f"{self.shape[0]} x {self.shape[1]}" if self.ndim == 2 else str(self.shape)]
         facts += [str(self.unit), str(self.meta.get("filter") or "")]
         if self._has_sky:

@@ -76,6 +76,7 @@ class SEDModel(Interactive):
     1.0
     """
 
+    @takes_other_keywords
     def __init__(self, components=None, *, cosmology=COSMOLOGY, frac_agn_definition="dust"):
         wanted = "given; SEDModel.survey() and SEDModel.yang2021() have theirs"
         check_that(components is not None, "components", wanted, "None")
@@ -530,6 +531,8 @@ class SEDModel(Interactive):
             twice = sorted(set(values) & set(parameters))
             check_that(not twice, "values", "without those given by keyword", twice)
             parameters = dict(values) | parameters
+        if any(np.ndim(value) == 1 for value in parameters.values()):
+            return [self.evaluate(model) for model in _single_models(parameters)]
         return tables.spectra(self, self.values(parameters))
 
     __call__ = evaluate

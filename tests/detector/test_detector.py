@@ -297,3 +297,16 @@ def test_ramp_checks_its_arrays(make_exposure):
     refuses("'data' must be of dtype", Ramp, good.astype(float), exposure)
     refuses("'pixel_dq' must be", Ramp, good, exposure, pixel_dq=np.zeros((64, 72)))
     refuses("'group_dq' must be", Ramp, good, exposure, group_dq=np.zeros((64, 72), np.uint8))
+
+
+def test_groups_of_a_ramp_are_subtracted_as_floats(make_exposure):
+    exposure = make_exposure(n_groups=2)
+    counts = np.full((1, 2, *exposure.shape), 100, np.uint16)
+    # a hit in the first group: the integers themselves would wrap to 65436
+    counts[0, 1, 3, 4] = 0
+    ramp = Ramp(counts, exposure)
+    difference = ramp[0, 1] - ramp[0, 0]
+    assert difference[3, 4] == -100 * u.DN
+    assert difference.sum() == -100 * u.DN
+    assert_array_equal(ramp[0, :, 3, 4].value, [100, 0])
+    refuses(r"ramp\[0, -1\] is a group", ramp.__getitem__, "first")

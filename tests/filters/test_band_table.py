@@ -36,3 +36,10 @@ def test_it_is_a_table_of_astropy_otherwise(table, tmp_path):
     table.write(tmp_path / "t.ecsv")
     assert QTable.read(tmp_path / "t.ecsv").colnames == table.colnames
     assert hstack([QTable({"x": [1, 2]}), table])["miri.f770w"][1] == 4 * u.uJy
+
+
+def test_a_quantity_alone_is_its_posterior_median():
+    fits = BandTable({"redshift_p16": [1.0], "redshift_p50": [2.0], "redshift_odds": [0.9]})
+    assert fits["redshift"][0] == 2.0
+    assert fits["redshift_odds"][0] == 0.9
+    refuses("frac_agn", fits.__getitem__, "frac_agn", error=KeyError)

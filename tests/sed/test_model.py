@@ -149,7 +149,7 @@ def test_meta_says_which_libraries(model):
         ({"tau": -1.0}, ValueError, "'tau' must be from 0.001 to 100.0 Gyr, got -1.0"),
         ({"age": 7.0, "redshift": 2.0}, ValueError, "'age' must be at most the age of the"),
         ({"redshift": 1 * u.um}, u.UnitsError, "'redshift' must be convertible"),
-        ({"age": [1.0, 2.0]}, ValueError, r"'age' must be one number .fluxes.. takes several"),
+        ({"age": [[1.0, 2.0]]}, ValueError, r"'age' must be one number .fluxes.. takes several"),
         ({"age": None}, ValueError, "'age' must be one number, got None"),
         ({"age": "1.0"}, ValueError, "'age' must be one number, got '1.0'"),
         ({"age": 1j}, ValueError, "'age' must be one number"),
@@ -648,3 +648,14 @@ def test_components_are_indexed_by_name_role_and_number():
     assert model[0] is model["sfh"] is model.components[0]
     assert model[-1] is model.components[-1]
     refuses("no component 'skirtor'", model.__getitem__, "skirtor", error=KeyError)
+
+
+def test_arrays_of_parameters_are_several_models():
+    model = SEDModel.yang2021(libraries="bundled")
+    redshifts = [0.5, 2.0]
+    masses = [1e10, 3e10] * u.Msun
+    several = model.evaluate(redshift=redshifts, mass=masses, age=1.0)
+    for sed, redshift, mass in zip(several, redshifts, masses, strict=True):
+        assert_array_equal(sed.fnu, model.evaluate(redshift=redshift, mass=mass, age=1.0).fnu)
+    refuses("arrays of one length, got 2 of 'redshift', 3 of 'age'", model.evaluate,
+            redshift=redshifts, age=[1.0, 2.0, 3.0])  # fmt: skip
