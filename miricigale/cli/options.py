@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 
 from miricigale.utils.named_values import without
+from miricigale.utils.table_formats import WRITTEN_FORMATS
 
 
 class Parser(argparse.ArgumentParser):
@@ -134,27 +135,17 @@ def number_or_file(text):
 
 
 #: Endings of files that people name as an output, where a command writes a folder.
-_FILE_ENDINGS = (
+_FILE_ENDINGS = {
+    *WRITTEN_FORMATS,
     ".asdf",
     ".cat",
-    ".csv",
-    ".dat",
-    ".ecsv",
-    ".fit",
-    ".fits",
     ".gz",
-    ".h5",
-    ".hdf5",
     ".html",
     ".json",
-    ".parquet",
     ".pdf",
     ".png",
     ".toml",
-    ".txt",
-    ".vot",
-    ".xml",
-)
+}
 
 
 def output_folder(text):

@@ -13,7 +13,8 @@ from miricigale.utils.files import packed_open, unpacked_size
 from miricigale.utils.meta import full_meta
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_data
-from miricigale.utils.table_files import TABLE_FORMATS, read_table, table_suffix
+from miricigale.utils.table_files import read_table
+from miricigale.utils.table_formats import TABLE_FORMATS, table_suffix
 from miricigale.utils.units import WAVE
 from miricigale.utils.values import value_class
 

@@ -19,7 +19,8 @@ from miricigale.utils.files import reading
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.options import check_that
 from miricigale.utils.other_keywords import takes_other_keywords
-from miricigale.utils.table_files import table_suffix, write_table
+from miricigale.utils.table_files import write_table
+from miricigale.utils.table_formats import table_suffix
 from miricigale.utils.units import (
     FNU,
     WAVE,

@@ -9,7 +9,7 @@ import numpy as np
 from miricigale.filters.band_names import find_filter, xray_energies
 from miricigale.filters.filter import Filter
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.table_files import TABLE_FORMATS
+from miricigale.utils.table_formats import TABLE_FORMATS
 
 _KEV = (const.h * const.c).to_value(u.keV * u.um)
 

@@ -29,7 +29,8 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
-from miricigale.utils.table_files import read_table, table_suffix, write_table
+from miricigale.utils.table_files import read_table, write_table
+from miricigale.utils.table_formats import table_suffix
 from miricigale.utils.units import (
     FNU,
     WAVE,

@@ -35,6 +35,7 @@ from miricigale.utils.meta import plain_value
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
+from miricigale.utils.table_formats import TABLE_FORMATS, WRITTEN_FORMATS, table_suffix
 from miricigale.utils.text_reading import BOM, check_text, first_bytes, read_text
 from miricigale.utils.text_tables import drop_repeated, is_barred, is_sextractor, names_in_comments
 
@@ -127,21 +128,6 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
         raise unreadable(path, wanted, err) from err
 
 
-#: Formats of tables by suffix, as `astropy.table.Table` calls them.
-TABLE_FORMATS = {
-    ".fits": "fits",
-    ".fit": "fits",
-    ".ecsv": "ascii.ecsv",
-    ".csv": "ascii.csv",
-    ".xml": "votable",
-    ".vot": "votable",
-    ".votable": "votable",
-    ".h5": "hdf5",
-    ".hdf5": "hdf5",
-    ".parquet": "parquet",
-}
-#: Those that tables are written in: plain text keeps the units too.
-_WRITTEN_FORMATS = TABLE_FORMATS | {".txt": "ascii.ecsv", ".dat": "ascii.ecsv"}
 #: What astropy must know further to write a format.
 _OPTIONS = {
     "hdf5": {"path": "table", "serialize_meta": True},
@@ -152,14 +138,6 @@ _VOTABLE_TYPES = FITS_TYPES | {
     np.dtype(np.uint32): np.int64,
     np.dtype(np.uint64): np.int64,
 }
-
-
-def table_suffix(path):
-    """Suffix of a file in lower case, without that of its packing."""
-    name = Path(path).name.lower()
-    for packing in (".gz", ".bz2", ".xz", ".zip"):
-        name = name.removesuffix(packing)
-    return Path(name).suffix
 
 
 def write_table(table, path, *, overwrite=False):
@@ -184,8 +162,8 @@ def write_table(table, path, *, overwrite=False):
         If the file is there and ``overwrite`` is not set.
     """
     path = Path(path)
-    form = _WRITTEN_FORMATS.get(Path(path.name.lower().removesuffix(".gz")).suffix)
-    wanted = f"a file ending in one of {', '.join(_WRITTEN_FORMATS)}"
+    form = WRITTEN_FORMATS.get(Path(path.name.lower().removesuffix(".gz")).suffix)
+    wanted = f"a file ending in one of {', '.join(WRITTEN_FORMATS)}"
     check_that(form is not None, "path", wanted, str(path))
     if form == "parquet":
         require("pyarrow", extra="parquet")
