@@ -34,7 +34,7 @@ from miricigale.fitting import (
 )
 from miricigale.fitting.data.template_error import pivots
 from miricigale.sed import SEDModel
-from miricigale.sed.spectrum import COSMOLOGY
+from miricigale.sed.cosmology import COSMOLOGY
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import LUMINOSITY
 

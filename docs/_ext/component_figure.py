@@ -84,7 +84,7 @@ def _agn(part, values):
 
 
 def _xrays(part, values):
-    from miricigale.sed.spectrum import COSMOLOGY, distance
+    from miricigale.sed.cosmology import COSMOLOGY, distance
 
     redshift = np.linspace(0.1, 5, 200)
     flux = part.derived(1e37, redshift, distance(redshift, COSMOLOGY), values)["xray_flux"]

@@ -12,7 +12,7 @@ from miricigale.cigale.names import AGN_PARTS, cigale_names
 from miricigale.filters import Filter
 from miricigale.filters.band_names import filter_of_band
 from miricigale.fitting.results.drawing import best_parameters
-from miricigale.sed.spectrum import distance
+from miricigale.sed.cosmology import distance
 from miricigale.sed.xray_bands import SPAN, XRays, disk_2500
 from miricigale.utils.files import replacing
 from miricigale.utils.options import check_that

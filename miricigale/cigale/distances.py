@@ -5,7 +5,7 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 
-from miricigale.sed.spectrum import distance
+from miricigale.sed.cosmology import distance
 from miricigale.utils.units import to_array
 
 

@@ -2,6 +2,7 @@ from . import components as components
 from .component import ROLES as ROLES
 from .component import Component as Component
 from .component import register as register
+from .cosmology import COSMOLOGY as COSMOLOGY
 from .derived import DERIVED as DERIVED
 from .derived import Derived as Derived
 from .foreground import GalacticExtinction as GalacticExtinction
@@ -18,7 +19,6 @@ from .presets import survey_axes as survey_axes
 from .presets import yang2021_axes as yang2021_axes
 from .red_dot_spectra import red_dot as red_dot
 from .red_dot_spectra import red_dots as red_dots
-from .spectrum import COSMOLOGY as COSMOLOGY
 from .spectrum import SED as SED
 from .tables import ModelFlags as ModelFlags
 from .templates import read_spectra as read_spectra

@@ -6,7 +6,7 @@ from astropy.table import QTable
 from miricigale.filters import FilterSet, find_filter
 from miricigale.sed.cells import cell_means, edges_around
 from miricigale.sed.chain import STELLAR
-from miricigale.sed.spectrum import distance
+from miricigale.sed.cosmology import distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import places

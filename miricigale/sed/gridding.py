@@ -8,9 +8,9 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from miricigale.sed.chain import GALAXY_ROLES, STELLAR, distinct
+from miricigale.sed.cosmology import distance
 from miricigale.sed.derived import DERIVED, galaxy_quantities
 from miricigale.sed.grid import ModelGrid
-from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import BLOCK, dilution, seen_agn
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ModelWarning, argument_error, unknown_name, warn

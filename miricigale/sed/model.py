@@ -12,11 +12,11 @@ from miricigale.refdata import citations
 from miricigale.sed import gridding, presets, tables
 from miricigale.sed.chain import Chain
 from miricigale.sed.component import Component, in_order, named_component, read_config
+from miricigale.sed.cosmology import COSMOLOGY
 from miricigale.sed.derived import DERIVED, Derived
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import MODEL_PARAMETERS, default_values
-from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance

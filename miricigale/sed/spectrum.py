@@ -1,37 +1,30 @@
 """Spectra as observed: wavelengths and flux densities, of a whole and of its parts."""
 
 import dataclasses
-import functools
-import operator
 from dataclasses import field
 
 import astropy.units as u
 import numpy as np
 from astropy.constants import c
-from astropy.cosmology import FlatLambdaCDM
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet, as_filter
 from miricigale.filters.spectra import spectrum_arrays
-from miricigale.instrument import DQ
-from miricigale.utils.curve_columns import (
-    FLUX_NAME,
-    curve_columns,
-    is_quality,
-    unit_of_fluxes,
-    unit_of_wavelengths,
-)
-from miricigale.utils.exceptions import argument_error, data_error, units_error, unknown_name
+from miricigale.sed.cosmology import COSMOLOGY, distance
+from miricigale.sed.flux_units import flux_density_unit
+from miricigale.sed.spectrum_parts import Parts
+from miricigale.sed.spectrum_tables import spectrum_columns
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import full_meta
-from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.table_formats import table_suffix
 from miricigale.utils.units import (
+    FLAM,
     FNU,
     WAVE,
     Frozen,
@@ -41,68 +34,6 @@ from miricigale.utils.units import (
     to_array,
 )
 from miricigale.utils.values import value_class
-
-_FLAM = u.erg / u.s / u.cm**2 / u.AA
-
-#: Unit of the parts of a spectrum in files, another one than that of the whole.
-_PART = u.nJy
-
-#: WMAP7, as in Yang et al. 2021.
-COSMOLOGY = FlatLambdaCDM(H0=70.4, Om0=0.272, name="yang2021")
-
-
-def distance(redshift, cosmology):
-    """
-    Luminosity distance in meters; 10 pc at redshift 0, as for absolute magnitudes.
-
-    Parameters
-    ----------
-    redshift : float or `~numpy.ndarray`
-        Redshifts >= 0.
-    cosmology : `~astropy.cosmology.Cosmology`
-        The cosmology.
-    """
-    z = floats(redshift)
-    far = cosmology.luminosity_distance(np.where(z > 0, z, 1.0)).to_value(u.m)
-    return np.where(z > 0, far, (10.0 * u.pc).to_value(u.m))
-
-
-def _with_unit(column, parse):
-    """A column as a quantity, its unit read by ``parse``; None without one."""
-    unit = getattr(column, "unit", None)
-    if unit is None:
-        return None
-    unit = parse(unit)
-    if unit == column.unit:
-        return column
-    return floats(column) * unit
-
-
-def _without_flagged(fnu, table):
-    """Fluxes that are NaN where a column DQ of JWST forbids their use, or a column of truth values masks them."""
-    for name in table.colnames:
-        flags = np.ma.getdata(table[name])
-        if name.lower() == "dq" and flags.dtype.kind in "iu":
-            bad = flags.astype(np.int64) & int(DQ.DO_NOT_USE) != 0
-        elif name.lower() == "mask" and flags.dtype.kind == "b":
-            bad = flags
-        else:
-            continue
-        if bad.any():
-            fnu = np.where(bad, np.nan, floats(fnu)) * fnu.unit
-    return fnu
-
-
-def _flux_unit(unit):
-    """Return the unit of a flux density, and what stands for it on an axis."""
-    unit = u.Unit(unit)
-    for kind, symbol in ((FNU, r"F_\nu"), (_FLAM, r"F_\lambda"), (_FLAM * u.AA, r"\nu F_\nu")):
-        if unit.is_equivalent(kind):
-            label = unit.to_string("unicode", fraction="inline")
-            if unit == FNU:
-                label = "µJy"
-            return unit, f"${symbol}$ ({label})"
-    raise units_error("unit", "one of F_nu, F_lambda or nu F_nu", unit)
 
 
 class _Flux(u.Quantity):
@@ -117,25 +48,6 @@ class _Flux(u.Quantity):
         flux = sed.fnu.view(cls)
         flux._sed = sed
         return flux
-
-
-class Parts(dict):
-    """
-    Parts of a spectrum by name.
-
-    ``"agn"`` is the sum of those of the AGN, ``"galaxy"`` that of the others, so that both make up the whole.
-    """
-
-    def __missing__(self, name):
-        groups = {"agn": [], "galaxy": []}
-        for key, part in self.items():
-            # light before attenuation is no part of the whole
-            if not key.endswith("_intrinsic"):
-                groups["agn" if key.startswith("agn_") else "galaxy"].append(part)
-        groups = {group: parts for group, parts in groups.items() if parts}
-        if name not in groups:
-            raise unknown_name("component", name, [*self, *groups])
-        return functools.reduce(operator.add, groups[name])
 
 
 @value_class
@@ -277,16 +189,16 @@ class SED(Frozen, WithTable):
     @property
     def flam(self):
         """Flux density F_lambda, erg/s/cm2/Angstrom."""
-        return self.fnu.to(_FLAM, u.spectral_density(self.wave))
+        return self.fnu.to(FLAM, u.spectral_density(self.wave))
 
     @property
     def nu_fnu(self):
         """Flux nu F_nu, the same as lambda F_lambda, erg/s/cm2."""
-        return (self.frequency * self.fnu).to(_FLAM * u.AA)
+        return (self.frequency * self.fnu).to(FLAM * u.AA)
 
     def to(self, unit):
         """Return the flux densities in a unit of F_nu, F_lambda or nu F_nu, `~astropy.units.Quantity`."""
-        unit, _ = _flux_unit(unit)
+        unit, _ = flux_density_unit(unit)
         return self.fnu.to(unit, u.spectral_density(self.wave))
 
     def _changed(self, change):
@@ -595,7 +507,7 @@ class SED(Frozen, WithTable):
         check_that(table_suffix(path) != ".csv", "path", wanted, str(path))
         table = self.to_table()
         for name in self.components:
-            table[name] = table[name].to(_PART)
+            table[name] = table[name].to(u.nJy)
         write_table(table, path, overwrite=overwrite)
 
     @classmethod
@@ -625,18 +537,7 @@ class SED(Frozen, WithTable):
     @classmethod
     def _of_table(cls, table, path):
         """Make a spectrum of a table, named ``path`` in messages."""
-        wave_name, flux_name = curve_columns(table, FLUX_NAME, path)
-        wave = _with_unit(table[wave_name], unit_of_wavelengths)
-        fnu = _with_unit(table[flux_name], unit_of_fluxes)
-        if wave is None or fnu is None:
-            raise data_error(path, "has no two columns with units, wavelengths and flux densities")
-        fnu = _without_flagged(fnu, table)
-        lights = []
-        for name in table.colnames:
-            unit = getattr(table[name], "unit", None)
-            is_other = name not in (wave_name, flux_name) and not is_quality(name)
-            if is_other and isinstance(unit, u.UnitBase) and unit.is_equivalent(FNU):
-                lights.append(name)
+        wave, fnu, lights = spectrum_columns(table, path)
         with reading(path, "a spectrum"):
             meta = full_meta(table.meta)
             redshift = float(meta.pop("redshift", 0.0))
@@ -748,7 +649,7 @@ class SED(Frozen, WithTable):
         wave = self.wave.value
         if rest_frame:
             wave = self.rest_wavelength.value
-        unit, symbol = _flux_unit(unit)
+        unit, symbol = flux_density_unit(unit)
         axes = {"rest_frame": rest_frame, "label_y": symbol}
         density = u.spectral_density(self.wave)
         values = self.fnu.to_value(unit, density)

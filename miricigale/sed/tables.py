@@ -12,8 +12,9 @@ from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
 from miricigale.sed.chain import SIX, SKY, STELLAR, distinct
 from miricigale.sed.component import COMPONENTS
+from miricigale.sed.cosmology import distance
 from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, scaled_quantities
-from miricigale.sed.spectrum import SED, distance
+from miricigale.sed.spectrum import SED
 from miricigale.utils.caching import cached
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn

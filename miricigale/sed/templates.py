@@ -20,10 +20,9 @@ from miricigale.utils.missing_values import floats, plain_floats
 from miricigale.utils.options import check_choice, check_data, check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_table
-from miricigale.utils.units import FNU, WAVE, is_ascending
+from miricigale.utils.units import FLAM, FNU, WAVE, is_ascending
 
 _SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii", ".spec")
-_FLAM = u.erg / u.s / u.cm**2 / u.AA
 #: Parameters that a grid has itself.
 _OF_GRIDS = frozenset({"redshift", "mass", "frac_agn"})
 #: Where spectra that end before are continued to.
@@ -115,7 +114,7 @@ def _read_file(file):
                         name = stem
                     else:
                         name = f"{stem}[{part}]"
-                    unit = unit_of_fluxes(table[column].unit or stated[1] or _FLAM)
+                    unit = unit_of_fluxes(table[column].unit or stated[1] or FLAM)
                     out[name] = SED(wave, flux * unit)
         return out
 

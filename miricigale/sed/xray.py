@@ -5,8 +5,8 @@ import numpy as np
 
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
+from miricigale.sed.cosmology import COSMOLOGY, distance
 from miricigale.sed.parameter import Parameter
-from miricigale.sed.spectrum import COSMOLOGY, distance
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import without_mask
 from miricigale.utils.units import LUMINOSITY, to_array

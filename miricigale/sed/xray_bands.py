@@ -8,8 +8,8 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters import Filter
+from miricigale.sed.cosmology import distance
 from miricigale.sed.grid_spectra import row_values
-from miricigale.sed.spectrum import distance
 from miricigale.sed.xray import check_band
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that

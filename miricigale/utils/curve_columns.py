@@ -5,15 +5,15 @@ import re
 import astropy.units as u
 
 from miricigale.utils.options import check_data
+from miricigale.utils.units import FLAM
 
-_FLAM = u.erg / u.s / u.cm**2 / u.AA
 #: Units as STScI and others write them, in lower case.
 _WAVE_UNITS = {
     "a": u.AA, "angstrom": u.AA, "angstroms": u.AA,
     "micron": u.um, "microns": u.um, "micrometer": u.um, "micrometers": u.um,
     "nanometer": u.nm, "nanometers": u.nm,
 }  # fmt: skip
-_FLUX_UNITS = {"flam": _FLAM, "fnu": _FLAM * u.AA / u.Hz}
+_FLUX_UNITS = {"flam": FLAM, "fnu": FLAM * u.AA / u.Hz}
 #: Names of columns of wavelengths.
 _WAVE_NAME = re.compile(r"wave|lambda|λ|^lam$|\bwl\b", re.IGNORECASE)
 #: Names of columns of flux densities.

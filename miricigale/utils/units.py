@@ -15,6 +15,7 @@ from miricigale.utils.options import check_that
 #: Units declared once; every array inside the package is in one of these.
 WAVE = u.um
 FNU = u.uJy
+FLAM = u.erg / u.s / u.cm**2 / u.AA
 LUMINOSITY = u.W
 MASS = u.Msun
 SURFACE_BRIGHTNESS = u.MJy / u.sr

@@ -16,7 +16,8 @@ from miricigale.cigale import CigaleSetup, fit_cigale, read_cigale_results, writ
 from miricigale.cigale import read_pcigale_ini as read
 from miricigale.cigale.ini import parse_ini, parse_values
 from miricigale.fitting import FitFlags
-from miricigale.sed.spectrum import COSMOLOGY, SED
+from miricigale.sed.cosmology import COSMOLOGY
+from miricigale.sed.spectrum import SED
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
 
 H_KEV = 4.135667696e-18  # h in keV s

@@ -19,7 +19,7 @@ from miricigale.fitting import (
 )
 from miricigale.fitting.survey.survey import SurveyCalibration, calibrate
 from miricigale.sed import SEDModel
-from miricigale.sed.spectrum import COSMOLOGY
+from miricigale.sed.cosmology import COSMOLOGY
 from miricigale.utils.exceptions import DataError
 
 

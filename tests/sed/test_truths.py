@@ -17,7 +17,7 @@ from scipy.special import hyp2f1
 
 from miricigale.filters import FilterSet
 from miricigale.sed import COSMOLOGY, SED, SEDModel
-from miricigale.sed.spectrum import distance
+from miricigale.sed.cosmology import distance
 
 BANDS = [
     *(f"megacam.{band}" for band in "ugriz"),

@@ -8,7 +8,7 @@ import numpy as np
 
 from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.fitting.posterior.quantities import column_values
-from miricigale.sed.spectrum import COSMOLOGY
+from miricigale.sed.cosmology import COSMOLOGY
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that

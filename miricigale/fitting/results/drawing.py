@@ -6,7 +6,7 @@ import numpy as np
 from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.fitting.results.corner_panels import marked_values
 from miricigale.fitting.results.table_columns import OUTLIER
-from miricigale.sed.spectrum import distance
+from miricigale.sed.cosmology import distance
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import places
 from miricigale.utils.options import check_names, check_that
