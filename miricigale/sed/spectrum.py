@@ -96,40 +96,6 @@ class SED(Frozen, WithTable):
     meta: dict = field(default_factory=dict)
     components: dict = field(default_factory=dict)
 
-    _other_names = {
-        "wavelength": "wave",
-        "wavelengths": "wave",
-        "spectral_axis": "wave",
-        "waveset": "wave",
-        "flux_density": "fnu",
-        "flux_at": "fnu_at",
-        "interpolate": "fnu_at",
-        "agn_fraction": "frac_agn",
-        "uv_slope": "beta",
-        "nufnu": "nu_fnu",
-        "nu_f_nu": "nu_fnu",
-        "lambda_flambda": "nu_fnu",
-        "lambda_f_lambda": "nu_fnu",
-        "f_nu": "fnu",
-        "f_lambda": "flam",
-        "nu": "frequency",
-        "z": "redshift",
-        "with_redshift": "redshifted",
-        "at_redshift": "redshifted",
-        "rest_wave": "rest_wavelength",
-        "magnitude": "synthetic_magnitude",
-        "mag": "synthetic_magnitude",
-        "ab_mag": "synthetic_magnitude",
-        "photometry": "fluxes",
-        "synthetic_fluxes": "fluxes",
-        "synthetic_magnitudes": "magnitudes",
-        "save": "write",
-        "properties": "derived",
-        "quantities": "derived",
-        "to_spectrum": "to_specutils",
-        "to_spectrum1d": "to_specutils",
-    }
-
     def _value(self, name):
         # half-made copies have no meta yet
         if "meta" not in self.__dict__:

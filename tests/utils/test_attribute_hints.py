@@ -57,6 +57,7 @@ def test_other_names_are_of_attributes(name):
             "Ramp": {"exposure"},
         }
         own["FitResults"] |= {"redshift_p16", "redshift_p50", "redshift_p84"}
+        own["SED"] = {"frac_agn", "beta"}
         own["SEDModel"] = {"components", "cosmology"}
         own["Ramp"] |= {"pixel_dq", "group_dq"}
         assert first in set(dir(cls)) | set(fields) | own.get(name, set()), (other, ours)
