@@ -138,8 +138,8 @@ def _with_index(rows, start, index_id):
 
 def _plain_columns(rows, place):
     """Rows of Arrow with columns of types that a table can hold, and a warning about the others."""
-    types = require("pyarrow", extra="parquet").types
     pyarrow = require("pyarrow", extra="parquet")
+    types = pyarrow.types
     lost = []
     for field in list(rows.schema):
         i = rows.schema.get_field_index(field.name)
@@ -148,10 +148,8 @@ def _plain_columns(rows, place):
         if types.is_dictionary(kind):
             kind = kind.value_type
             column = column.cast(kind)
-        if types.is_null(kind):
-            # no value in any row: missing numbers
-            column = column.cast(pyarrow.float64())
-        elif types.is_decimal(kind):
+        if types.is_null(kind) or types.is_decimal(kind):
+            # a column without any value has missing numbers
             column = column.cast(pyarrow.float64())
         elif types.is_large_string(kind) or getattr(types, "is_string_view", types.is_string)(kind):
             column = column.cast(pyarrow.string())

@@ -20,8 +20,6 @@ WRITTEN_INDEX = "Unnamed: 0"
 _LIKELY = ("name", "designation", "iauname", "object", "source", "target", "seq", "recno", "index")
 _ID_PART = re.compile(r"(?:^|[_\-. ])id(?:$|[_\-. ])", re.IGNORECASE)
 _ID_END = re.compile(r"[a-z](?:Id|ID)$|[A-Z]ID$")
-#: Whole numbers below which every one is exact in double and single precision.
-_EXACT = {8: 2**53, 4: 2**24, 2: 2**11}
 #: Ids listed in a message.
 _LISTED = 3
 
@@ -195,10 +193,8 @@ def ids_and_missing(column, argument):
         ids = _of_floats(ids, missing, argument)
     # FITS takes numbers of one byte for true and false
     if ids.dtype == np.int8:
-        dtype = np.dtype(np.int16)
-    else:
-        dtype = ids.dtype
-    return ids.astype(dtype.newbyteorder("=")), missing
+        ids = ids.astype(np.int16)
+    return ids.astype(ids.dtype.newbyteorder("=")), missing
 
 
 def _is_empty(key):
@@ -239,8 +235,8 @@ def _of_floats(ids, missing, argument):
     safe = np.where(missing, 0, ids)
     if not np.all(safe == np.round(safe)):
         return np.array([repr(value) for value in safe.tolist()])
-    limit = _EXACT.get(ids.dtype.itemsize, 2**53)
-    # the limit itself may be the next number, rounded
+    # below it every whole number is exact; the limit itself may be the next number, rounded
+    limit = 2 ** min(np.finfo(ids.dtype).nmant + 1, 53)
     rows = np.flatnonzero(~(np.abs(safe) < limit))
     if rows.size:
         wanted = f"a table with ids as integers or text, for floats of {8 * ids.dtype.itemsize} bits are not exact"
@@ -314,13 +310,13 @@ class Duplicates:
         """Warn if there are any; ``what`` says what becomes of them."""
         if self.n_rows:
             examples = ", ".join(map(repr, self.first))
+            if self.n_rows > len(self.first):
+                examples += ", ..."
             rows = "1 row has"
             if self.n_rows != 1:
                 rows = f"{self.n_rows} rows have"
-            text = f"{argument}: {rows} an id that occurred before ({examples}"
-            warn(
-                f"{text}{', ...' if self.n_rows > len(self.first) else ''}); {what}", CatalogWarning
-            )
+            text = f"{argument}: {rows} an id that occurred before ({examples}); {what}"
+            warn(text, CatalogWarning)
 
 
 def warn_of_duplicates(ids, argument, **options):

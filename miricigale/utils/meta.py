@@ -11,6 +11,12 @@ import numpy as np
 from miricigale.utils.caching import cached
 from miricigale.utils.named_values import without_none
 
+#: Names of keywords of FITS, but for those that mean something there.
+_KEYWORD = re.compile(r"[A-Za-z0-9_-]{1,8}")
+_RESERVED = {"META", "SIMPLE", "EXTEND", "BITPIX", "NAXIS", "TFIELDS", "EXTNAME", "COMMENT"}
+#: Text short enough to stand on one card with its keyword
+_TEXT = re.compile(r"[ -~]{0,40}")
+
 
 @cached
 def package_version():
@@ -61,11 +67,10 @@ def undated(meta):
     """
     out = {}
     for key, value in meta.items():
+        if isinstance(value, dict):
+            value = undated(value)
         if key not in ("created", "keywords"):
-            if isinstance(value, dict):
-                out[key] = undated(value)
-            else:
-                out[key] = value
+            out[key] = value
     return out
 
 
@@ -92,8 +97,9 @@ def fits_meta(meta):
         finite = isinstance(value, float) and math.isfinite(value)
         is_plain = finite or isinstance(value, (bool, int))
         if is_plain or (isinstance(value, str) and _TEXT.fullmatch(value)):
-            fits_keyword = _KEYWORD.fullmatch(key) is not None and key.upper() not in _RESERVED
-            cards[key if fits_keyword else f"HIERARCH {key}"] = value
+            if _KEYWORD.fullmatch(key) is None or key.upper() in _RESERVED:
+                key = f"HIERARCH {key}"
+            cards[key] = value
     return cards | {"META": json.dumps(meta, default=plain_value)}
 
 
@@ -109,12 +115,6 @@ def plain_value(value):
     if isinstance(value, (np.generic, np.ndarray)) and not hasattr(value, "unit"):
         return value.tolist()
     return str(value)
-
-
-_KEYWORD = re.compile(r"[A-Za-z0-9_-]{1,8}")
-_RESERVED = {"META", "SIMPLE", "EXTEND", "BITPIX", "NAXIS", "TFIELDS", "EXTNAME", "COMMENT"}
-# short enough to stand on one card with its keyword
-_TEXT = re.compile(r"[ -~]{0,40}")
 
 
 def json_meta(meta):

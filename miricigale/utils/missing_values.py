@@ -54,14 +54,11 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
         return (code & (magnitudes | (values < 0))) | zero | named | beyond, none
     repeats_value = errors == values
     size = np.abs(values)
-    sigma = np.abs(errors)
     coded = is_code(errors)
     noise = (errors >= 0.2 * size) & (errors <= 100.0 * size)
-    limit = (values >= sigma) & (values <= 10.0 * sigma)
-    no_error = (coded & (((errors < 0) & ~limit) | magnitudes | repeats_value)) | np.isin(
-        errors, further
-    )
-    no_error |= np.isfinite(errors) & (sigma >= largest)
+    no_error = coded & (negative_codes(values, errors) | magnitudes | repeats_value)
+    no_error |= np.isin(errors, further)
+    no_error |= np.isfinite(errors) & (np.abs(errors) >= largest)
     zero = (values == 0) & (~(errors > 0) if magnitudes else errors == 0)
     missing = code & (((values < 0) & (coded | ~noise)) | magnitudes | repeats_value)
     return missing | zero | named | beyond, no_error
@@ -171,11 +168,14 @@ def mask_of(values):
     if kind == "O" and not hasattr(values, "unit"):
         objects = np.asarray(values, dtype=object)
         if objects.shape == shape:
-            gone = []
-            for v in objects.ravel():
-                gone.append(v is None or v is np.ma.masked or type(v).__name__ == "NAType")
+            gone = [_is_none(value) for value in objects.ravel()]
             mask = mask | np.array(gone, dtype=bool).reshape(shape)
     return mask
+
+
+def _is_none(value):
+    """Whether an object stands for no value: None, pandas' NA or a masked one."""
+    return value is None or value is np.ma.masked or type(value).__name__ == "NAType"
 
 
 def between_missing(present, missing):
@@ -204,7 +204,9 @@ def without_mask(values):
     if hasattr(values, "isna") and hasattr(values, "to_numpy"):
         missing = np.asarray(values.isna(), dtype=bool)
         unmasked = between_missing(values[~missing].to_numpy(), missing)
-        return unmasked, (missing if missing.any() else None)
+        if missing.any():
+            return unmasked, missing
+        return unmasked, None
     if isinstance(values, (list, tuple)) and any(
         value is None or value is np.ma.masked for value in values
     ):

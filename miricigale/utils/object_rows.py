@@ -131,12 +131,10 @@ class ObjectRows(Interactive):
         mapped = {}
         for name, value in self._per_object():
             if isinstance(value, dict):
-                mapped[name] = _ByName(convert_values(function, value), self._other_name)
-            else:
-                if value is None:
-                    mapped[name] = None
-                else:
-                    mapped[name] = function(value)
+                value = _ByName(convert_values(function, value), self._other_name)
+            elif value is not None:
+                value = function(value)
+            mapped[name] = value
         return mapped
 
     @property

@@ -33,9 +33,8 @@ class _Lines(contextlib.AbstractContextManager):
         self.unit = unit
         self._show = show
         if total is None and hasattr(iterable, "__len__"):
-            self.total = len(iterable)
-        else:
-            self.total = total
+            total = len(iterable)
+        self.total = total
         self.n = 0
         self._begin = time.monotonic()
         self._last = self._begin
@@ -56,10 +55,9 @@ class _Lines(contextlib.AbstractContextManager):
     def _line(self):
         self._last = time.monotonic()
         if self._show:
-            if self.total is None:
-                share = f"{self.n}"
-            else:
-                share = f"{self.n} of {self.total}"
+            share = f"{self.n}"
+            if self.total is not None:
+                share += f" of {self.total}"
             label = ""
             if self.desc:
                 label = f"{self.desc}: "

@@ -109,6 +109,6 @@ def circles(table, radius):
 
 def write_circles(table, path, *, radius, overwrite=False):
     """Write `circles` to a file, which ``overwrite`` replaces."""
-    found = circles(table, radius)
+    regions = circles(table, radius)
     with replacing(path, overwrite=overwrite) as partial:
-        found.write(partial, format="ds9", overwrite=True)
+        regions.write(partial, format="ds9", overwrite=True)

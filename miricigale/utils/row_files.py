@@ -164,10 +164,9 @@ class _FitsRows(RowFile):
 
     def _choose(self, hdus):
         tables = [i for i, item in enumerate(hdus) if isinstance(item, fits.BinTableHDU)]
-        if isinstance(self._hdu, str):
-            wanted = self._hdu.upper()
-        else:
-            wanted = self._hdu
+        wanted = self._hdu
+        if isinstance(wanted, str):
+            wanted = wanted.upper()
         chosen = [i for i in tables if wanted in (None, i, hdus[i].name)]
         if wanted is None and len(chosen) > 1:
             chosen = [i for i in chosen if hdus[i].name != LDAC_HEADER]
@@ -323,12 +322,10 @@ def _fits_rows(table):
         if key == "citations":
             key = "cite"
             value = "; ".join(value)
-        # headers hold no dicts
-        is_plain = isinstance(value, (str, int, float, bool))
-        if is_plain:
-            table.meta[key] = value
-        else:
-            table.meta[key] = json.dumps(value, default=plain_value)
+        if not isinstance(value, (str, int, float, bool)):
+            # headers hold no dicts
+            value = json.dumps(value, default=plain_value)
+        table.meta[key] = value
     file = io.BytesIO()
     table = fits_ready(table)
     with warnings.catch_warnings():

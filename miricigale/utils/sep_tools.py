@@ -41,7 +41,7 @@ def native(array):
     return np.ascontiguousarray(array, dtype=dtype)
 
 
-def _also(mask, bad):
+def _masked_too(mask, bad):
     """Return a mask, or None, with further pixels masked."""
     if mask is None:
         return bad
@@ -60,7 +60,7 @@ def _image(data, mask):
         check_that(mask.shape == data.shape, "mask", "of the image's shape", got)
     bad = ~np.isfinite(data)
     if bad.any():
-        mask = _also(mask, bad)
+        mask = _masked_too(mask, bad)
         data = np.where(bad, data.dtype.type(0), data)
     return data, mask
 
@@ -161,7 +161,7 @@ def extract(
     check_that(err.shape == data.shape, "err", f"of the image's shape {data.shape}", str(err.shape))
     bad = ~(np.isfinite(err) & (err > 0))
     if bad.any():
-        mask = _also(mask, bad)
+        mask = _masked_too(mask, bad)
         err = np.where(bad, err.dtype.type(1), err)
     # sep's buffer of detected pixels never overflows, also where all of them are above the threshold
     stack = data.size + data.shape[1] + 16
@@ -170,14 +170,11 @@ def extract(
     sep.set_sub_object_limit(min(_SUB_OBJECTS, math.isqrt((2**31 - 1) // levels)))
     form = {"err": err, "mask": mask, "minarea": check_count(min_area, "min_area")}
     form |= {"deblend_nthresh": levels, "deblend_cont": float(deblend_contrast)}
-    if filter_kernel is None:
-        form["filter_kernel"] = None
-    else:
+    form |= {"filter_type": "conv", "filter_kernel": filter_kernel, "segmentation_map": True}
+    if filter_kernel is not None:
         form["filter_kernel"] = native(filter_kernel)
     try:
-        return sep.extract(
-            data, float(threshold), filter_type="conv", segmentation_map=True, **form
-        )
+        return sep.extract(data, float(threshold), **form)
     except Exception as err:
         # sep raises this class itself, and names its limit
         if type(err) is not Exception or "limit" not in str(err):

@@ -4,7 +4,8 @@ import contextlib
 import json
 
 import numpy as np
-from astropy.io.fits import VerifyError
+from astropy.io import fits
+from astropy.table import Table
 
 from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.files import open_fits, replacing, write_fits
@@ -42,9 +43,6 @@ def write_parts(path, layout, *, shown=None, text=None, arrays=None, tables=None
     OSError
         See `replacing`.
     """
-    from astropy.io import fits
-    from astropy.table import Table
-
     hdus = [fits.PrimaryHDU(header=fits.Header({"FORMAT": layout}))]
     if shown is not None:
         shown = shown.copy(copy_data=False)
@@ -63,10 +61,9 @@ def write_parts(path, layout, *, shown=None, text=None, arrays=None, tables=None
                 hdu.header["BUNIT"] = unit.to_string("fits")
             hdus.append(hdu)
     for name, table in (tables or {}).items():
-        if isinstance(table, Table):
-            table = type(table)(table, copy=False)
-        else:
+        if not isinstance(table, Table):
             table = Table(table)
+        table = table.copy(copy_data=False)
         table.meta = {}
         hdus.append(fits.table_to_hdu(table))
         hdus[-1].name = name
@@ -104,7 +101,7 @@ def open_parts(path, layouts, *, wanted, memmap=False):
         layout = hdus[0].header.get("FORMAT")
         if layout not in layouts:
             raise data_error(path, _foreign(str(layout), layouts[0], wanted))
-        with file_errors(path, f"is not a complete file of {wanted}", VerifyError):
+        with file_errors(path, f"is not a complete file of {wanted}", fits.VerifyError):
             yield Parts(hdus)
 
 
@@ -159,9 +156,6 @@ class Parts:
 
     def table(self, name, cls=None, *, rows=None):
         """Table by name (a `~astropy.table.Table`, or another class), or these rows; its meta empty."""
-        from astropy.io import fits
-        from astropy.table import Table
-
         hdu = self._hdus[name]
         if rows is not None:
             hdu = fits.BinTableHDU(hdu.data[rows], header=hdu.header)
@@ -174,11 +168,7 @@ class Parts:
         data = self._hdus[name].data
         if rows is not None:
             data = data[rows]
-        arrays = {}
-        for column in data.names:
-            array = np.asarray(data[column])
-            arrays[column] = array.astype(array.dtype.newbyteorder("="))
-        return arrays
+        return {column: native(data[column]).copy() for column in data.names}
 
 
 def native(array):

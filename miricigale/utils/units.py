@@ -200,13 +200,10 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         # magnitudes and other logarithms
         raise units_error(name, f"convertible to {unit}", value.unit) from None
     except (TypeError, ValueError):
-        wanted = "numbers"
-        if unit != u.dimensionless_unscaled:
-            wanted = f"convertible to {unit}"
+        wanted = _convertible(unit, "numbers")
+        got = type(value).__name__
         if isinstance(value, (str, list)):
             got = repr(value)
-        else:
-            got = type(value).__name__
         raise argument_error(name, wanted, got) from None
     if quantity.dtype.kind == "c":
         raise argument_error(name, "real numbers", "complex numbers")
@@ -216,9 +213,7 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     try:
         array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)
     except u.UnitConversionError:
-        wanted = "convertible to a number without a unit"
-        if unit != u.dimensionless_unscaled:
-            wanted = f"convertible to {unit}"
+        wanted = _convertible(unit, "convertible to a number without a unit")
         raise units_error(name, wanted, getattr(value, "unit", None)) from None
     if mask is not None:
         array = np.where(mask, np.nan, array)
@@ -226,11 +221,16 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         raise argument_error(name, f"an array of {ndim} dimension(s)", f"shape {array.shape}")
     if finite and not np.all(np.isfinite(array)):
         n_bad = int(np.count_nonzero(~np.isfinite(array)))
-        masked = "masked, "
-        if mask is None:
-            masked = ""
+        masked = "masked, " * (mask is not None)
         raise argument_error(name, "finite values", f"{n_bad} that are {masked}NaN or infinite")
     return array
+
+
+def _convertible(unit, number):
+    """Words for a value in a unit, or for a ``number`` without one."""
+    if unit == u.dimensionless_unscaled:
+        return number
+    return f"convertible to {unit}"
 
 
 class Frozen:
