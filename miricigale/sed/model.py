@@ -9,7 +9,7 @@ from astropy.table import QTable
 
 from miricigale.filters import FilterSet
 from miricigale.refdata import citations
-from miricigale.sed import gridding, presets, tables
+from miricigale.sed import gridding, parameter_names, presets, tables
 from miricigale.sed.chain import Chain
 from miricigale.sed.component import Component, in_order, named_component, read_config
 from miricigale.sed.cosmology import COSMOLOGY
@@ -470,9 +470,9 @@ class SEDModel(Interactive):
         ValueError
             If a value is outside its bounds, or the galaxy older than the universe.
         """
-        parameters = tables.by_our_names(parameters, self._parameters, short=True)
+        parameters = parameter_names.by_our_names(parameters, self._parameters, short=True)
         parameters = tables.with_mass_formed(self, parameters)
-        tables.check_parameters(parameters, self)
+        parameter_names.check_parameters(parameters, self)
         for name, value in parameters.items():
             wanted = "one number (fluxes() takes several models)"
             check_that(np.ndim(value) == 0, name, wanted, f"shape {np.shape(value)}")
@@ -588,11 +588,11 @@ class SEDModel(Interactive):
         >>> model.fluxes(rows, ["miri.f770w"])["miri.f770w"].round(2)
         <Quantity [6.57, 2.42] uJy>
         """
-        table, filters = tables.named_first(table, filters, parameters, "table")
+        table, filters = parameter_names.named_first(table, filters, parameters, "table")
         if parameters:
-            parameters = tables.by_our_names(parameters, self._parameters, short=True)
-            tables.check_parameters(parameters, self)
-            table = tables.parameter_table(parameters)
+            parameters = parameter_names.by_our_names(parameters, self._parameters, short=True)
+            parameter_names.check_parameters(parameters, self)
+            table = parameter_names.parameter_table(parameters)
         for name, value in (("table", table), ("filters", filters)):
             check_that(value is not None, name, "given, or parameters by name", "None")
         return tables.flux_table(self, table, self._bands(filters))
@@ -640,7 +640,7 @@ class SEDModel(Interactive):
         >>> model.grid(axes, ["miri.f770w"], cache=False)
         <ModelGrid 2 redshifts x 3 galaxies x 0 AGN x 1 fractions, 1 bands, 6 models>
         """
-        axes, filters = tables.named_first(axes, filters, values, "axes")
+        axes, filters = parameter_names.named_first(axes, filters, values, "axes")
         if isinstance(filters, Mapping):
             # bands first, as fitters have them
             axes, filters = filters, axes

@@ -50,7 +50,7 @@ ARGUMENTS = {
         np.array([1.0, 1.5]).tobytes(),
     ),
     "sed.foreground._table": ("G23", 3.1),
-    "sed.tables._cigale_parameters": (("tau", "age"), True),
+    "sed.parameter_names._cigale_parameters": (("tau", "age"), True),
     "fitting.grid.points.quasi_random": (3, 6, 1),
     "fitting.grid.labels.places_in_cells": (3, 64),
     "fitting.survey.defaults._survey_calibration": (("miri.f770w",),),
