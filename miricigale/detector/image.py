@@ -8,7 +8,7 @@ from astropy.wcs.utils import proj_plane_pixel_area
 
 from miricigale.instrument import Exposure, ImageFacts
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 # pixels by which the image may lie off the exposure
@@ -33,7 +33,7 @@ def checked_light(image, exposure):
     """
     if exposure is None:
         exposure = getattr(image, "exposure", None)
-    check_that(isinstance(exposure, Exposure), "exposure", "an Exposure", type(exposure).__name__)
+    check_type(exposure, "exposure", Exposure, "an Exposure")
     exposure.check_sky()
     if hasattr(image, "render"):
         image = image.render()

@@ -8,7 +8,7 @@ import numpy as np
 from miricigale.detector.ramp import Ramp
 from miricigale.instrument import DQ, aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.units import TIME, Frozen, frozen_array, scalar, to_array
 from miricigale.utils.values import value_class
 
@@ -105,7 +105,7 @@ class Latent(Frozen):
         latent : `Latent`
             A saturated pixel counts as full at the end: its latent is a lower limit.
         """
-        check_that(isinstance(ramp, Ramp), "ramp", "a Ramp", type(ramp).__name__)
+        check_type(ramp, "ramp", Ramp, "a Ramp")
         check_that(0 <= threshold <= 1, "threshold", "a fraction of the full well", threshold)
         properties = ramp.properties or miri_detector()
         level = properties.linearize(np.asarray(ramp.data[-1, -1], float) - properties.bias)

@@ -5,9 +5,8 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.ids import id_column, ids_and_missing
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.positions import at_epoch
 from miricigale.utils.tables import (
     Flags,
@@ -191,8 +190,7 @@ def _positions(catalog, argument):
     if not isinstance(catalog, SkyCoord):
         require_columns(catalog, ["sky"], argument)
         sky = catalog["sky"]
-        if not isinstance(sky, SkyCoord):
-            raise argument_error(argument, "a table whose 'sky' is a SkyCoord", type(sky).__name__)
+        check_type(sky, argument, SkyCoord, "a table whose 'sky' is a SkyCoord")
     return sky.reshape(-1)
 
 

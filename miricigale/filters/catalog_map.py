@@ -33,7 +33,7 @@ from miricigale.utils.missing_values import (
     without_codes,
 )
 from miricigale.utils.named_values import convert_values, field_names, field_values
-from miricigale.utils.options import check_choice, check_data, check_names, check_that
+from miricigale.utils.options import check_choice, check_data, check_names, check_that, check_type
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, flux_unit
 from miricigale.utils.values import value_class
@@ -108,7 +108,7 @@ class CatalogMap:
         for argument in ("columns", "units", "error_factors"):
             names = getattr(self, argument) or {}
             wanted = "a dict by our names of columns"
-            check_that(isinstance(names, Mapping), argument, wanted, type(names).__name__)
+            check_type(names, argument, Mapping, wanted)
             for name in names:
                 if "." in str(name) and not is_band(name):
                     band = str(name).removesuffix(error_column(""))

@@ -4,7 +4,7 @@ from miricigale.fitting.data.likelihood import filter_names, is_filter
 from miricigale.fitting.data.settings import GridSettings, SamplerSettings
 from miricigale.fitting.survey.band_errors import long_instruments
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 
 
 def chosen_settings(engine, settings):
@@ -28,7 +28,7 @@ def chosen_settings(engine, settings):
         kind = GridSettings
     settings = settings or kind()
     wanted = f"{kind.__name__} with engine={engine!r}"
-    check_that(isinstance(settings, kind), "settings", wanted, type(settings).__name__)
+    check_type(settings, "settings", kind, wanted)
     return settings
 
 

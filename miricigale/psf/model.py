@@ -15,7 +15,7 @@ from miricigale.utils.file_formats import read_write
 from miricigale.utils.files import write_fits
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import attributes
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.units import ANGLE, check_count, positive, scalar, to_array
 
 #: Where a PSF's axes may stand: on the detector (angle on the sky not yet known) or the sky.
@@ -363,7 +363,7 @@ def instrument_psf(psf, argument="psf"):
         "a PSF on pixels of known size, such as one of miricigale.psf.from_photutils and make_psf, or "
         "(psf, 0.11 * u.arcsec)"
     )
-    check_that(isinstance(psf, InstrumentPSF), argument, wanted, type(psf).__name__)
+    check_type(psf, argument, InstrumentPSF, wanted)
     return psf
 
 

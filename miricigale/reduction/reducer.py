@@ -44,6 +44,7 @@ from miricigale.utils.options import (
     check_least,
     check_positive,
     check_that,
+    check_type,
 )
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.parallel import thread_count
@@ -229,7 +230,7 @@ class Reducer(Interactive):
             the exposure. `write_image` makes a ``_rateints`` of the list.
         """
         ramp = as_exposure(ramp)
-        check_that(isinstance(ramp, Ramp), "ramp", "a Ramp", type(ramp).__name__)
+        check_type(ramp, "ramp", Ramp, "a Ramp")
         maps = maps_of(self, ramp)
         rates = []
         for number in progress(range(ramp.shape[0]), show=progress_bar, desc="integrations"):
@@ -394,7 +395,7 @@ class Reducer(Interactive):
         if isinstance(exposure, (Ramp, Charge)):
             exposure = self.fit_ramp(exposure)
         wanted = "a Ramp, a Charge, CCDData or a path"
-        check_that(isinstance(exposure, CCDData), "exposure", wanted, type(exposure).__name__)
+        check_type(exposure, "exposure", CCDData, wanted)
         rate = None
         if exposure.unit.is_equivalent(RATE):
             rate = exposure

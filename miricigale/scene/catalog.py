@@ -12,7 +12,7 @@ from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.ids import id_column, likely_ids
 from miricigale.utils.missing_values import own_mask, plain_floats, without_codes
 from miricigale.utils.named_values import without, without_none
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import (
@@ -163,7 +163,7 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
       1        3.0   point    16
       2        5.0   point    16
     """
-    check_that(isinstance(table, Table), argument, "a table", type(table).__name__)
+    check_type(table, argument, Table, "a table")
     catalog = quantity_table(table, copy=True)
     check_that(len(catalog), argument, "a table with rows", "none")
     ids = id_column(catalog.colnames, argument)

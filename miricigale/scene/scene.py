@@ -25,7 +25,7 @@ from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import plain_floats
-from miricigale.utils.options import check_kind, check_that
+from miricigale.utils.options import check_kind, check_that, check_type
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import middle_pixel
@@ -230,8 +230,7 @@ class Scene(WithTable):
         """Cutouts by row of the catalog."""
         cutouts = dict(cutouts or {})
         for key, value in cutouts.items():
-            if not isinstance(value, Cutout):
-                raise argument_error("cutouts", f"a Cutout for {key!r}", type(value).__name__)
+            check_type(value, "cutouts", Cutout, f"a Cutout for {key!r}")
         rows = np.flatnonzero(self._catalog["profile"] == "cutout")
         ids = {self._catalog["id"][row].item(): int(row) for row in rows}
         if lacking := sorted(set(ids) - set(cutouts), key=str):

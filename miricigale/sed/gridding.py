@@ -16,7 +16,7 @@ from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ModelWarning, argument_error, unknown_name, warn
 from miricigale.utils.missing_values import own_mask
 from miricigale.utils.named_values import subset, without
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import WAVE, is_ascending
 
@@ -28,8 +28,7 @@ _COLD = 30.0  # um at rest, beyond which dust heated by the mean field shines
 
 def check_axes(model, axes):
     """Check the axes: dict of name to values in the declared units."""
-    if not isinstance(axes, Mapping):
-        raise argument_error("axes", "a dict of parameter name to values", type(axes).__name__)
+    check_type(axes, "axes", Mapping, "a dict of parameter name to values")
     out = {}
     skipped = {"mass", *_names(model, ("xray", "igm", "foreground"))}
     for name, values in axes.items():

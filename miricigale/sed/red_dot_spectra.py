@@ -11,7 +11,7 @@ from miricigale.sed.presets import red_dot_axes
 from miricigale.sed.spectrum import SED
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
-from miricigale.utils.options import check_names, check_that
+from miricigale.utils.options import check_names, check_that, check_type
 from miricigale.utils.units import FNU, WAVE, to_array
 
 #: Planck's h c / k in um K.
@@ -245,7 +245,7 @@ def _black_body(values):
 
 def _photosphere(atmosphere):
     """F_nu of the envelope as a spectrum, 1 at 0.51 um: means around the points of `_WAVE_UM`."""
-    check_that(isinstance(atmosphere, SED), "atmosphere", "an SED", type(atmosphere).__name__)
+    check_type(atmosphere, "atmosphere", SED, "an SED")
     wave = atmosphere.rest_wavelength.to_value(WAVE)
     fnu = atmosphere.fnu.to_value(FNU)
     # 1 % in wavelength, over lines

@@ -23,7 +23,7 @@ def check_that(good, name, wanted, got):
 
     Examples
     --------
-    >>> from miricigale.utils.options import check_that
+    >>> from miricigale.utils.options import check_that, check_type
     >>> check_that(0 <= 2 <= 1, "share", "from 0 to 1", 2)
     Traceback (most recent call last):
     ...
@@ -77,6 +77,11 @@ def check_kind(value, name, kind):
     """Refuse what is neither None nor of a class (a `ValueError`)."""
     if value is not None and not isinstance(value, kind):
         raise argument_error(name, f"a {kind.__name__}", repr(value))
+
+
+def check_type(value, name, kinds, wanted):
+    """Refuse what is of none of some classes (a `ValueError` that says of which it is)."""
+    check_that(isinstance(value, kinds), name, wanted, type(value).__name__)
 
 
 def check_least(value, name, minimum, *, whole=False):

@@ -11,7 +11,7 @@ from astropy.table import Table
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.frames import as_column, frame_columns, is_frame
 from miricigale.utils.ids import id_column, ids_and_missing
-from miricigale.utils.options import check_least, check_that
+from miricigale.utils.options import check_least, check_that, check_type
 from miricigale.utils.units import ANGLE, flux_unit, to_array
 
 
@@ -238,7 +238,7 @@ def require_columns(table, names, argument, *, units=None):
     `~astropy.units.UnitsError`
         If a column has no unit or a wrong one (magnitudes are no fluxes).
     """
-    check_that(isinstance(table, Table), argument, "a table", type(table).__name__)
+    check_type(table, argument, Table, "a table")
     missing = [name for name in names if name not in table.colnames]
     wanted = f"a table with the columns {missing}"
     check_that(not missing, argument, wanted, f"columns {table.colnames}")

@@ -15,7 +15,7 @@ from miricigale.fitting.results.pulls import without_warnings
 from miricigale.fitting.survey.survey import bands_in_catalog
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_names, check_that
+from miricigale.utils.options import check_names, check_that, check_type
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import (
@@ -319,7 +319,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     array([[-1. ],
            [ 1.5]])
     """
-    check_that(isinstance(fitter, BayesFitter), "fitter", "a BayesFitter", type(fitter).__name__)
+    check_type(fitter, "fitter", BayesFitter, "a BayesFitter")
     if isinstance(bands, str) or not len(bands):
         raise argument_error("bands", "a list of one or more names", repr(bands))
     fitter = fitter.for_photometry(photometry)

@@ -36,7 +36,7 @@ from miricigale.utils.folder import FileFolder
 from miricigale.utils.ids import Duplicates
 from miricigale.utils.meta import package_version, plain_value, undated
 from miricigale.utils.named_values import convert_values
-from miricigale.utils.options import check_data, check_that
+from miricigale.utils.options import check_data, check_that, check_type
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import ascii_ids, read_ids, require_columns
@@ -137,9 +137,8 @@ def fit_file(
     >>> results = fit_file(fitter, "catalog.fits", "fits", redshift="z_spec")  # doctest: +SKIP
     >>> results.write_table("table.fits")  # doctest: +SKIP
     """
-    check_that(isinstance(fitter, BayesFitter), "fitter", "a BayesFitter", type(fitter).__name__)
-    if not isinstance(path_in, (str, os.PathLike)):
-        raise argument_error("path_in", "the path of a catalog", type(path_in).__name__)
+    check_type(fitter, "fitter", BayesFitter, "a BayesFitter")
+    check_type(path_in, "path_in", (str, os.PathLike), "the path of a catalog")
     unit = None
     if flux_unit is not None:
         unit = unit_of_fluxes(flux_unit, "flux_unit")

@@ -20,7 +20,7 @@ from miricigale.utils.files import open_fits, replacing
 from miricigale.utils.folder import RecordFolder
 from miricigale.utils.named_values import attributes, subset
 from miricigale.utils.object_rows import ByID
-from miricigale.utils.options import check_data
+from miricigale.utils.options import check_data, check_type
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.tables import ascii_ids
@@ -120,8 +120,7 @@ def write_samples(samples, path, *, overwrite=False):
 
 def read_samples(path, grid, *, model=None):
     """Read samples, with the grid that was fitted (another is refused) and, if it is known, its model."""
-    if not isinstance(grid, ModelGrid):
-        raise argument_error("grid", "the ModelGrid that was fitted", type(grid).__name__)
+    check_type(grid, "grid", ModelGrid, "the ModelGrid that was fitted")
     with open_parts(path, (_SAMPLES,), wanted="samples") as parts:
         text = parts.text
         table = parts.table("SAMPLES")

@@ -23,7 +23,7 @@ from miricigale.fitting.samplers.space import Space, redshift_axis
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import attributes, convert_values
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import MASS
@@ -62,7 +62,7 @@ class SamplerFit:
     @classmethod
     def of_model(cls, model, filters, priors, settings, *, sampler, scale_error):
         """Set up the sampler with the priors of a model."""
-        check_that(isinstance(model, FluxModel), "model", "an SEDModel", type(model).__name__)
+        check_type(model, "model", FluxModel, "an SEDModel")
         check_that(isinstance(priors, dict), "priors", "a dict of parameters", repr(priors))
         predict = settings.predict
         names = tuple(getattr(filters, "names", filters)) + tuple(

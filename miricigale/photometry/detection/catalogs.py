@@ -8,7 +8,7 @@ from astropy.table import Table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing_values import floats, mask_of
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.positions import at_epoch
 from miricigale.utils.tables import require_columns, unique_ids
 from miricigale.utils.units import to_array
@@ -28,12 +28,10 @@ def catalog_sources(catalog, epoch=None):
     TypeError, ValueError
         If it is no table, has no ``sky``, an id twice, or a number of components other than 1 and 2.
     """
-    if not isinstance(catalog, Table):
-        raise argument_error("catalog", "a table with the column 'sky'", type(catalog).__name__)
+    check_type(catalog, "catalog", Table, "a table with the column 'sky'")
     require_columns(catalog, ["sky"], "catalog")
     sky = catalog["sky"]
-    if not isinstance(sky, SkyCoord):
-        raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
+    check_type(sky, "catalog", SkyCoord, "a table whose 'sky' is a SkyCoord")
     name = id_column(catalog.colnames, "catalog", labels=False)
     if name is None:
         ids = counted_ids(catalog, "catalog")

@@ -9,7 +9,7 @@ from miricigale.instrument.image import Image
 from miricigale.instrument.image_planes import standard_deviation
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import attributes, without_none
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 
@@ -115,7 +115,7 @@ def own_grid(images, pixel_scale):
 
 def check_images(images, wcs):
     """Refuse images that cannot be put together, and what is no grid for them."""
-    check_that(isinstance(wcs, WCS), "wcs", "an astropy WCS", type(wcs).__name__)
+    check_type(wcs, "wcs", WCS, "an astropy WCS")
     check_that(wcs.pixel_shape is not None, "wcs", "a WCS with a pixel_shape", "one without")
     check_alike(images)
 

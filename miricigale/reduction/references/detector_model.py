@@ -23,7 +23,7 @@ from miricigale.reduction.references.reference_maps import (
 )
 from miricigale.reduction.references.references import BRIGHTNESS, SLOPES, needed, own_maps
 from miricigale.utils.exceptions import ReferenceWarning, argument_error, warn
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 
 #: Signal over that in the full frame: Gordon et al. 2025, AJ 169, 6, as in the script that makes their photom
 #: references (STScI-MIRI/ImagingFluxCal, create_photom_reffile.py).
@@ -145,7 +145,7 @@ def maps_of(reducer, ramp):
     ValueError
         If it is no ramp, there are no references for it, or another detector made it.
     """
-    check_that(isinstance(ramp, (Ramp, Charge)), "ramp", "a Ramp or a Charge", type(ramp).__name__)
+    check_type(ramp, "ramp", (Ramp, Charge), "a Ramp or a Charge")
     history = ramp.history
     if is_own(reducer, history):
         has_references = reducer.references is not None or reducer.properties is not None
