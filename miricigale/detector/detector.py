@@ -220,8 +220,8 @@ class Detector(Interactive):
         for kind in kinds:
             if isinstance(kind, str):
                 kind = _effect_class(kind)
-            if not (isinstance(kind, type) and issubclass(kind, Effect)):
-                raise argument_error("kinds", "classes of effects", repr(kind))
+            good = isinstance(kind, type) and issubclass(kind, Effect)
+            check_that(good, "kinds", "classes of effects", repr(kind))
             classes.append(kind)
         chain = [effect for effect in self.effects if not isinstance(effect, tuple(classes))]
         return type(self)(chain, properties=self.properties)

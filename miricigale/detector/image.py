@@ -46,13 +46,11 @@ def checked_light(image, exposure):
     masked = np.count_nonzero(image.mask)
     wanted = "without masked pixels, as each of them collects light"
     check_that(not masked, "image", wanted, f"{masked} of them")
-    if image.data.shape != exposure.shape:
-        raise argument_error("image", f"of the exposure's shape {exposure.shape}", image.data.shape)
+    wanted = f"of the exposure's shape {exposure.shape}"
+    check_that(image.data.shape == exposure.shape, "image", wanted, image.data.shape)
     facts = ImageFacts.of(image)
-    if facts.band not in (None, exposure.filter[5:]):
-        raise argument_error(
-            "image", f"one of the filter {exposure.filter}", f"one of {facts.filter}"
-        )
+    wanted = f"one of the filter {exposure.filter}"
+    check_that(facts.band in (None, exposure.filter[5:]), "image", wanted, f"one of {facts.filter}")
     _check_place(image, exposure)
     light = to_array(image.data * image.unit, SURFACE_BRIGHTNESS, "image", ndim=2, finite=True)
     lowest = light.min()

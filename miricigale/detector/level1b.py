@@ -25,6 +25,7 @@ from miricigale.instrument.product_files import jwst_product
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing
 from miricigale.utils.meta import plain_value
+from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 
 _START = "2022-06-21T00:00:00"
@@ -90,8 +91,8 @@ def keywords(exposure):
 
 def write(path, ramp, *, start=None, filename=None, overwrite=False):
     """Write a level-1b file: see `~miricigale.detector.Ramp.write`."""
-    if ramp.data.dtype != np.uint16:
-        raise argument_error("data", "counts (uint16) to be written", ramp.data.dtype)
+    wanted = "counts (uint16) to be written"
+    check_that(ramp.data.dtype == np.uint16, "data", wanted, ramp.data.dtype)
     if jwst_product(path) not in (None, "uncal"):
         wanted = "a name that is not of another product of JWST: ramps are x_uncal.fits"
         raise argument_error("path", wanted, repr(os.fspath(path)))

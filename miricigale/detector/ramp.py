@@ -109,8 +109,8 @@ class Ramp(Interactive, NDData):
         data = np.asarray(getattr(data, "unmasked", data))
         shape = (exposure.n_integrations, exposure.n_groups) + exposure.shape
         check_that(data.shape == shape, "data", f"of the exposure's shape {shape}", data.shape)
-        if data.dtype not in (np.uint16, np.float32):
-            raise argument_error("data", "of dtype uint16 or float32", data.dtype)
+        wanted = "of dtype uint16 or float32"
+        check_that(data.dtype in (np.uint16, np.float32), "data", wanted, data.dtype)
         if pixel_dq is None:
             pixel_dq = np.zeros(shape[2:], np.uint32)
         pixel_dq = _flags(pixel_dq, "pixel_dq", shape[2:], np.uint32)
@@ -222,9 +222,8 @@ class Ramp(Interactive, NDData):
         """
         if isinstance(number, tuple):
             return self.data[number].astype(float) * u.DN
-        if not isinstance(number, numbers.Integral):
-            wanted = "that of an integration; ramp[0, -1] is a group, ramp[0, :, y, x] a pixel"
-            raise argument_error("number", wanted, repr(number))
+        wanted = "that of an integration; ramp[0, -1] is a group, ramp[0, :, y, x] a pixel"
+        check_that(isinstance(number, numbers.Integral), "number", wanted, repr(number))
         if not -len(self.data) <= number < len(self.data):
             msg = f"integration {number} of {len(self.data)}"
             raise IndexError(msg)

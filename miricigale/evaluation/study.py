@@ -9,6 +9,7 @@ from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, ab_magnitude
 from miricigale.utils.values import value_class
@@ -75,8 +76,8 @@ class TruthResults:
         require_columns(self.truth, ["id", "redshift", "frac_agn"], "truth")
         require_columns(self.matched, ["id", "selection", "n_detected"], "matched")
         ids = np.asarray(self.truth["id"])
-        if not np.array_equal(ids, np.asarray(self.matched["id"])):
-            raise argument_error("matched", "of the sources of 'truth', row by row", "others")
+        good = np.array_equal(ids, np.asarray(self.matched["id"]))
+        check_that(good, "matched", "of the sources of 'truth', row by row", "others")
         if np.shape(self.field) != ids.shape:
             raise argument_error("field", f"of shape {ids.shape}", np.shape(self.field))
         for name, table in self.fits.items():

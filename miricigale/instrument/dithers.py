@@ -13,7 +13,7 @@ from miricigale.instrument.published_tables import table
 from miricigale.instrument.siaf import aperture, imager_columns, vector_angles
 from miricigale.instrument.wcs import tangent_offset
 from miricigale.utils.caching import cached
-from miricigale.utils.exceptions import DataError, argument_error, data_error
+from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import reading, unpacked_size
 from miricigale.utils.options import check_data, check_names, check_that
 from miricigale.utils.table_files import read_table
@@ -303,8 +303,7 @@ def read_centers(path, roll):
                 continue
             place = [float(words[k]) for k in (7, 8, 15, 16)]
             centers.setdefault((observation, *words[:2]), []).append(place)
-    if not centers:
-        raise data_error(path, f"has no exposures of the full imager; it has {sorted(detectors)}")
+    check_data(centers, path, f"has no exposures of the full imager; it has {sorted(detectors)}")
     pa = roll + aperture().v3_ideal_y_angle * u.deg
     fields = []
     for places in centers.values():

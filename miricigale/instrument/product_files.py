@@ -24,6 +24,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing, write_fits
 from miricigale.utils.meta import json_meta
 from miricigale.utils.named_values import without_none
+from miricigale.utils.options import check_that
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, with_adu
 
 #: How files of products of JWST are called.
@@ -231,8 +232,8 @@ def _flags(image, further):
     """Flags of an image and further ones, with masked pixels as not to be used."""
     shape = image.data.shape
     further = np.asarray(further, np.int64)
-    if further.shape not in ((), shape):
-        raise argument_error("planes", f"of {shape} pixels", f"DQ of {further.shape}")
+    wanted = f"of {shape} pixels"
+    check_that(further.shape in ((), shape), "planes", wanted, f"DQ of {further.shape}")
     flags = np.zeros(shape, np.int64) | further
     if image.flags is not None:
         flags = flags | np.asarray(image.flags, np.int64)

@@ -14,7 +14,6 @@ from miricigale.instrument.siaf import (
 )
 from miricigale.instrument.sky_axes import lon_lat, pixel_to_radec
 from miricigale.utils.caching import cached
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import positive, scalar, to_array
@@ -375,8 +374,8 @@ def mosaic_wcs(exposures, pixel_scale):
     ra = []
     dec = []
     for wcs in wcss:
-        if wcs.pixel_shape is None:
-            raise argument_error("exposures", "WCSs with a pixel_shape", "one without")
+        wanted = "WCSs with a pixel_shape"
+        check_that(wcs.pixel_shape is not None, "exposures", wanted, "one without")
         nx, ny = wcs.pixel_shape
         # distorted edges bulge between the corners
         tx = np.linspace(-0.5, nx - 0.5, 17)

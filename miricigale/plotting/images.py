@@ -3,7 +3,6 @@
 import numpy as np
 
 from miricigale.plotting.axes import TRUE, add_borders, resolve_axes
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_that
 
 #: Color of lines over an image.
@@ -443,8 +442,8 @@ def plot_segmentation(image, labels, *, ax=None, pixel_scale=1.0, center=None, *
     """
     image = np.asarray(image)
     labels = np.asarray(labels)
-    if image.shape != labels.shape:
-        raise argument_error("labels", f"of the image's shape {image.shape}", labels.shape)
+    wanted = f"of the image's shape {image.shape}"
+    check_that(image.shape == labels.shape, "labels", wanted, labels.shape)
     ax = plot_image(image, ax=ax, pixel_scale=pixel_scale, center=center, **kwargs)
     x_min, _, bottom, _ = _extent(image.shape, pixel_scale, center)
     y, x = (np.arange(n + 1) * pixel_scale for n in image.shape)

@@ -57,8 +57,8 @@ def psf_grid(psfs, positions):
         raise argument_error("positions", "each point of a rectangular grid", positions.tolist())
     psfs = alike(psfs, ("oversampling", "frame", "angle", "includes"))
     for i, psf in enumerate(psfs):
-        if not np.allclose(psf.origin, middle_pixel(psf.data.shape)):
-            raise argument_error("psfs", "centered on the middle", f"{psf.origin} (psfs[{i}])")
+        good = np.allclose(psf.origin, middle_pixel(psf.data.shape))
+        check_that(good, "psfs", "centered on the middle", f"{psf.origin} (psfs[{i}])")
     return PSFGrid(psfs, positions)
 
 

@@ -447,8 +447,8 @@ def read_psf(
     if oversampling is None:
         oversampling = _stated_oversampling(path, header)
     pixel_scale = psf_file.pixel_scale(pixel_scale, oversampling=oversampling)
-    if pixel_scale is None:
-        raise argument_error("pixel_scale", "given where the header does not state it", None)
+    wanted = "given where the header does not state it"
+    check_that(pixel_scale is not None, "pixel_scale", wanted, None)
     if frame is None:
         frame = "sky"
         if psf_file.on_detector:
@@ -468,10 +468,8 @@ def _stated_oversampling(path, header):
     """Read OVERSAMP of a header, 1 without it; a `DataError` unless it is a whole number."""
     value = header.get("OVERSAMP", 1)
     is_whole = isinstance(value, (int, float)) and value >= 1 and value == int(value)
-    if not is_whole:
-        raise data_error(
-            path, f"has an OVERSAMP of {value!r}, which is no whole number of 1 or more"
-        )
+    problem = f"has an OVERSAMP of {value!r}, which is no whole number of 1 or more"
+    check_data(is_whole, path, problem)
     return int(value)
 
 

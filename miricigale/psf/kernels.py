@@ -203,8 +203,8 @@ class MatchingKernel(Interactive):
         lo = named_psf(lo)
         if pixel_scale is None:
             pixel_scale = getattr(hi, "pixel_scale", None)
-        if pixel_scale is None:
-            raise argument_error("pixel_scale", "given where 'hi' does not state it", "None")
+        wanted = "given where 'hi' does not state it"
+        check_that(pixel_scale is not None, "pixel_scale", wanted, "None")
         scale = scalar(pixel_scale, ANGLE, "pixel_scale")
         check_choice(resampling, "resampling", ("drizzle", None))
         source, target, mended = psf_pair(

@@ -20,7 +20,6 @@ from miricigale.psf.model import make_psf
 from miricigale.psf.optics import jwst_constants
 from miricigale.psf.telescope import Telescope, checked_grid, odd_cells
 from miricigale.utils.caching import cached
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE
 
@@ -50,8 +49,8 @@ def local_pixel(x, y, *, subarray="FULL"):
     """
     part = aperture(subarray)
     ny, nx = part.shape
-    if not (-0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5):
-        raise argument_error("position", f"on the {nx} x {ny} pixels of {subarray}", (x, y))
+    good = -0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5
+    check_that(good, "position", f"on the {nx} x {ny} pixels of {subarray}", (x, y))
     half = 0.5 * np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
     v2, v3 = pixel_to_v2v3(x + half[0], y + half[1], subarray=subarray)
     a = math.radians(part.v3_ideal_y_angle)

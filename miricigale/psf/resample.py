@@ -146,8 +146,8 @@ def alike(psfs, names):
             mine = psf.facts[name]
             theirs = first[name]
             close = name in _ANGLES and np.isclose(mine.value, theirs.value, rtol=1e-6)
-            if not (close or mine == theirs):
-                raise argument_error("psfs", f"alike in {name}", f"{theirs} and {mine} (psfs[{i}])")
+            wanted = f"alike in {name}"
+            check_that(close or mine == theirs, "psfs", wanted, f"{theirs} and {mine} (psfs[{i}])")
         shapes = f"{psfs[0].data.shape} and {psf.data.shape} (psfs[{i}])"
         check_that(psf.data.shape == psfs[0].data.shape, "psfs", "alike in shape", shapes)
     return psfs

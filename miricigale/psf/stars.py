@@ -9,7 +9,6 @@ from astropy.table import Table
 from miricigale.instrument.image_planes import standard_deviation
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.star_fit import TERMS, Star, StarPSF
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, positive
 
@@ -121,8 +120,8 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
 def _places(image, stars):
     """Pixels x, y of stars on an image."""
     if not isinstance(stars, SkyCoord) and "sky" not in stars.colnames:
-        if not {"x", "y"} <= set(stars.colnames):
-            raise argument_error("stars", "tables with 'x' and 'y', or 'sky'", stars.colnames)
+        wanted = "tables with 'x' and 'y', or 'sky'"
+        check_that({"x", "y"} <= set(stars.colnames), "stars", wanted, stars.colnames)
         return np.stack([np.asarray(stars[name], float) for name in "xy"], axis=1)
     sky = stars
     if not isinstance(stars, SkyCoord):

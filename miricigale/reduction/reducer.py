@@ -270,8 +270,8 @@ class Reducer(Interactive):
         rate = as_exposure(rate)
         facts = ImageFacts.of(rate)
         for key in ("filter", "subarray"):
-            if getattr(facts, key) is None:
-                raise argument_error("rate", f"an image whose meta has {key!r}", "none")
+            wanted = f"an image whose meta has {key!r}"
+            check_that(getattr(facts, key) is not None, "rate", wanted, "none")
         if ExposureHistory.of(rate).done("photom"):
             if not (before := rate.meta.get("photmjsr")):
                 raise argument_error("rate", "slopes, or an image with its PHOTMJSR", "neither")

@@ -245,8 +245,8 @@ class Scene(WithTable):
         flux = self._catalog[self._filter].to_value(FNU)
         if agn is None:
             return flux, np.zeros(len(flux))
-        if agn not in self._catalog.colnames:
-            raise argument_error("agn", f"a column of {self._catalog.colnames}", repr(agn))
+        wanted = f"a column of {self._catalog.colnames}"
+        check_that(agn in self._catalog.colnames, "agn", wanted, repr(agn))
         column = self._catalog[agn]
         unit = getattr(column, "unit", None)
         is_share = unit is None or unit == u.one

@@ -273,8 +273,8 @@ def color_excess(sky, dust_map, *, scale=1.0):
     >>> color_excess(SkyCoord([53.1, 53.2], [-27.8, -27.9], unit="deg"), Everywhere(), scale=0.86)
     <Quantity [0.0086, 0.0086] mag>
     """
-    if not hasattr(dust_map, "query"):
-        raise argument_error("dust_map", "a map with a method query(sky)", type(dust_map).__name__)
+    wanted = "a map with a method query(sky)"
+    check_that(hasattr(dust_map, "query"), "dust_map", wanted, type(dust_map).__name__)
     ebv = floats(dust_map.query(sky)) * scale
     check_that(ebv.shape == sky.shape, "dust_map", f"numbers of shape {sky.shape}", ebv.shape)
     # maps take what stands behind the mask of a position

@@ -58,8 +58,7 @@ def check_output(path, argument, *, overwrite=False, inputs=(), kind="a file", e
         raise argument_error(argument, f"{kind} ({', '.join(endings)})", path)
     check_that(not path.is_dir(), argument, "a file", f"the folder {path}")
     read = {Path(split_extension(name)[0]).resolve() for name in inputs}
-    if path.resolve() in read:
-        raise argument_error(argument, "another file than those that are read", path)
+    check_that(path.resolve() not in read, argument, "another file than those that are read", path)
     if path.exists() and not overwrite:
         raise argument_error(
             argument, "a new file (or 'overwrite' given)", f"{path}, which is there"

@@ -8,6 +8,7 @@ from astropy.table import QTable
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import replacing
 from miricigale.utils.optional_packages import require
+from miricigale.utils.options import check_data
 from miricigale.utils.positions import sky_as_angles
 from miricigale.utils.units import ANGLE, positive
 
@@ -58,8 +59,7 @@ def region_table(source):
         centers.append(center.icrs)
         texts.append(str(region.meta.get("text", "")))
         radii.append(getattr(region, "radius", np.nan * u.arcsec).to_value(ANGLE))
-    if not centers:
-        raise data_error(label, "has no regions")
+    check_data(centers, label, "has no regions")
     ids = np.array(texts)
     if "" in texts or len(set(texts)) < len(texts):
         ids = np.arange(1, len(texts) + 1)

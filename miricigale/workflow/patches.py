@@ -28,7 +28,7 @@ from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file, replacing
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_least
+from miricigale.utils.options import check_least, check_that
 from miricigale.utils.outputs import check_output
 from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table, write_table
@@ -217,8 +217,7 @@ def table_stage(context, _):
             rows.append({"patch": name} | entry)
         if len(table):
             tables[k] = table
-    if not tables:
-        raise argument_error("highres", "an image with sources", "none in any patch")
+    check_that(tables, "highres", "an image with sources", "none in any patch")
     has_ids = inputs.segmentation is not None
     joined = join_patches(tables, grid, inputs.highres.header, _catalog(inputs), has_ids)
     settings = dataclasses.asdict(context.config.patches)

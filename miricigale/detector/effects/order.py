@@ -83,10 +83,10 @@ def place_of(effect):
 def check_order(effects):
     """Refuse effects that cannot turn light into counts, or that do not act in their order."""
     names = ", ".join(type(effect).__name__ for effect in effects)
-    if sum(isinstance(effect, Photons) for effect in effects) != 1:
-        raise argument_error("effects", "a tuple with one Photons in it", names or "none")
-    if not isinstance(effects[-1], ADConversion):
-        raise argument_error("effects", "a tuple that ends with ADConversion", names)
+    good = sum(isinstance(effect, Photons) for effect in effects) == 1
+    check_that(good, "effects", "a tuple with one Photons in it", names or "none")
+    wanted = "a tuple that ends with ADConversion"
+    check_that(isinstance(effects[-1], ADConversion), "effects", wanted, names)
     placed = [(place, effect) for effect in effects if (place := place_of(effect)) is not None]
     for (place, effect), (following, successor) in itertools.pairwise(placed):
         wanted = f"in their order, {type(successor).__name__} before {type(effect).__name__}"

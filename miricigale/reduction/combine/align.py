@@ -184,8 +184,8 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
     check_that(images, "images", "at least one image", "none")
     reach = positive(radius, ANGLE, "radius")
     groups = list(range(len(images)) if groups is None else groups)
-    if len(groups) != len(images):
-        raise argument_error("groups", f"one for each of {len(images)} images", len(groups))
+    wanted = f"one for each of {len(images)} images"
+    check_that(len(groups) == len(images), "groups", wanted, len(groups))
     reference = None
     out = [None] * len(images)
     alignments = [None] * len(images)

@@ -16,7 +16,6 @@ from miricigale.reduction.sky.background import (
 )
 from miricigale.reduction.sky.dither_background import dither_backgrounds, restored
 from miricigale.reduction.sky.sky_match import match_levels
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 
 
@@ -146,8 +145,7 @@ def _aligned(images, align):
     if align is None:
         return images
     if isinstance(align, str):
-        if align != "dithers":
-            raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))
+        check_that(align == "dithers", "align", "a SkyCoord, 'dithers' or None", repr(align))
         align = None
     aligned, _ = align_images(images, align)
     return aligned

@@ -34,6 +34,7 @@ from miricigale.reduction.images.images import flagged_image, sigma
 from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.named_values import without, without_none
+from miricigale.utils.options import check_data
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, with_adu
 from miricigale.utils.values import value_class
@@ -373,8 +374,8 @@ def _flags(hdus, shape, path):
         flags = read_dq(hdu)
     else:
         flags = np.asarray(hdu.data).astype(np.int64)
-    if flags.shape != shape:
-        raise data_error(path, f"must have {shape} pixels in DQ, as in SCI, got {flags.shape}")
+    problem = f"must have {shape} pixels in DQ, as in SCI, got {flags.shape}"
+    check_data(flags.shape == shape, path, problem)
     return with_own_bits(flags, hdus)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from miricigale.instrument import ExposureHistory, joined_header
 from miricigale.instrument.history import ORIGIN, keyword_values
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import open_fits
+from miricigale.utils.options import check_that
 
 #: Keywords that together name an exposure of JWST.
 _NAMES = (
@@ -96,10 +96,8 @@ class ExposureRecord:
             header["ORIGIN"] = ORIGIN
         stage = f"{np.ndim(data)} {getattr(exposure, 'unit', None)}"
         duplicate = self.add(name, np.asarray(data), header, stage)
-        if duplicate is not None:
-            raise argument_error(
-                "ramps", "exposures that differ", f"{name}, the same as {duplicate}"
-            )
+        wanted = "exposures that differ"
+        check_that(duplicate is None, "ramps", wanted, f"{name}, the same as {duplicate}")
 
 
 def _is_simulated(header):

@@ -304,8 +304,8 @@ def _read_only(array):
 def _map(values, name, usable, *, above=-np.inf, floor=-np.inf, infinite=False):
     """One value (1, 1), or one for each pixel, that is in range wherever it is used."""
     values = np.array(floats(values), ndmin=2, order="C")
-    if values.shape not in ((1, 1), usable.shape):
-        raise argument_error(name, f"one number or of shape {usable.shape}", values.shape)
+    wanted = f"one number or of shape {usable.shape}"
+    check_that(values.shape in ((1, 1), usable.shape), name, wanted, values.shape)
     good = (values > above) & (values >= floor) & (np.isfinite(values) | infinite)
     if values.size == 1:
         bad = ~good

@@ -6,6 +6,7 @@ from miricigale.instrument import DQ, field_mask
 from miricigale.reduction.images.images import flag_pixels, plain_flags, with_data
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
+from miricigale.utils.options import check_that
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, with_adu
 
 
@@ -62,8 +63,8 @@ def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
     if unit is None or not unit.is_equivalent(RATE):
         raise argument_error("rate", f"in {RATE}", f"unit {rate.unit}")
     inside = field_mask(subarray=subarray)
-    if rate.shape != inside.shape:
-        raise argument_error("rate", f"of shape {inside.shape} for {subarray!r}", rate.shape)
+    wanted = f"of shape {inside.shape} for {subarray!r}"
+    check_that(rate.shape == inside.shape, "rate", wanted, rate.shape)
     flat = np.broadcast_to(floats(flat).astype(np.float32), rate.shape)
     scale = np.float32(unit.to(RATE) * conversion) / flat
     out = with_data(

@@ -22,7 +22,7 @@ from miricigale.reduction.references.reference_maps import (
     read_photom,
 )
 from miricigale.reduction.references.references import BRIGHTNESS, SLOPES, needed, own_maps
-from miricigale.utils.exceptions import ReferenceWarning, argument_error, warn
+from miricigale.utils.exceptions import ReferenceWarning, warn
 from miricigale.utils.options import check_that, check_type
 
 #: Signal over that in the full frame: Gordon et al. 2025, AJ 169, 6, as in the script that makes their photom
@@ -75,8 +75,8 @@ def imager_response(photom=None, *, date=None):
     >>> miri_detector().replace(response=imager_response()).relative_response("miri.f770w", "SUB64")
     0.966
     """
-    if bool(photom) != bool(date):
-        raise argument_error("photom, date", "both given, or neither", f"{photom!r}, {date!r}")
+    wanted = "both given, or neither"
+    check_that(bool(photom) == bool(date), "photom, date", wanted, f"{photom!r}, {date!r}")
     if not photom:
         return tuple((name, *row) for name in imager_filters() for row in _PARTS.items())
     day = Time(date).mjd

@@ -9,7 +9,7 @@ from miricigale.instrument.history import TYPES
 from miricigale.reduction.references.references import ReferenceFiles
 from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.optional_packages import require
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_data, check_that
 from miricigale.utils.package_tables import declared
 
 
@@ -67,8 +67,8 @@ class ReferenceCache:
             self.context or os.environ.get("CRDS_CONTEXT") or max(contexts, default="a context")
         )
         object.__setattr__(self, "context", str(context))
-        if not (self._mappings / self.context).is_file():
-            raise data_error(self.folder, f"is no CRDS cache of JWST with {self.context}")
+        problem = f"is no CRDS cache of JWST with {self.context}"
+        check_data((self._mappings / self.context).is_file(), self.folder, problem)
 
     @property
     def _mappings(self):

@@ -269,8 +269,8 @@ def photom_row(path, filter, subarray):
                    if key.lower() not in ("filter", "subarray")}
             for name in ("TIMECOEFF", *_TIMES) if name in hdus and hdus[name].data is not None
         }  # fmt: skip
-    if not (np.isfinite(conversion) and conversion > 0):
-        raise data_error(path, f"has no conversion for {short} and {subarray}: {conversion}")
+    problem = f"has no conversion for {short} and {subarray}: {conversion}"
+    check_data(np.isfinite(conversion) and conversion > 0, path, problem)
     return conversion, times
 
 

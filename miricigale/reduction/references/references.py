@@ -18,6 +18,7 @@ from miricigale.reduction.references.measured_noise import measure_noise
 from miricigale.reduction.references.reference_maps import READERS
 from miricigale.utils.exceptions import ReferenceWarning, argument_error, data_error, warn
 from miricigale.utils.named_values import without
+from miricigale.utils.options import check_that
 
 #: What slopes need, and what surface brightness needs beside them.
 SLOPES = ("mask", "saturation", "linearity", "dark", "gain", "read_noise")
@@ -270,8 +271,8 @@ class ReferenceFiles:
             if value is None or (value == "measured" and name in _MEASURED):
                 continue
             if isinstance(value, (str, os.PathLike)):
-                if not Path(value).is_file():
-                    raise argument_error(name, "the path of a file", f"{value}: there is none")
+                wanted = "the path of a file"
+                check_that(Path(value).is_file(), name, wanted, f"{value}: there is none")
                 object.__setattr__(self, name, Path(value))
                 continue
             number = isinstance(value, numbers.Real) and not isinstance(value, bool)

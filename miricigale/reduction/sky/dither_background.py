@@ -11,7 +11,6 @@ from miricigale.reduction.mosaic.mosaic import drizzle_images, pixel_maps_of
 from miricigale.reduction.mosaic.outliers import nan_median
 from miricigale.reduction.sky.background import estimate_background, warn_of
 from miricigale.reduction.sky.sky_mesh import sky_boxes
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
@@ -95,8 +94,8 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
     if backgrounds is None:
         backgrounds = [estimate_background(im, warn=False) for im in images]
     single = list(backgrounds)
-    if len(single) != len(images):
-        raise argument_error("backgrounds", f"one for each of {len(images)} images", len(single))
+    wanted = f"one for each of {len(images)} images"
+    check_that(len(single) == len(images), "backgrounds", wanted, len(single))
     masks = [plain_mask(im) for im in images]
     if wcs is None:
         wcs = own_grid(images, 0.11 * ANGLE)

@@ -112,8 +112,8 @@ def _check_product(path, axes):
         holes = itertools.islice((key for key in product if key not in present), 3)
         problem = f"has {len(present):,} spectra, but the values found make {wanted:,}; missing, among others:"
         raise data_error(path, f"{problem} {', '.join(map(_file_name, holes))}")
-    if values["inclination"][0] != 0.0:
-        raise data_error(path, "has no spectrum at inclination 0: the disk seen from above")
+    problem = "has no spectrum at inclination 0: the disk seen from above"
+    check_data(values["inclination"][0] == 0.0, path, problem)
 
 
 def _file_name(key):
@@ -182,8 +182,8 @@ def _parse(data, source):
 
 
 def _check_numbers(table, source):
-    if not (np.isfinite(table).all() and table.min() >= 0.0):
-        raise data_error(source, "has negative, infinite or missing numbers")
+    good = np.isfinite(table).all() and table.min() >= 0.0
+    check_data(good, source, "has negative, infinite or missing numbers")
 
 
 def _check_wave(wave, source):
@@ -235,8 +235,8 @@ def _read_fits(path):
         raise data_error(path, f"must have the same {_ROWS} wavelengths in all rows")
     _check_wave(wave, path)
     nu = table["NU_REST"][:, order]
-    if not np.allclose(nu * wave, 2.99792458e14, rtol=1e-4):
-        raise data_error(path, "has frequencies and wavelengths that do not belong together")
+    good = np.allclose(nu * wave, 2.99792458e14, rtol=1e-4)
+    check_data(good, path, "has frequencies and wavelengths that do not belong together")
     power = {name: table[f"LNU_{name}"][:, order] * nu for name in _FITS_LIGHT}
     for name, array in power.items():
         _check_numbers(array, f"{path}, column LNU_{name},")

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.utils.caching import cached_property
-from miricigale.utils.exceptions import argument_error, data_error
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.named_values import convert_values, subset
 from miricigale.utils.options import check_data, check_that
@@ -104,8 +104,8 @@ class LibraryTable:
         if len(lower_names) < len(names):
             raise argument_error("axes", "of other names than values and spectra", names)
         for name in names:
-            if not (name.isascii() and name.isidentifier()):
-                raise argument_error("axes", "named by plain identifiers", repr(name))
+            wanted = "named by plain identifiers"
+            check_that(name.isascii() and name.isidentifier(), "axes", wanted, repr(name))
 
     @property
     def n_rows(self):
@@ -332,6 +332,6 @@ def verify_library(path, name):
             check_data((hdu.verify_datasum(), hdu.verify_checksum()) == (1, 1), path, problem)
     for kind, spectra in library.spectra.items():
         for first in range(0, library.n_rows, 1000):
-            if not np.all(np.isfinite(spectra[first : first + 1000])):
-                raise data_error(path, f"has {kind!r} spectra with NaN or infinity")
+            good = np.all(np.isfinite(spectra[first : first + 1000]))
+            check_data(good, path, f"has {kind!r} spectra with NaN or infinity")
     return library

@@ -11,8 +11,8 @@ from scipy.ndimage import uniform_filter
 
 from miricigale.photometry import ErrorModel
 from miricigale.photometry.images.arrays import nearest_values
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import rows_of
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, error_column
 from miricigale.workflow.options import of_option, require
 
@@ -85,8 +85,7 @@ def footprint_area(images, within=True):
     """Return the solid angle of the pixels that are usable in every image on one grid, as for `in_field`."""
     images = list(images)
     shapes = [image.shape for image in images]
-    if len(set(shapes)) != 1:
-        raise argument_error("images", "on one grid", shapes)
+    check_that(len(set(shapes)) == 1, "images", "on one grid", shapes)
     usable = ~np.any([image.mask for image in images], axis=0) & within
     pixel = proj_plane_pixel_area(images[0].wcs) * u.deg**2
     return (np.count_nonzero(usable) * pixel).to(u.arcmin**2)
