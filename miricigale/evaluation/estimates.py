@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.evaluation.metrics import OUTLIER, fraction_interval, sigma_mad
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import attributes
 from miricigale.utils.random import check_seed, stream
 
 #: Values that are held at once: draws are made in pieces of this size.
@@ -42,6 +43,10 @@ class Estimate:
     high: float = np.nan
     n: int = 0
     n_all: int | None = None
+
+    def columns(self):
+        """Return value, interval, number of sources and completeness by name, for a row of a table."""
+        return attributes(self, ("value", "low", "high", "n", "completeness"))
 
     @property
     def error(self):

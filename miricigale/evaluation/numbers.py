@@ -71,23 +71,12 @@ def study_numbers(study, *, seed, n_draws=500):
                     options += REDSHIFT_BINS
                 for option in options:
                     key = stream(seed, "numbers", sky.name, band_set, quantity, str(option))
-                    row = {"truth": sky, "band_set": band_set, "option": option}
-                    got = measure(study, quantity, **row, seed=key, n_draws=n_draws)
+                    choice = {"truth": sky, "band_set": band_set, "option": option}
+                    estimate = measure(study, quantity, **choice, seed=key, n_draws=n_draws)
                     z_low, z_high = option or (0.0, np.inf)
-                    rows.append(
-                        {
-                            "truth": sky.name,
-                            "band_set": band_set,
-                            "quantity": quantity,
-                            "z_low": z_low,
-                            "z_high": z_high,
-                            "value": got.value,
-                            "low": got.low,
-                            "high": got.high,
-                            "n": got.n,
-                            "completeness": got.completeness,
-                        }
-                    )
+                    row = {"truth": sky.name, "band_set": band_set, "quantity": quantity}
+                    row |= {"z_low": z_low, "z_high": z_high}
+                    rows.append(row | estimate.columns())
     return described_rows(rows, declared("miricigale.evaluation", "columns.toml")["numbers"])
 
 

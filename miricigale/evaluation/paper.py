@@ -8,6 +8,7 @@ import numpy as np
 
 from miricigale.evaluation.estimates import Estimate
 from miricigale.evaluation.quantities import QUANTITIES, SHARES, measure
+from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_names
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
@@ -144,20 +145,14 @@ def compare_with_paper(study, *, seed, n_draws=1000, reasons=None, same_exposure
         if published.quantity == "extra":
             ours = study.extra.get(published.key, Estimate(np.nan))
         else:
-            row = {
-                "truth": published.truth,
-                "band_set": published.band_set,
-                "option": published.option,
-            }
-            row["seed"] = stream(seed, "paper", published.key)
-            ours = measure(study, published.quantity, **row, n_draws=n_draws)
-        judged = same_exposures or published.quantity == "extra"
+            choice = attributes(published, ("truth", "band_set", "option"))
+            choice["seed"] = stream(seed, "paper", published.key)
+            ours = measure(study, published.quantity, **choice, n_draws=n_draws)
         sigma = np.nan
-        if judged:
-            sigma = _difference(published, ours)
-        why = reasons.get(published.key, published.why)
         verdict = OTHER_EXPOSURES
-        if judged:
+        if same_exposures or published.quantity == "extra":
+            sigma = _difference(published, ours)
+            why = reasons.get(published.key, published.why)
             verdict = _verdict(published, ours, sigma, why)
         description = published.text
         if QUANTITIES.get(published.quantity):
@@ -207,7 +202,10 @@ def _difference(number, ours):
 
 def _excess(published, ours):
     """How much our value, or of a bound its size, is above the published one."""
-    return (abs(ours.value) if published.relation == "<" else ours.value) - published.value
+    value = ours.value
+    if published.relation == "<":
+        value = abs(value)
+    return value - published.value
 
 
 def _verdict(published, ours, sigma, why):

@@ -145,6 +145,11 @@ def name_and_unit(text):
     return text, None
 
 
+def band_label(name):
+    """Return a filter's name without its instrument, in upper case: ``F770W`` for ``miri.f770w``."""
+    return name.rpartition(".")[2].upper()
+
+
 def known_filter(label, names, kind):
     """
     Filter out of some that a user means.

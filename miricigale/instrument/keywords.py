@@ -4,6 +4,7 @@ import re
 
 from astropy.io import fits
 
+from miricigale.filters.band_names import band_label
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.options import check_data
 from miricigale.utils.package_tables import declared
@@ -153,7 +154,7 @@ def check_imager(path, header, *, kinds=None, own=None):
         raise data_error(path, f"{wanted}, got the prism {header['FILTER']}")
     filter_name = str(header.get("FILTER", "")).strip()
     recorded = (own or {}).get("filter")
-    bands = {name.rpartition(".")[2].upper() for name in (filter_name, recorded) if name}
+    bands = {band_label(name) for name in (filter_name, recorded) if name}
     problem = f"FILTER is {filter_name} in the header and {recorded} in the package's record"
     check_data(len(bands) <= 1, path, f"contradicts itself: {problem}")
 

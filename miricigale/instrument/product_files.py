@@ -9,6 +9,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.wcs.utils import proj_plane_pixel_area
 
+from miricigale.filters.band_names import band_label
 from miricigale.instrument.asdf_extension import asdf_extension
 from miricigale.instrument.dq import DQ, dq_planes
 from miricigale.instrument.history import ExposureHistory
@@ -190,7 +191,7 @@ def _headers(image, filename):
     primary, science = placed_keywords(meta.get("keywords", {}), wcs=False)
     keywords = {
         "TELESCOP": "JWST", "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE", "EXP_TYPE": "MIR_IMAGE",
-        "FILTER": str(meta.get("filter", "")).rpartition(".")[2].upper() or None,
+        "FILTER": band_label(str(meta.get("filter", ""))) or None,
         "SUBARRAY": meta.get("subarray"), "READPATT": meta.get("readout"),
         "DATAMODL": "ImageModel" if image.data.ndim == 2 else "CubeModel", "FILENAME": filename,
     }  # fmt: skip

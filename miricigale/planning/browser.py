@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.filters import Filter
+from miricigale.filters.band_names import band_label
 from miricigale.pages.browser import (
     list_column,
     parameter_entries,
@@ -58,7 +59,7 @@ def write_browser(path, title, planner, plans):
         sets.append({"name": plan.name, "label": plan.name, "color": color})
     bands_of_page = []
     for band in bands:
-        label = band.rpartition(".")[2].upper()
+        label = band_label(band)
         is_miri = band in plans[-1].bands
         entry = {"name": band, "label": label, "wave": rounded(pivots[band]), "miri": is_miri}
         bands_of_page.append(entry)

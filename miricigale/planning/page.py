@@ -5,6 +5,7 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 
+from miricigale.filters.band_names import band_label
 from miricigale.pages import Link, Page, SectionWriter, number, sentence
 from miricigale.planning.browser import MAX_SOURCES, write_browser
 from miricigale.planning.exposures import background_options
@@ -118,7 +119,7 @@ def answer(planner, plans, comparison):
 def _bands_in_words(name, plans):
     """Return the bands of a plan, such as F770W + F1000W."""
     bands = next(plan.bands for plan in plans if plan.name == name)
-    return " + ".join(band.removeprefix("miri.").upper() for band in bands)
+    return " + ".join(band_label(band) for band in bands)
 
 
 def _entries(table):

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 
+from miricigale.filters.band_names import band_label
 from miricigale.psf.effects import EFFECTS
 from miricigale.psf.field import psf_at
 from miricigale.psf.miri import MIRI_PIXEL_SCALE
@@ -25,7 +26,7 @@ def _instrument(filter_name):
         # no folder, no version.txt, or data of another version than stpsf asks for
         msg = f"stpsf cannot use the data of STPSF_PATH: {str(err).splitlines()[0]}"
         raise DataError(msg) from err
-    instrument.filter = str(filter_name).removeprefix("miri.").upper()
+    instrument.filter = band_label(str(filter_name))
     return instrument
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 from miricigale.depth import sky_background
+from miricigale.filters.band_names import band_label
 from miricigale.utils.caching import cached
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 from miricigale.workflow.options import require
@@ -51,7 +52,7 @@ def text_by_filter(texts):
     """Join the texts of filters into a sentence: the text alone where it is the same for all."""
     names = {}
     for filter, text in texts.items():
-        names.setdefault(text, []).append(filter.removeprefix("miri.").upper())
+        names.setdefault(text, []).append(band_label(filter))
     if len(names) == 1:
         return next(iter(names))
     return "; ".join(f"{', '.join(filters)}: {text}" for text, filters in names.items())

@@ -3,6 +3,7 @@
 from urllib.parse import quote, urlencode
 
 from miricigale.filters import Filter
+from miricigale.filters.band_names import band_label
 from miricigale.pages import Link
 from miricigale.plotting.axes import MEASURED, SECOND, plain_text
 from miricigale.utils.package_tables import declared
@@ -18,11 +19,6 @@ _LABELS = texts_of("labels")
 #: Sets of bands: what they are called, and their colors.
 SET_LABELS = _LABELS["sets"]
 SET_COLORS = {"all": MEASURED, "none": SECOND, "blue": "#0d9488", "red": "#a21caf"}
-
-
-def band_label(name):
-    """Return what a band is called on the page: ``F770W`` for ``miri.f770w``."""
-    return name.rpartition(".")[2].upper()
 
 
 def band_title(name):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from miricigale.filters.band_names import band_label
 from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.pages.browser import (
     cell_weights,
@@ -130,7 +131,7 @@ class _Objects:
         edges = {name: rounded(fits.distribution(name)[0].value) for name in self.drawn}
         bands = []
         for name, wave in zip(self.names, rounded(self.waves), strict=True):
-            label = name.rpartition(".")[2].upper()
+            label = band_label(name)
             is_miri = name.startswith("miri.")
             bands.append({"name": name, "label": label, "wave": wave, "miri": is_miri})
         spectrum = (

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.filters import Filter
+from miricigale.filters.band_names import band_label
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.pages.browser import image_note, list_column, rounded, saver, source_pages
 from miricigale.photometry.images.flags import ForcedFlags
@@ -65,7 +66,7 @@ def write_browser(path, title, bands, highres, confidence, detected):
         limits[band] = result.upper_limit(confidence)
         wave = Filter.from_name(band).pivot.value
         waves.append(wave)
-        label = band.rpartition(".")[2].upper()
+        label = band_label(band)
         bands_of_page.append(
             {"name": band, "label": label, "wave": rounded([wave])[0], "miri": True}
         )

@@ -9,6 +9,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.detector import Ramp
+from miricigale.filters.band_names import band_label
 from miricigale.instrument import ImageFacts
 from miricigale.pages import Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure, plain_text
@@ -312,7 +313,7 @@ def _show(page, path, members, notes):
     file = read_images(path)[0]
     image = file.image
     meta = file.image.meta
-    band = meta["filter"].rpartition(".")[2].upper()
+    band = band_label(meta["filter"])
     page.section("mosaic", band=band, notes=" ".join(f"{note}." for note in notes))
     good = ~image.mask
     values = {

@@ -5,6 +5,7 @@ from astropy.time import Time
 from scipy.ndimage import convolve
 
 from miricigale.detector import Charge, Ramp
+from miricigale.filters.band_names import band_label
 from miricigale.instrument import (
     REFERENCES,
     Exposure,
@@ -271,7 +272,7 @@ def _from_files(reducer, rate, facts, history):
 def _header(exposure, day):
     """Keywords by which references of a rate are found."""
     header = {
-        "DETECTOR": "MIRIMAGE", "EXP_TYPE": "MIR_IMAGE", "FILTER": exposure.filter.rpartition(".")[2].upper(),
+        "DETECTOR": "MIRIMAGE", "EXP_TYPE": "MIR_IMAGE", "FILTER": band_label(exposure.filter),
         "SUBARRAY": exposure.subarray, "READPATT": exposure.readout,
     }  # fmt: skip
     if day is not None:

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 
+from miricigale.filters.band_names import band_label
 from miricigale.instrument import DQ, READOUT_NAMES, aperture, frame_pattern, joined_header
 from miricigale.instrument.history import TYPES
 from miricigale.instrument.keywords import keyword_text
@@ -52,7 +53,7 @@ def _header(hdus, path, name, extension, exposure=None):
         # references of single frames serve groups that are their means
         patterns = (frame_pattern(exposure.readout),) + _ANY
     if name == "flat" and exposure.filter is not None:
-        wanted["FILTER"] = exposure.filter.rpartition(".")[2].upper()
+        wanted["FILTER"] = band_label(exposure.filter)
     for key, value in wanted.items():
         keyword_value = keyword_text(header.get, key)
         keyword_value = READOUT_NAMES.get(keyword_value, keyword_value)
@@ -254,7 +255,7 @@ def read_photom(path, exposure, day):
 
 def photom_row(path, filter, subarray):
     """Conversion of a filter and sub-array in a photom reference, and the rows of its dependence on time."""
-    short = filter.rpartition(".")[2].upper()
+    short = band_label(filter)
     with open_fits(path, wanted=_wanted("photom", "PHOTOM")) as hdus:
         _header(hdus, path, "photom", "PHOTOM")
         rows = hdus["PHOTOM"].data
