@@ -9,6 +9,7 @@ import numpy as np
 from astropy.table import Table, vstack
 
 from miricigale.fitting.posterior.priors import GridAxis
+from miricigale.fitting.results.result_tables import reduced_chi2
 from miricigale.fitting.results.results import FitResults
 from miricigale.fitting.results.sample_flags import with_high_chi2
 from miricigale.fitting.results.samples import Samples
@@ -226,8 +227,8 @@ def part_chi2(path):
     with open_fits(path, wanted="fit results", memmap=True) as hdus:
         data = hdus["RESULTS"].data
         chi2 = native(np.array(data["chi2"]))
-        degrees = native(np.array(data["n_bands"])) - 1
-    return np.divide(chi2, degrees, out=np.full(chi2.shape, np.nan), where=degrees > 0)
+        n_bands = native(np.array(data["n_bands"]))
+    return reduced_chi2(chi2, n_bands)
 
 
 def open_results(path, *, partial=False, model=None, curves=()):

@@ -7,9 +7,6 @@ from dataclasses import field
 import astropy.units as u
 import numpy as np
 
-from miricigale.filters.band_names import known_filter
-from miricigale.filters.band_table import BandTable
-from miricigale.fitting.data.likelihood import FitFlags, filter_names
 from miricigale.fitting.posterior.posterior import (
     FitRows,
     cell_edges,
@@ -20,14 +17,12 @@ from miricigale.fitting.posterior.posterior import (
 )
 from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.fitting.results import drawing, histories, inference_data
-from miricigale.fitting.results.percentile_columns import LEVELS
+from miricigale.fitting.results.result_tables import flux_table, reduced_chi2, result_table
 from miricigale.fitting.results.sample_flags import worst_bands
-from miricigale.fitting.results.table_columns import FIELDS, ODDS, OUTLIER, TEXTS
+from miricigale.fitting.results.table_columns import OUTLIER, TEXTS
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.object_rows import PerObject, PerObjectDict, of_id
 from miricigale.utils.options import check_names, check_that
-from miricigale.utils.tables import described_table, error_column
-from miricigale.utils.units import FNU
 from miricigale.utils.values import value_class
 
 #: Part of the mean below which CIGALE gives no standard deviation.
@@ -225,10 +220,7 @@ class FitResults(FitRows):
     @property
     def reduced_chi2(self):
         """Chi2 over the number of bands (limits among them) less one; NaN with a single band."""
-        degrees = np.asarray(np.maximum(self.n_bands - 1, 0))
-        return np.divide(self.chi2, degrees, out=np.full(degrees.shape, np.nan), where=degrees > 0)[
-            ()
-        ]
+        return reduced_chi2(self.chi2, self.n_bands)[()]
 
     @property
     def residuals(self):
@@ -553,44 +545,7 @@ class FitResults(FitRows):
             of log10 (dex, in their unit). Of a fit with ``outliers``, for each band
             ``<band>_outlier``, how likely it is wrong. With free redshifts `redshift_odds`.
         """
-        rows = self._several()
-        texts = TEXTS["object"] | {"flags": FitFlags.describe()}
-        table = {n: (getattr(rows, FIELDS.get(n, n)), text) for n, text in texts.items()}
-        table = {n: value for n, value in table.items() if value[0] is not None}
-        for name in rows.parameters:
-            unit = rows.unit(name)
-            meaning = rows._meaning(name)
-            percentiles = rows.percentile(name, LEVELS)
-            parts = [rows.mean(name), rows.std(name), *percentiles.T, rows.best[name]]
-            for (suffix, text), value in zip(TEXTS["parameter"].items(), parts, strict=True):
-                table[f"{name}_{suffix}"] = (value, f"{text} of {meaning}")
-            if rows.extensive(name):
-                log_mean = rows.moments[:, rows._quantity(name), 2] * u.dex
-                text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
-                table[f"{name}_logmean"] = (log_mean, text)
-            if name == "redshift" and not rows.redshift_fixed:
-                table["redshift_odds"] = (rows.redshift_odds, ODDS)
-        if rows.outlier is not None:
-            for name in rows.fitted_filters:
-                value = rows.outlier[:, rows.filters.index(name)]
-                table[f"{name}_outlier"] = (value, f"how likely {name} is wrong")
-        return described_table(self._chosen(table, columns), dict(self.meta), cls=BandTable)
-
-    def _chosen(self, table, names):
-        """Return columns of a table by name, or all of some parameters."""
-        if names is None:
-            return table
-        chosen = {}
-        for name in names:
-            if self._named(name) in self.parameters:
-                name = self._named(name)
-                of_name = [f"{name}_{suffix}" for suffix in TEXTS["parameter"]]
-                of_name = [column for column in [*of_name, f"{name}_logmean"] if column in table]
-            else:
-                check_names([name], "column", table)
-                of_name = [name]
-            chosen |= {column: table[column] for column in of_name}
-        return chosen
+        return result_table(self._several(), columns)
 
     def predict(self, filters=None):
         """
@@ -607,26 +562,7 @@ class FitResults(FitRows):
             ``id`` and, for each filter, mean (by its name), standard deviation (``<name>_err``)
             and flux of the best model (``<name>_best``) in uJy.
         """
-        rows = self._several()
-        columns = {"id": (rows.ids, "identifier")}
-        if filters is None:
-            filters = self.filters
-        labels = filter_names("filters", filters)
-        try:
-            names = [known_filter(label, self.filters, "filter of the models") for label in labels]
-        except KeyError as err:
-            err.add_note(
-                "draws have other bands: fitter.sample(photometry, 1000, seed=1).predict(filters)"
-            )
-            raise
-        for name in names:
-            for column, array, text in (
-                (name, rows.model_flux, "posterior mean of the model flux"),
-                (error_column(name), rows.model_flux_std, "its posterior standard deviation"),
-                (f"{name}_best", rows.best_flux, "flux of the best model"),
-            ):
-                columns[column] = (array[:, self.filters.index(name)] * FNU, text)
-        return described_table(columns, dict(self.meta), cls=BandTable)
+        return flux_table(self._several(), filters)
 
     samples = drawing.samples
     to_arviz = inference_data.of_results
