@@ -12,7 +12,6 @@ def agn(args):
     import astropy.units as u
 
     from miricigale.agn import AGNSurvey
-    from miricigale.utils.exceptions import OtherResultsError
 
     settings = filled(args, AGNSurvey)
     settings["area"] = args.area * u.arcmin**2
@@ -24,12 +23,8 @@ def agn(args):
     if args.plan:
         print(_plan(args, survey))
         return 0
-    try:
-        with fit_workers(args) as executor:
-            result = survey.run(**fit_options(args), executor=executor)
-    except OtherResultsError as err:
-        # name the option of this command instead of the argument
-        raise OtherResultsError(err.reason, "--no-resume to replace them") from err
+    with fit_workers(args) as executor:
+        result = survey.run(**fit_options(args), executor=executor)
     for row in result.totals:
         interval = f"{row['n_low']:.1f} to {row['n_high']:.1f}"
         shipped = f"{row['n_shipped']:.1f} with the shipped prior"

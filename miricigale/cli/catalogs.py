@@ -12,7 +12,6 @@ from miricigale.utils.named_values import attributes, without_none
 def fit(args):
     """Fit a catalog."""
     from miricigale.fitting.catalogs.classes import fit_classes, write_table
-    from miricigale.utils.exceptions import OtherResultsError
 
     if str(args.path) == "-":
         args.path = read_input(args.output)
@@ -45,9 +44,6 @@ def fit(args):
             f"stopped; {n_parts} finished parts are in {args.output}/; {command} resumes here"
         )
         raise
-    except OtherResultsError as err:
-        # name the option of this command instead of the argument
-        raise OtherResultsError(err.reason, "--no-resume to replace them") from err
     print(f"{_outcome(results['galaxy'])}; table: {table}; page: {page}")
     print(
         "mass: all stars formed; stellar_mass: living stars, as other codes quote it (0.2 to 0.3 dex less)"
@@ -61,12 +57,9 @@ def _outcome(results):
 
     from miricigale.fitting import FitFlags
 
-    flags = results.to_table(["flags"])["flags"]
-    unfitted = []
-    for value in flags.tolist():
-        if value & int(FitFlags.UNFITTED):
-            unfitted.append(value & int(FitFlags.UNFITTED))
-    n = len(flags)
+    causes = results.to_table(["flags"])["flags"] & int(FitFlags.UNFITTED)
+    unfitted = causes[causes != 0].tolist()
+    n = len(causes)
     text = f"{n} object{'s' * (n != 1)}, {n - len(unfitted)} fitted"
     if not unfitted:
         return text
@@ -95,17 +88,22 @@ def fit_options(args):
 
 @contextlib.contextmanager
 def fit_workers(args):
-    """Return an executor of the threads of this machine, or of the workers of a scheduler."""
+    """Return an executor for fits of a catalog: threads of this machine, or workers of a scheduler."""
+    from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import threads
 
-    if args.scheduler is None:
-        with threads(args.n_threads or None) as executor:
-            yield executor
-    else:
-        from miricigale.workflow.engine.cluster import cluster_executor
+    try:
+        if args.scheduler is None:
+            with threads(args.n_threads or None) as executor:
+                yield executor
+        else:
+            from miricigale.workflow.engine.cluster import cluster_executor
 
-        with cluster_executor(args.scheduler) as cluster:
-            yield cluster._client.get_executor(pure=False)
+            with cluster_executor(args.scheduler) as cluster:
+                yield cluster._client.get_executor(pure=False)
+    except OtherResultsError as err:
+        # name the option of the command instead of the argument
+        raise OtherResultsError(err.reason, "--no-resume to replace them") from err
 
 
 def images_of(args, paths, prefix=""):

@@ -116,7 +116,7 @@ def _is_file_name(text):
     return text.lower().endswith((".toml",) + TRANSLATE_SUFFIXES) or os.sep in text
 
 
-def catalog_messages(lost, pieces, treatment="taken as missing, by the number that stands there"):
+def catalog_messages(lost, pieces):
     """Yield warnings about bands without a filter, and numbers for no value in pieces (dicts as of `codes_of`)."""
     if lost:
         yield f"left out, no filter here: {', '.join(lost)}"
@@ -135,7 +135,7 @@ def catalog_messages(lost, pieces, treatment="taken as missing, by the number th
     if len(parts) > _FEW:
         parts = parts[:_FEW] + [f"and {len(parts) - _FEW} more bands"]
     if parts:
-        yield f"{treatment}: {'; '.join(parts)}"
+        yield f"taken as missing, by the number that stands there: {'; '.join(parts)}"
 
 
 def codes_of(table, bands):

@@ -163,6 +163,13 @@ def add_borders(ax, labels, x, y, **kwargs):
     ax.add_collection(LineCollection(lines, **kwargs))
 
 
+def row_mask(rows, n, default):
+    """Truth values of ``n`` points, shape (n,): those of the caller, or ``default`` for all without."""
+    if rows is None:
+        return np.full(n, default)
+    return np.asarray(rows, bool)
+
+
 def resolve_axes(ax):
     """The given axes, or those of pyplot's current figure."""
     if ax is not None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import TRUE, add_borders, resolve_axes
+from miricigale.plotting.axes import TRUE, add_borders, resolve_axes, row_mask
 from miricigale.utils.options import check_choice, check_that
 
 #: Color of lines over an image.
@@ -263,10 +263,7 @@ def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None):
     ax = resolve_axes(ax)
     xy = np.asarray(xy, float).reshape(-1, 2)
     offset = np.asarray(offset, float).reshape(-1, 2)
-    if used is None:
-        is_used = np.ones(len(xy), bool)
-    else:
-        is_used = np.asarray(used, bool)
+    is_used = row_mask(used, len(xy), True)
     ny, nx = field.shape
     step = max(nx, ny) / 12
     x, y = np.meshgrid(np.arange(step / 2, nx, step), np.arange(step / 2, ny, step))

@@ -5,7 +5,7 @@ import itertools
 import astropy.units as u
 import numpy as np
 
-from miricigale.plotting.axes import add_borders, legend, resolve_axes
+from miricigale.plotting.axes import add_borders, legend, resolve_axes, row_mask
 
 #: Upper limits: a bar, and an arrow down from it.
 _ARROW = {"fmt": "_", "uplims": True, "color": "tab:blue", "markersize": 10, "zorder": 4}
@@ -197,14 +197,8 @@ def plot_sed_fit(
     flux = _value(flux, u.uJy)
     err = _value(flux_err, u.uJy)
     model = _value(model_flux, u.uJy)
-    if used is None:
-        is_used = np.ones(wave.size, bool)
-    else:
-        is_used = np.asarray(used, bool)
-    if limit is None:
-        limit = np.zeros(wave.size, bool)
-    else:
-        limit = np.asarray(limit, bool)
+    is_used = row_mask(used, wave.size, True)
+    limit = row_mask(limit, wave.size, False)
     have = np.isfinite(flux) & np.isfinite(err)
     shown = np.concatenate([flux[have & (flux > 0)], model[np.isfinite(model) & (model > 0)]])
     if shown.size:

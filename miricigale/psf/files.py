@@ -136,15 +136,15 @@ class PSFFile:
         ValueError
             If the two differ by more than 2 %.
         """
-        in_header = None
-        if self.cell is not None:
-            in_header = self.cell * oversampling
-        if user_scale is None:
-            if in_header is None:
+        if self.cell is None:
+            if user_scale is None:
                 return None
+            return scalar(user_scale, ANGLE, argument) * ANGLE
+        in_header = self.cell * oversampling
+        if user_scale is None:
             return in_header * ANGLE
         scale = scalar(user_scale, ANGLE, argument)
-        if in_header is not None and abs(scale / in_header - 1) > _SAME_SCALE:
+        if abs(scale / in_header - 1) > _SAME_SCALE:
             wanted = f"{in_header:.4g} arcsec, as the header of {self.path} says"
             if oversampling > 1:
                 wanted += f" with {oversampling} cells along a pixel"
@@ -220,8 +220,7 @@ class PSFFile:
         centered = []
         for plane, center in zip(self.planes, centers, strict=True):
             centered.append(_shifted(plane, middle - center))
-        planes = centered
-        return make_psf(np.mean(planes, axis=0), origin=tuple(middle), **options)
+        return make_psf(np.mean(centered, axis=0), origin=tuple(middle), **options)
 
 
 def _planes(hdu, path, wanted, plane):
@@ -230,27 +229,22 @@ def _planes(hdu, path, wanted, plane):
     if hdu.is_image:
         data = hdu.data
     shape = getattr(data, "shape", None)
-    if shape is not None and len(shape) == 3 and shape[0] == 1 and plane is None:
-        data = data[0]
-        shape = data.shape
+    kind = "a cube"
     n_axes = 3
     if plane is None:
+        kind = "an image"
         n_axes = 2
+        if shape is not None and shape[:-2] == (1,):
+            # a cube of one plane is an image
+            shape = shape[1:]
     if shape is None or len(shape) != n_axes:
-        kind = "a cube"
-        if plane is None:
-            kind = "an image"
         hint = "; say FILE[EXTENSION,PLANE] or FILE[EXTENSION,mean] of a cube"
         raise data_error(path, f"must be {kind} with {wanted}, got the shape {shape}{hint}")
     if isinstance(plane, int) and not 0 <= plane < shape[0]:
         raise data_error(path, f"is a cube with the planes 0 to {shape[0] - 1}")
-    if plane is None:
-        planes = data[None]
-    elif plane == "mean":
-        planes = data
-    else:
-        planes = data[plane][None]
-    return np.array(planes, dtype=float)
+    if isinstance(plane, int):
+        data = data[plane]
+    return np.array(data, dtype=float).reshape(-1, *shape[-2:])
 
 
 def _shifted(data, offset):
@@ -276,10 +270,10 @@ def _best_extension(hdus, name):
         chosen = images[0]
         why = " (the first)"
     if len(images) > 1:
-        label = hdus[chosen].name or chosen
-        ignored_names = ", ".join(str(hdus[k].name or k) for k in images if k != chosen)
+        labels = {k: str(hdus[k].name or k) for k in images}
+        label = labels.pop(chosen)
         msg = (
-            f"{name} has several images: extension {label} is taken{why}, not {ignored_names}; "
+            f"{name} has several images: extension {label} is taken{why}, not {', '.join(labels.values())}; "
             f"{name}[NUMBER] names one"
         )
         warn(msg, PSFWarning)

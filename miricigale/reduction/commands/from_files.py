@@ -128,7 +128,7 @@ def reduce_files(
             if duplicate is not None:
                 reason = f"the same exposure as {duplicate}"
                 log.warning("%s is left out: %s", path, reason)
-                rows.append({"file": str(path), "filter": "", "status": "failed", "reason": reason})
+                rows.append(_failed(path, reason=reason))
                 continue
             row, cal, key = reduction.reduce(path)
             rows.append(row)
@@ -140,7 +140,7 @@ def reduce_files(
         options = {"pixel_scale": pixel_scale.to_value(ANGLE) * ANGLE, "align": align}
         for name in sorted(members):
             rows.append(reduction.combine(name, members[name], options, page))
-        table = Table(rows=[list(row.values()) for row in rows], names=list(rows[0]))
+        table = Table(rows=rows)
         products.write(_TABLE, "", lambda path: write_table(table, path, overwrite=True))
         _list(page, table)
         products.write(_PAGE, "", lambda path: page.report.write(path, overwrite=True))
@@ -201,6 +201,11 @@ def _reason(err):
     return " ".join(text.split()) or type(err).__name__
 
 
+def _failed(file, band="", *, reason=""):
+    """Return the row of a file in the table, for one that failed or as it is before it is reduced."""
+    return {"file": str(file), "filter": band, "status": "failed", "reason": reason}
+
+
 def _settings(reducer):
     """What the products depend on: settings, and the content of reference files."""
     values = {}
@@ -225,7 +230,7 @@ class _Reduction:
 
     def reduce(self, path):
         """Reduce one file: its row, its calibrated product (None without one), and the key of that."""
-        row = {"file": str(path), "filter": "", "status": "failed", "reason": ""}
+        row = _failed(path)
         cal = key = None
         try:
             key = content_sha256([_VERSION, file_sha256(path), self.settings, self.integrations])
@@ -279,7 +284,7 @@ class _Reduction:
     def combine(self, band, members, options, page):
         """Combine the exposures of a filter, and put the mosaic on the page: its row."""
         name = _mosaic_name(band)
-        row = {"file": name, "filter": band, "status": "failed", "reason": ""}
+        row = _failed(name, band)
         try:
             path, row["status"], notes = self._mosaic(name, members, options)
             row["reason"] = "; ".join(notes)

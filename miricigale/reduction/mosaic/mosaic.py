@@ -425,14 +425,14 @@ class _DrizzledGrid:
 
 def _drizzled_meta(images, weights, wcs, pixfrac):
     """What the images say of themselves, put together, and what drizzling does to their noise."""
-    alive = []
+    usable = []
     for im, weight in zip(images, weights, strict=True):
-        # an exposure without any usable pixel was not long
+        # the time of an exposure without any usable pixel does not count
         if np.any((weight > 0) & ~plain_mask(im)):
-            alive.append(im)
+            usable.append(im)
     ratio = _scale(wcs) / float(np.mean([_scale(im.wcs) for im in images]))
     before_drizzle = float(np.mean([ImageFacts.of(im).noise_correction for im in images]))
-    return _meta(alive or images) | {
+    return _meta(usable or images) | {
         "pixfrac": float(pixfrac),
         "pixel_scale": _scale(wcs) * 3600,
         "noise_correction": noise_correction(pixfrac, ratio) * before_drizzle,
@@ -444,7 +444,7 @@ def _check_covered(touched, pixel_map, weighted, shape, pixfrac):
     Refuse a mosaic in which the area of an image is not that of its map of pixels.
 
     Versions of drizzle have left out half of an image, or all of it, for one pixel of a map. ``touched`` are the
-    pixels of the grid that got some light, ``used`` those of the image that have a weight.
+    pixels of the grid that got some light, ``weighted`` those of the image that have a weight.
     """
     x, y = pixel_map
     ny, nx = shape
@@ -525,11 +525,12 @@ def _meta(images):
     """What the inputs say of themselves, put together."""
     metas = [im.meta for im in images]
     meta = {"n_exposures": len(images)}
+    common = set(metas[0]).intersection(*metas)
     for key in ("exposure_time", "n_negative", "n_outliers"):
-        if all(key in m for m in metas):
+        if key in common:
             meta[key] = sum(m[key] for m in metas)
     for key in ("pa_aper", "dither", "background", "background_error", "background_flags"):
-        if all(key in m for m in metas):
+        if key in common:
             meta[key] = [m[key] for m in metas]
     keywords = _shared_keywords([m.get("keywords", {}) for m in metas])
     if keywords is not None:

@@ -344,16 +344,23 @@ class StudyRunner:
                 text,
             )
 
+    def _changed_keys(self, store):
+        """Yield name, value and value in the folder's configuration (None without) of keys that differ."""
+        if not store.config:
+            return
+        for section, values in _values(self.config).items():
+            values_before = store.config.get(section, {})
+            for key, value in values.items():
+                before = values_before.get(key)
+                if before != value:
+                    yield f"[{section}] {key}", value, before
+
     def _warn_of_new_keys(self, store):
         """Name keys that the version which made the folder did not have, and their values in this run."""
-        old = store.config
-        if not old:
-            return
         added = []
-        for section, values in _values(self.config).items():
-            for key, value in values.items():
-                if key not in old.get(section, {}):
-                    added.append(f"[{section}] {key} = {_short(value)}")
+        for name, value, before in self._changed_keys(store):
+            if before is None:
+                added.append(f"{name} = {_short(value)}")
         if added:
             log.warning(
                 "%s was made by a version without %s: what is made now has these values",
@@ -363,14 +370,9 @@ class StudyRunner:
 
     def _differences(self, store):
         """Return what is other in the configuration than in that of the folder, in words."""
-        old = store.config
         changes = []
-        if old:
-            for section, values in _values(self.config).items():
-                for key, value in values.items():
-                    before = old.get(section, {}).get(key)
-                    if before != value:
-                        changes.append(f"[{section}] {key}: {_short(before)} -> {_short(value)}")
+        for name, value, before in self._changed_keys(store):
+            changes.append(f"{name}: {_short(before)} -> {_short(value)}")
         if changes:
             return "; ".join(changes)
         return "by another version of the package, its data or the catalog, or before a redo that was stopped"

@@ -73,7 +73,6 @@ def measure_rivals(context, name):
         table[error_column(method)] = nearest[error_column(name)]
     table.meta.update(method=own_method, n_source_extractor=int(n_blind))
     context.save_table(f"rivals/{name}.ecsv", table)
-    context.save_table(f"rivals/{name}.ecsv", table)
 
 
 def rival_table(truth, matched, name, *, method, inside):
