@@ -268,46 +268,20 @@ def _sources(image, argument):
 
 def _aligned(detected, catalog, radius, argument):
     """Images, with pixels of their sources, moved together to a catalog: the images, and by how much."""
-    # plane about the reference position of the first, deg, east and north
-    plane = WCS(naxis=2)
-    first = detected[0][0].wcs.wcs
-    plane.wcs.ctype = "RA---TAN", "DEC--TAN"
-    plane.wcs.crval = first.crval
-    plane.wcs.crpix = (1.0, 1.0)
-    plane.wcs.cdelt = 1.0, 1.0
-    positions = [im.wcs.pixel_to_world(x, y).icrs for im, x, y in detected if x.size]
-    places = [(coordinates.ra.deg, coordinates.dec.deg) for coordinates in positions] or [([], [])]
-    sky = SkyCoord(*np.concatenate(places, axis=1), unit="deg")
-    if len(sky):
-        i, j = search_around_sky(sky, catalog, radius * ANGLE)[:2]
-    else:
-        i, j = ([], [])
-    coordinates, target = (
-        np.stack(plane.world_to_pixel(s[k]), axis=1) * 3600 if len(k) else np.empty((0, 2))
-        for s, k in ((sky, i), (catalog, j))
-    )
-    shift = target - coordinates
-    matched = np.zeros(len(shift), bool)
-    if len(shift):
-        tree = KDTree(shift)
-        votes = tree.query_ball_point(shift, _VOTE, return_length=True)
-        # of several shifts that are as frequent one: between them there are none
-        neighbors = tree.query_ball_point(shift[np.argmax(votes)], _VOTE)
-        matched = np.hypot(*(shift - np.median(shift[neighbors], axis=0)).T) < _VOTE
-    turn = 0.0
-    move = np.zeros(2)
-    residual = shift
+    plane = _tangent_plane(detected[0][0].wcs.wcs.crval)
+    places, targets, n_sources = _pairs(detected, catalog, radius, plane)
+    matched = _agreeing(targets - places)
     for _ in range(5):
         wanted = f"one with at least {_LEAST} sources of the catalog within {radius:g} arcsec"
-        got = f"{np.count_nonzero(matched)} of {len(sky)} sources"
+        got = f"{np.count_nonzero(matched)} of {n_sources} sources"
         check_that(np.count_nonzero(matched) >= _LEAST, argument, wanted, got)
-        turn, move = _solved(coordinates[matched], target[matched])
-        residual = target - coordinates @ _rotation(turn).T - move
+        turn, move = _solved(places[matched], targets[matched])
+        residual = targets - places @ _rotation(turn).T - move
         spread = np.sqrt(np.mean(np.square(residual[matched])))
-        new = np.hypot(*residual.T) < max(3 * spread, 1e-6)
-        if np.array_equal(new, matched):
+        matched_before = matched
+        matched = np.hypot(*residual.T) < max(3 * spread, 1e-6)
+        if np.array_equal(matched, matched_before):
             break
-        matched = new
     alignment = Alignment(
         east=move[0] * ANGLE,
         north=move[1] * ANGLE,
@@ -315,21 +289,77 @@ def _aligned(detected, catalog, radius, argument):
         n_matched=int(np.count_nonzero(matched)),
         scatter=float(np.sqrt(np.mean(np.square(residual[matched])))) * ANGLE,
     )
-    matrix = _rotation(turn)
-    out = []
+    moved = []
     for im, *_ in detected:
-        new = with_data(im, im.data, n_aligned=alignment.n_matched)
-        new.wcs = wcs = im.wcs.deepcopy()
-        if wcs.wcs.has_cd():
-            wcs.wcs.cd = matrix @ wcs.wcs.cd
-        else:
-            scale = np.diag(wcs.wcs.cdelt)
-            wcs.wcs.pc = np.linalg.inv(scale) @ matrix @ scale @ wcs.wcs.get_pc()
-        place = np.array(plane.wcs_world2pix([wcs.wcs.crval], 0)[0])
-        wcs.wcs.crval = plane.wcs_pix2world([matrix @ place + move / 3600], 0)[0]
-        wcs.wcs.set()
-        out.append(new)
-    return out, alignment
+        aligned = with_data(im, im.data, n_aligned=alignment.n_matched)
+        aligned.wcs = _moved_wcs(im.wcs, plane, _rotation(turn), move)
+        moved.append(aligned)
+    return moved, alignment
+
+
+def _tangent_plane(center):
+    """Coordinates east and north of a position (deg), in deg: "pixels" of the plane are degrees."""
+    plane = WCS(naxis=2)
+    plane.wcs.ctype = "RA---TAN", "DEC--TAN"
+    plane.wcs.crval = center
+    plane.wcs.crpix = (1.0, 1.0)
+    plane.wcs.cdelt = 1.0, 1.0
+    return plane
+
+
+def _pairs(detected, catalog, radius, plane):
+    """
+    Pair sources of images with all positions of a catalog within a radius in arcsec.
+
+    Returns
+    -------
+    places, targets : `~numpy.ndarray`, shape (n_pairs, 2)
+        Sources and positions of the catalog in the plane, arcsec.
+    n_sources : int
+        Number of sources of the images.
+    """
+    ra = [np.empty(0)]
+    dec = [np.empty(0)]
+    for im, x, y in detected:
+        if x.size:
+            sky = im.wcs.pixel_to_world(x, y).icrs
+            ra.append(sky.ra.deg)
+            dec.append(sky.dec.deg)
+    sky = SkyCoord(np.concatenate(ra), np.concatenate(dec), unit="deg")
+    source = position = np.empty(0, int)
+    if len(sky):
+        source, position, _, _ = search_around_sky(sky, catalog, radius * ANGLE)
+    if not len(source):
+        return np.empty((0, 2)), np.empty((0, 2)), len(sky)
+    places = np.stack(plane.world_to_pixel(sky[source]), axis=1) * 3600
+    targets = np.stack(plane.world_to_pixel(catalog[position]), axis=1) * 3600
+    return places, targets, len(sky)
+
+
+def _agreeing(shift):
+    """Which pairs agree with the most frequent shift, of shifts in arcsec, shape (n, 2)."""
+    if not len(shift):
+        return np.zeros(0, bool)
+    tree = KDTree(shift)
+    votes = tree.query_ball_point(shift, _VOTE, return_length=True)
+    # the neighbors of one of the most frequent: between two such places there are none
+    neighbors = tree.query_ball_point(shift[np.argmax(votes)], _VOTE)
+    return np.hypot(*(shift - np.median(shift[neighbors], axis=0)).T) < _VOTE
+
+
+def _moved_wcs(wcs, plane, matrix, move):
+    """World coordinates turned by a matrix and moved by arcsec (east, north) in a tangent plane."""
+    wcs = wcs.deepcopy()
+    if wcs.wcs.has_cd():
+        wcs.wcs.cd = matrix @ wcs.wcs.cd
+    else:
+        # PC acts on pixels, before the scale CDELT: CDELT PC' = matrix CDELT PC
+        scale = np.diag(wcs.wcs.cdelt)
+        wcs.wcs.pc = np.linalg.inv(scale) @ matrix @ scale @ wcs.wcs.get_pc()
+    place = np.array(plane.wcs_world2pix([wcs.wcs.crval], 0)[0])
+    wcs.wcs.crval = plane.wcs_pix2world([matrix @ place + move / 3600], 0)[0]
+    wcs.wcs.set()
+    return wcs
 
 
 def _rotation(turn):

@@ -16,6 +16,7 @@ from miricigale.reduction.mosaic.extended_outliers import extended_outliers
 from miricigale.reduction.mosaic.mosaic import add_image, extent_of, pixel_maps_of, weight_map
 from miricigale.utils.options import check_positive
 from miricigale.utils.parallel import chunks
+from miricigale.utils.values import value_class
 
 # rows of a grid of which the median of many images is taken together
 _ROWS = 256
@@ -105,57 +106,90 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
         weights = [weight_map(im) for im in images]
     if pixel_maps is None:
         pixel_maps = pixel_maps_of(images, wcs)
-    median, count = _median_of(images, wcs, weights, pixel_maps)
-    # where too few images overlap there is nothing to compare with
-    judged = count >= 3
-    share = np.where(judged, 1.5 / np.maximum(count, 1), 0.0).astype(np.float32)
-    inner = slice(1, -1)
-    before = slice(None, -2)
-    after = slice(2, None)
-    padded = np.pad(median, 1, constant_values=np.nan)
-    shifts = [(before, inner), (after, inner), (inner, before), (inner, after)]
-    steep = np.fmax.reduce([np.abs(median - padded[place]) for place in shifts])
-    median = np.where(judged, median, 0.0)
-    gradient = gaussian_gradient_magnitude(median, _GRADIENT_WIDTH)
-    ny, nx = median.shape
-    # between four pixels of the grid that all can be compared with
-    all_judged = judged[:-1, :-1] & judged[:-1, 1:] & judged[1:, :-1] & judged[1:, 1:]
-    out = []
-    for im, (x, y) in zip(images, pixel_maps, strict=True):
+    median = _MosaicMedian.of(*_median_of(images, wcs, weights, pixel_maps))
+    checked = []
+    for im, pixel_map in zip(images, pixel_maps, strict=True):
+        single, extended = median.outliers(im, pixel_map, threshold)
+        outlier = single | extended
+        flagged = flag_pixels(im, outlier, DQ.OUTLIER | DQ.DO_NOT_USE)
+        afterglow = _afterglow(extended, im, images)
+        if afterglow.any():
+            flagged = flag_pixels(flagged, afterglow, DQ.PERSISTENCE)
+        flagged.meta["n_outliers"] = int(np.count_nonzero(outlier))
+        checked.append(flagged)
+    return checked
+
+
+@value_class
+class _MosaicMedian:
+    """
+    The median of images on a grid, (ny, nx), with which each of them is compared.
+
+    ``steep`` is its largest step to a neighboring pixel, ``gradient`` its smooth gradient. ``judged`` are corners
+    of four pixels, (ny - 1, nx - 1), in all of which enough images overlap, and ``share`` the variance of the
+    median over that of an image.
+    """
+
+    data: np.ndarray
+    steep: np.ndarray
+    gradient: np.ndarray
+    judged: np.ndarray
+    share: np.ndarray
+
+    @classmethod
+    def of(cls, median, count):
+        """Make one of a median and the number of images in each pixel."""
+        # where too few images overlap there is nothing to compare with
+        enough = count >= 3
+        share = np.where(enough, 1.5 / np.maximum(count, 1), 0.0).astype(np.float32)
+        inner = slice(1, -1)
+        before = slice(None, -2)
+        after = slice(2, None)
+        padded = np.pad(median, 1, constant_values=np.nan)
+        neighbors = [(before, inner), (after, inner), (inner, before), (inner, after)]
+        steep = np.fmax.reduce([np.abs(median - padded[place]) for place in neighbors])
+        median = np.where(enough, median, 0.0)
+        gradient = gaussian_gradient_magnitude(median, _GRADIENT_WIDTH)
+        judged = enough[:-1, :-1] & enough[:-1, 1:] & enough[1:, :-1] & enough[1:, 1:]
+        return cls(median, np.nan_to_num(steep), gradient, judged, share)
+
+    def outliers(self, im, pixel_map, threshold):
+        """
+        Compare an image with the median.
+
+        Returns
+        -------
+        single, extended : `~numpy.ndarray` of bool
+            Pixels that are off by themselves, and further ones that are off together with others.
+        """
+        x, y = pixel_map
+        ny, nx = self.data.shape
         column = np.floor(np.nan_to_num(x, nan=-1)).astype(int)
         row = np.floor(np.nan_to_num(y, nan=-1)).astype(int)
         inside = (column >= 0) & (column < nx - 1) & (row >= 0) & (row < ny - 1)
         column[~inside] = row[~inside] = 0
+        good = inside & self.judged[row, column] & ~plain_mask(im)
         coords = np.array([y, x])
         options = {"order": 1, "mode": "constant", "cval": 0.0}
-        expected = map_coordinates(median, coords, **options)
-        slope = map_coordinates(np.nan_to_num(steep), coords, **options)
-        inside_judged = inside & all_judged[row, column]
-        # that of the median too, of as many images as there are at this place
-        noise = sigma(im) * np.sqrt(1 + share[row, column])
+        difference = im.data - map_coordinates(self.data, coords, **options)
+        slope = map_coordinates(self.steep, coords, **options)
+        # the noise of the median too, of as many images as there are at this place
+        noise = sigma(im) * np.sqrt(1 + self.share[row, column])
         with np.errstate(invalid="ignore"):
-            far = np.abs(im.data - expected) > threshold * noise + _DERIVATIVE * slope
-        good = inside_judged & ~plain_mask(im)
-        outlier = far & good
-        difference = im.data - expected
+            far = np.abs(difference) > threshold * noise + _DERIVATIVE * slope
+        single = far & good
         # sampling of sources is allowed for, the noise of the median's slopes is none of theirs
         noise_slope = 0.0
         if good.any():
             noise_slope = np.median(slope[good])
         allowed = _DERIVATIVE * np.maximum(slope - _NOISE_SLOPES * noise_slope, 0.0)
         # wide sources have slopes below the noise, over many pixels
-        allowed = np.maximum(allowed, _MISPLACED * map_coordinates(gradient, coords, **options))
+        smooth_slope = map_coordinates(self.gradient, coords, **options)
+        allowed = np.maximum(allowed, _MISPLACED * smooth_slope)
         excess = np.sign(difference) * np.maximum(np.abs(difference) - allowed, 0.0)
         with np.errstate(invalid="ignore"):
-            extended = extended_outliers(excess / noise, good & ~outlier, threshold)
-        outlier |= extended
-        flagged = flag_pixels(im, outlier, DQ.OUTLIER | DQ.DO_NOT_USE)
-        afterglow = _afterglow(extended, im, images)
-        if afterglow.any():
-            flagged = flag_pixels(flagged, afterglow, DQ.PERSISTENCE)
-        flagged.meta["n_outliers"] = int(np.count_nonzero(outlier))
-        out.append(flagged)
-    return out
+            extended = extended_outliers(excess / noise, good & ~single, threshold)
+        return single, extended
 
 
 def _afterglow(extended, image, images):
