@@ -98,10 +98,9 @@ def check_bands(filters, law, beyond="refuse"):
     out = []
     for band in FilterSet(filters):
         first, last = band.wave.value[[0, -1]]
+        top = high
         if beyond == "transparent":
             top = max(high, 1.01 * last)
-        else:
-            top = high
         try:
             band.weights(np.array([low, top]))
         except ValueError:
@@ -331,12 +330,11 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     values, _ = _color_excess(ebv)
     check_bands(bands, law, beyond)
     low, high = coverage(law)
-    if sed is None:
-        points = None
-    else:
+    points = None
+    if sed is not None:
         points = spectrum_arrays(sed, bands)
-    if points is not None:
-        bands.weights(points[0])  # refuses what the spectrum does not cover
+        # refuses what the spectrum does not cover
+        bands.weights(points[0])
     # many sources lie in one cell of a map
     different, row = np.unique(values, return_inverse=True)
     out = QTable({"ebv": values * u.mag})

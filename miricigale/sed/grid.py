@@ -49,21 +49,15 @@ def fraction_span(definition):
     ``definition`` is ``"dust"`` or a range such as ``"3-1000um"`` or ``"5-20um"`` in 0.1-1000 um; anything else
     is a ValueError.
     """
-    if isinstance(definition, str):
-        match = _SPAN.fullmatch(definition)
-    else:
-        match = None
-    if match:
-        low, high = map(float, match.groups())
-    else:
-        low = 0.0
-        high = 0.0
-    if definition != "dust" and not 0.1 <= low < high <= 1000.0:
-        wanted = "one of 'dust' and ranges in 0.1-1000 um such as '3-1000um'"
-        raise argument_error("frac_agn_definition", wanted, repr(definition))
     if definition == "dust":
         return None
-    return (low, high)
+    match = _SPAN.fullmatch(str(definition))
+    if match:
+        low, high = map(float, match.groups())
+        if 0.1 <= low < high <= 1000.0:
+            return (low, high)
+    wanted = "one of 'dust' and ranges in 0.1-1000 um such as '3-1000um'"
+    raise argument_error("frac_agn_definition", wanted, repr(definition))
 
 
 @value_class

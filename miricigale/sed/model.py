@@ -5,18 +5,17 @@ from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.filters import FilterSet
 from miricigale.refdata import citations
 from miricigale.sed import gridding, parameter_names, presets, tables
-from miricigale.sed.chain import Chain
+from miricigale.sed.chain import INFRARED, Chain
 from miricigale.sed.component import Component, in_order, named_component, read_config
 from miricigale.sed.cosmology import COSMOLOGY
 from miricigale.sed.derived import DERIVED, Derived
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
-from miricigale.sed.parameter import MODEL_PARAMETERS, default_values
+from miricigale.sed.parameter import MODEL_PARAMETERS, default_values, parameter_table
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
@@ -237,11 +236,7 @@ class SEDModel(Interactive):
         >>> model.preset
         'survey'
         """
-        model = type(self)(
-            list(self.components) + list(components),
-            cosmology=self.cosmology,
-            frac_agn_definition=self.frac_agn_definition,
-        )
+        model = self._of_components([*self.components, *components])
         model._notes = self._notes
         model.preset = self.preset
         return model
@@ -278,11 +273,12 @@ class SEDModel(Interactive):
             )
             new[component.role] = component
         kept = [component for component in self.components if component.role not in new]
-        return type(self)(
-            [*kept, *new.values()],
-            cosmology=self.cosmology,
-            frac_agn_definition=self.frac_agn_definition,
-        )
+        return self._of_components([*kept, *new.values()])
+
+    def _of_components(self, components):
+        """Model of other components, with the cosmology and the AGN fractions of this one."""
+        options = {"frac_agn_definition": self.frac_agn_definition}
+        return type(self)(components, cosmology=self.cosmology, **options)
 
     def named_axes(self, name=None):
         """
@@ -311,18 +307,7 @@ class SEDModel(Interactive):
         >>> SEDModel.survey(agn=False).named_axes()["metallicity"]
         array([0.004, 0.02 ])
         """
-        names = [n for n, (preset, _) in presets.GRIDS.items() if preset == self.preset]
-        if name is None:
-            if not names:
-                wanted = "given for a model that has no grid of its own: a dict of its parameters to values"
-                raise argument_error("axes", wanted, "None")
-            name = self.preset
-        name = presets.grid_name(name)
-        if names and name not in names:
-            named = ", ".join(map(repr, names))
-            wanted = f"{named} or a dict of parameters to values for the model {self.preset!r}"
-            raise argument_error("axes", wanted, repr(name))
-        return presets.grid_axes(name, agn=self.has_agn)
+        return presets.axes_of_preset(self.preset, name, agn=self.has_agn)
 
     survey_axes = staticmethod(presets.survey_axes)
     yang2021_axes = staticmethod(presets.yang2021_axes)
@@ -348,12 +333,7 @@ class SEDModel(Interactive):
         table : `~astropy.table.QTable`
             ``name``, ``default``, ``low`` and ``high`` (bounds), ``unit`` and ``description`` of each.
         """
-        rows = []
-        for name, parameter in self._parameters.items():
-            low, high = parameter.bounds
-            unit = str(parameter.unit)
-            rows.append((name, parameter.default, low, high, unit, parameter.description))
-        return QTable(rows=rows, names=["name", "default", "low", "high", "unit", "description"])
+        return parameter_table(self._parameters)
 
     def component(self, role):
         """The component of a role (one of `~miricigale.sed.ROLES`), or None."""
@@ -408,8 +388,8 @@ class SEDModel(Interactive):
     @functools.cached_property
     def chain(self):
         """The components on their common grid of wavelengths (made on first use)."""
-        span = fraction_span(self.frac_agn_definition)
-        return Chain({c.role: c for c in self.components}, **({"span": span} if span else {}))
+        span = fraction_span(self.frac_agn_definition) or INFRARED
+        return Chain({c.role: c for c in self.components}, span=span)
 
     @property
     def wave(self):
@@ -425,17 +405,12 @@ class SEDModel(Interactive):
         columns : dict of str to `~miricigale.sed.Derived`
             Unit and description by name.
         """
-        out = {n: d for n, d in DERIVED.items() if self.has_agn or d.of != "agn"}
-        xray = self.component("xray")
-        # the relation is not linear: it is worked out after scaling
-        if xray:
-            xray_columns = xray.columns
-        else:
-            xray_columns = {}
-        xray_derived = {}
-        for n, (unit, text) in xray_columns.items():
-            xray_derived[n] = Derived(unit, text, False, "xray")
-        return out | xray_derived
+        columns = {n: entry for n, entry in DERIVED.items() if self.has_agn or entry.of != "agn"}
+        if xray := self.component("xray"):
+            for name, (unit, text) in xray.columns.items():
+                # the relation is not linear: it is worked out after scaling
+                columns[name] = Derived(unit, text, False, "xray")
+        return columns
 
     def __getstate__(self):
         state = self.__dict__.copy()
@@ -473,23 +448,19 @@ class SEDModel(Interactive):
         parameters = parameter_names.by_our_names(parameters, self._parameters, short=True)
         parameters = tables.with_mass_formed(self, parameters)
         parameter_names.check_parameters(parameters, self)
+        values = self.defaults
         for name, value in parameters.items():
             wanted = "one number (fluxes() takes several models)"
             check_that(np.ndim(value) == 0, name, wanted, f"shape {np.shape(value)}")
-        out = {}
-        for name, par in self._parameters.items():
-            if name in parameters:
-                out[name] = par.check(parameters[name])
-            else:
-                out[name] = par.default
+            values[name] = self._parameters[name].check(value)
         for component in self.components:
-            why = component.invalid(out)
-            if why:
-                raise ValueError(why)
-        limit = float(self.cosmology.age(out["redshift"]).to_value(u.Gyr))
+            refusal = component.invalid(values)
+            if refusal:
+                raise ValueError(refusal)
+        limit = float(self.cosmology.age(values["redshift"]).to_value(u.Gyr))
         wanted = f"at most the age of the universe, {limit:.3f} Gyr"
-        check_that(out["age"] <= limit, "age", wanted, out["age"])
-        return out
+        check_that(values["age"] <= limit, "age", wanted, values["age"])
+        return values
 
     def evaluate(self, values=None, /, **parameters):
         """

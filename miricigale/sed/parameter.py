@@ -4,6 +4,7 @@ import math
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.missing_values import without_mask
@@ -211,6 +212,17 @@ class Parameter:
 def default_values(parameters):
     """Return the default of each `Parameter`, in its unit, by name."""
     return {name: parameter.default for name, parameter in parameters.items()}
+
+
+def parameter_table(parameters):
+    """Tabulate parameters, a dict by name; see `SEDModel.to_table`."""
+    rows = []
+    for name, parameter in parameters.items():
+        low, high = parameter.bounds
+        row = {"name": name, "default": parameter.default, "low": low, "high": high}
+        row |= {"unit": str(parameter.unit), "description": parameter.description}
+        rows.append(row)
+    return QTable(rows=rows)
 
 
 #: Parameters of a model that are of none of its components.

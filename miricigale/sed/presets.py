@@ -7,7 +7,7 @@ from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.component import COMPONENTS
 from miricigale.utils.exceptions import argument_error, warn
-from miricigale.utils.named_values import convert_values
+from miricigale.utils.named_values import convert_values, without
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 
@@ -242,16 +242,32 @@ def grid_name(name, argument="axes"):
     return name
 
 
+def axes_of_preset(preset, name=None, *, agn):
+    """
+    Axes of a grid of a model of a preset; see `SEDModel.named_axes`.
+
+    ``preset`` is None of a model that has no grid of its own, and ``name`` that of the grid, by default that of
+    the preset.
+    """
+    names = [grid for grid, (chain, _) in GRIDS.items() if chain == preset]
+    if name is None:
+        wanted = "given for a model that has no grid of its own: a dict of its parameters to values"
+        check_that(names, "axes", wanted, "None")
+        name = preset
+    name = grid_name(name)
+    if names and name not in names:
+        named = ", ".join(map(repr, names))
+        wanted = f"{named} or a dict of parameters to values for the model {preset!r}"
+        raise argument_error("axes", wanted, repr(name))
+    return grid_axes(name, agn=agn)
+
+
 def grid_axes(name, *, agn):
     """Axes of a grid in `GRIDS`: new arrays by parameter; without those of AGN if ``agn`` is false."""
     axes = _values(GRIDS[name][1])
     if agn:
         return axes
-    galaxy_axes = {}
-    for n, values in axes.items():
-        if n not in _OF_AGN:
-            galaxy_axes[n] = values
-    return galaxy_axes
+    return without(axes, _OF_AGN)
 
 
 def red_dot_axes():
