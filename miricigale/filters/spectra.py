@@ -63,41 +63,17 @@ def spectrum_arrays(sed, bands):
     `~astropy.units.UnitsError`
         If it has other units than a flux density's.
     """
-    if hasattr(sed, "wave") and hasattr(sed, "fnu"):
-        wave = sed.wave
-        flux = sed.fnu
-    elif isinstance(sed, (tuple, list)) and len(sed) == 2:
-        wave, flux = sed
-    elif isinstance(sed, Table):
-        wave_name, flux_name = curve_columns(sed, FLUX_NAME, "'sed'")
-        wave = sed[wave_name]
-        flux = sed[flux_name]
-    elif hasattr(sed, "spectral_axis") and hasattr(sed, "flux"):
-        wave = sed.spectral_axis.to(WAVE, u.spectral())
-        flux = sed.flux
-    elif hasattr(sed, "waveset"):
-        if sed.waveset is None:
-            wave = _inside(bands)
-        else:
-            wave = sed.waveset
-        flux = sed(wave, flux_unit=u.Jy)
-    elif callable(sed):
-        wave = _inside(bands)
-        flux = sed(wave)
-    else:
-        wanted = "a spectrum: an SED, (wavelengths, flux densities), or one of specutils or synphot"
-        raise argument_error("sed", wanted, type(sed).__name__)
+    wave, flux = _wave_and_flux(sed, bands)
     if not hasattr(wave, "unit"):
         raise u.UnitsError("'sed' must have wavelengths with a unit, got bare numbers")
     order = slice(None, None, -1 if wave[-1] < wave[0] else 1)
     wave = check_wave(wave[order])
     flux = flux[order]
     unit = getattr(flux, "unit", None)
-    is_converted = unit == FNU
     if unit is not None and (unit * u.sr).is_equivalent(FNU, u.spectral_density(1 * WAVE)):
         raise units_error("sed", "a flux density; multiply by the solid angle", unit)
     spectral = []
-    if not is_converted:
+    if unit != FNU:
         spectral = u.spectral_density(wave * WAVE)
     fnu = to_array(flux, FNU, "sed.fnu", ndim=1, equivalencies=spectral)
     got = f"{fnu.size} for {wave.size} wavelengths"
@@ -106,6 +82,29 @@ def spectrum_arrays(sed, bands):
     if getattr(sed, "mask", None) is not None:
         missing = missing | np.broadcast_to(np.asarray(sed.mask, dtype=bool), fnu.shape)[order]
     return _without_missing(wave, fnu, missing)
+
+
+def _wave_and_flux(sed, bands):
+    """Wavelengths and flux densities of a spectrum as it has them: see `spectrum_arrays`."""
+    if hasattr(sed, "wave") and hasattr(sed, "fnu"):
+        return sed.wave, sed.fnu
+    if isinstance(sed, (tuple, list)) and len(sed) == 2:
+        return sed
+    if isinstance(sed, Table):
+        wave_name, flux_name = curve_columns(sed, FLUX_NAME, "'sed'")
+        return sed[wave_name], sed[flux_name]
+    if hasattr(sed, "spectral_axis") and hasattr(sed, "flux"):
+        return sed.spectral_axis.to(WAVE, u.spectral()), sed.flux
+    if hasattr(sed, "waveset"):
+        wave = sed.waveset
+        if wave is None:
+            wave = _inside(bands)
+        return wave, sed(wave, flux_unit=u.Jy)
+    if callable(sed):
+        wave = _inside(bands)
+        return wave, sed(wave)
+    wanted = "a spectrum: an SED, (wavelengths, flux densities), or one of specutils or synphot"
+    raise argument_error("sed", wanted, type(sed).__name__)
 
 
 def _without_missing(wave, fnu, missing):
@@ -125,7 +124,4 @@ def _without_missing(wave, fnu, missing):
 
 def _inside(bands):
     """Wavelengths of the curves of bands, refined."""
-    nodes = []
-    for band in bands:
-        nodes.append(band._fine[0])
-    return np.unique(np.concatenate(nodes)) * WAVE
+    return np.unique(np.concatenate([band._fine[0] for band in bands])) * WAVE

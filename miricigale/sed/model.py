@@ -265,12 +265,8 @@ class SEDModel(Interactive):
         for component in components:
             if isinstance(component, str):
                 component = named_component(component)
-            check_that(
-                isinstance(component, Component),
-                "components",
-                "Component instances or names",
-                component,
-            )
+            wanted = "Component instances or names"
+            check_that(isinstance(component, Component), "components", wanted, component)
             new[component.role] = component
         kept = [component for component in self.components if component.role not in new]
         return self._of_components([*kept, *new.values()])

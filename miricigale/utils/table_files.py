@@ -91,29 +91,15 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
         if form is None:
             form = _table_format(path)
         if form == "fits":
-            with open_fits(path, wanted=wanted) as hdus, silent_units():
-                chosen = hdu
-                if hdu is None:
-                    chosen = first_table(hdus)
-                read = table_read(hdus, chosen)
-                check_names_differ(names_in_header(read))
-                table = Table.read(hdus, format=form, character_as_bytes=False, hdu=chosen)
-                mask_scaled_nulls(table, read)
-                leave_ragged_out(table, read, Path(path).name)
+            table = _read_fits(path, wanted, hdu)
         elif hdu is not None:
             raise unreadable(path, wanted, f"'hdu' is {hdu!r}, and it is no FITS file")
         elif form == "parquet":
             parquet = require("pyarrow.parquet", extra="parquet")
             check_names_differ(parquet.read_schema(path).names)
-            rows = parquet.read_table(path)
-            table = arrow_table(rows, Table, where=Path(path).name)
+            table = arrow_table(parquet.read_table(path), Table, where=Path(path).name)
         else:
-            check_text(path)
-            with silent_units():
-                table = read_text(path, form, id_names)
-                # SExtractor numbers the parts of a vector as astropy does names that stand twice
-                if form.startswith("ascii") and form != "ascii.sextractor":
-                    drop_repeated(table, path)
+            table = _read_text(path, form, id_names)
         if not table.colnames:
             raise unreadable(path, wanted, "it has no columns")
         return in_units(table, cls, id_names)
@@ -126,6 +112,30 @@ def read_table(path, *, wanted, cls=QTable, form=None, hdu=None, id_names=()):
         raise unreadable(path, wanted, err) from None
     except Exception as err:  # readers of different formats raise different exceptions
         raise unreadable(path, wanted, err) from err
+
+
+def _read_fits(path, wanted, hdu):
+    """Table of a FITS file: that of an extension, or the first one."""
+    with open_fits(path, wanted=wanted) as hdus, silent_units():
+        if hdu is None:
+            hdu = first_table(hdus)
+        read = table_read(hdus, hdu)
+        check_names_differ(names_in_header(read))
+        table = Table.read(hdus, format="fits", character_as_bytes=False, hdu=hdu)
+        mask_scaled_nulls(table, read)
+        leave_ragged_out(table, read, Path(path).name)
+        return table
+
+
+def _read_text(path, form, id_names):
+    """Table of a text file or another one that astropy reads by itself."""
+    check_text(path)
+    with silent_units():
+        table = read_text(path, form, id_names)
+        # SExtractor numbers the parts of a vector as astropy does names that stand twice
+        if form.startswith("ascii") and form != "ascii.sextractor":
+            drop_repeated(table, path)
+        return table
 
 
 #: What astropy must know further to write a format.

@@ -139,14 +139,15 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
         # limit and scatter of each sample, by images
         measures = {}
         for name, flux in fluxes.items():
+            curves = []
             measures[name] = np.empty((len(samples), 2))
             for k, sample in enumerate(samples):
                 curve = measured_curve(band, true[sample], flux[sample], bin_size, statistic)
+                curves.append(curve)
                 off = (flux - true)[sample]
                 measures[name][k] = _measures(curve, off[faint[sample]])
-                if k == 0:
-                    with np.errstate(divide="ignore", invalid="ignore"):
-                        detected = flux > 5 * curve.sigma(flux)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                detected = flux > 5 * curves[0].sigma(flux)
             # the images of the study, by rates too
             reference_name = STUDY
             if RATES in tables and name not in (STUDY, RATES):
