@@ -4,6 +4,7 @@ import numpy as np
 
 from miricigale.evaluation import OUTLIER, bootstrap
 from miricigale.evaluation.estimates import median, scatter, weighted_share
+from miricigale.utils.missing_values import floats
 
 
 def _share(hits, population):
@@ -13,7 +14,7 @@ def _share(hits, population):
 
 def sky_weights(sources, agn_limit):
     """What each source counts for in one sky, shape (n,): an AGN one by all skies that its like are drawn from."""
-    agn = np.asarray(sources["frac_agn"], float) >= agn_limit
+    agn = floats(sources["frac_agn"]) >= agn_limit
     return np.where(agn, 1 / sources.meta.get("n_skies", 1), 1.0)
 
 
@@ -32,9 +33,9 @@ NUMBERS = {
 
 def columns_of(sources, agn_limit):
     """What the numbers are made of, by source."""
-    z = np.asarray(sources["redshift"], float)
-    f = np.asarray(sources["frac_agn"], float)
-    dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
+    z = floats(sources["redshift"])
+    f = floats(sources["frac_agn"])
+    dz = (floats(sources["redshift_mean"]) - z) / (1 + z)
     weight = sky_weights(sources, agn_limit)
     agn = f >= agn_limit
     # AGN of other skies are for completeness and purity
@@ -44,9 +45,9 @@ def columns_of(sources, agn_limit):
         "dz": first * dz,
         "known": compared,
         "outlier": compared & (np.abs(dz) > OUTLIER),
-        "z_std": first * np.asarray(sources["redshift_std"], float) / (1 + z),
-        "df": first * (np.asarray(sources["frac_agn_mean"], float) - f),
-        "f_std": first * np.asarray(sources["frac_agn_std"], float),
+        "z_std": first * floats(sources["redshift_std"]) / (1 + z),
+        "df": first * (floats(sources["frac_agn_mean"]) - f),
+        "f_std": first * floats(sources["frac_agn_std"]),
         "agn": weight * agn,
         "selected": weight * np.asarray(sources["selected"], bool),
         "found": weight * (agn & np.asarray(sources["selected"], bool)),

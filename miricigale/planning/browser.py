@@ -14,6 +14,7 @@ from miricigale.pages.browser import (
     source_pages,
 )
 from miricigale.plotting.axes import MEASURED, SECOND
+from miricigale.utils.missing_values import floats
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
@@ -109,13 +110,13 @@ def _list(planner, sources, plans):
         table[key] = np.asarray(sources[key], float)
         columns.append(list_column(key, "true", "of the simulated source", **options))
         for k, plan in enumerate(plans):
-            table[f"{key}_{k}"] = np.asarray(plan.sources[f"{key}_mean"], float)[:MAX_SOURCES]
+            table[f"{key}_{k}"] = floats(plan.sources[f"{key}_mean"])[:MAX_SOURCES]
             columns.append(list_column(f"{key}_{k}", plan.name, "mean of the posterior", **options))
     title = f"posterior probability of a fracAGN of at least {planner.config.agn.limit:g}"
     is_agn = np.asarray(sources["frac_agn"]) >= planner.config.agn.limit
     for k, plan in enumerate(plans):
         rows = plan.sources[:MAX_SOURCES]
-        table[f"agn_{k}"] = np.asarray(rows["agn_probability"], float)
+        table[f"agn_{k}"] = floats(rows["agn_probability"])
         columns.append(list_column(f"agn_{k}", plan.name, title, group="P(AGN)", digits=2))
         selected = np.asarray(rows["selected"], bool)
         table[f"found_{k}"] = is_agn & selected

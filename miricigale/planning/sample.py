@@ -7,7 +7,7 @@ from astropy.table import vstack
 from miricigale.refdata import resources
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error, config_error
-from miricigale.utils.missing_values import plain_floats
+from miricigale.utils.missing_values import floats, plain_floats
 from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
 from miricigale.utils.table_files import read_table
@@ -115,7 +115,7 @@ def _catalog_galaxies(config, executor):
     catalog = study_catalog(config.catalog)
     catalog = bright_sources(catalog, config.catalog, study.highres.filter)
     area = catalog_area(config, catalog)
-    redshift = np.asarray(catalog["redshift"], float)
+    redshift = floats(catalog["redshift"])
     chosen = (redshift >= options.redshift[0]) & (redshift <= options.redshift[1])
     catalog = _cut(catalog, chosen & ~np.asarray(catalog["star"], bool), "[sample] redshift")
     fit = {"model_error": config.fit.model_error, "executor": executor}
@@ -128,7 +128,7 @@ def _catalog_galaxies(config, executor):
     size = 2 * u.Quantity(catalog["half_light_radius"]).to_value(u.arcsec)
     sources["size"] = np.where(np.isfinite(size) & (size > 0), size, 0.0) * u.arcsec
     if "frac_agn" in catalog.colnames:
-        sources["frac_agn"] = np.asarray(catalog["frac_agn"], float)
+        sources["frac_agn"] = floats(catalog["frac_agn"])
     with np.errstate(divide="ignore", invalid="ignore"):
         luminosity = np.log10(sources["luminosity"].value)
         is_complete = np.isfinite(sources["mass"].value) & np.isfinite(luminosity)

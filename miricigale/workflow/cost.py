@@ -6,6 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.instrument import imager_columns
+from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import convert_values
 from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
@@ -109,7 +110,7 @@ class _Size:
         catalog = study_catalog(config.catalog)
         catalog = bright_sources(catalog, config.catalog, config.highres.filter)
         self.n = len(catalog)
-        redshifts = np.round(np.asarray(catalog["redshift"], float) / REDSHIFT_STEP)
+        redshifts = np.round(floats(catalog["redshift"]) / REDSHIFT_STEP)
         self.n_redshifts = len(np.unique(redshifts))
         wcs = grid_of(config, config.reduction.pixel_scale)
         inside = np.count_nonzero(wcs.footprint_contains(catalog["sky"]))

@@ -18,6 +18,7 @@ from miricigale.profiles import sersic_radius
 from miricigale.psf import psf_image, rotate_psf
 from miricigale.scene import CatalogFlags, Cutout, check_catalog, deconvolve
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without_none
 from miricigale.utils.random import stream
 from miricigale.utils.store import open_parts, write_parts
@@ -351,7 +352,7 @@ def _drawn(row, galaxies, seed):
     """Return the stamp of a galaxy drawn for a source, scaled and turned; None if none is like it."""
     galaxy = galaxies.resolved
     radius = row["half_light_radius"].to_value(ANGLE) * np.sqrt(row["axis_ratio"])
-    factors = radius / np.asarray(galaxy["radius"], float)
+    factors = radius / floats(galaxy["radius"])
     like = np.flatnonzero((factors >= SIZE_FACTORS[0]) & (factors <= SIZE_FACTORS[1]))
     if like.size == 0:
         return None

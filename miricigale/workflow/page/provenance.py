@@ -11,6 +11,7 @@ from miricigale.evaluation import CEERS_DUST
 from miricigale.pages import sentence
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
+from miricigale.utils.missing_values import floats
 from miricigale.workflow.background import background_text
 from miricigale.workflow.labels import band_label, texts_of
 from miricigale.workflow.stages.exposures import (
@@ -113,7 +114,7 @@ def catalog_facts(config, catalog):
         n = CEERS_DUST[sed.SEDModel.yang2021(agn=False).component("dust").name][-1]
         drawn = f"drawn from CEERS' distribution, measured on {n} sources"
         facts["dust colors"] = f"{drawn}, where no band of the fit of the input SED shows the dust"
-    has_redshift = np.asarray(catalog["redshift"], float) > 0
+    has_redshift = floats(catalog["redshift"]) > 0
     is_star = np.asarray(catalog["star"], bool)
     if n := np.count_nonzero(~has_redshift & ~is_star):
         facts["galaxies without redshift"] = f"{n}: without a model SED, and so on no image"

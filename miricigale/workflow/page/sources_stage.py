@@ -18,6 +18,7 @@ from miricigale.pages.browser import (
 )
 from miricigale.plotting.cutouts import Cutouts
 from miricigale.sed.cells import cell_means
+from miricigale.utils.missing_values import floats
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE, ab_magnitude
 from miricigale.workflow.engine.stage import stage
@@ -203,7 +204,7 @@ class _Sources(StudyTables):
         in_field = (selection & int(SampleFlags.OUTSIDE_FIELD)) == 0
         columns |= {"in_field": in_field, "sample": selection == 0}
         columns["left"] = in_field & (selection != 0)
-        z = np.asarray(truth["redshift"], float)
+        z = floats(truth["redshift"])
         for unit in self.compared:
             with np.errstate(invalid="ignore"):
                 columns[f"outlier_{unit}"] = (

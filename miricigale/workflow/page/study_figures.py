@@ -31,6 +31,7 @@ from miricigale.plotting.axes import (
     plain_text,
 )
 from miricigale.plotting.comparison import plot_offsets, plot_redshifts
+from miricigale.utils.missing_values import floats
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.labels import (
     SET_LABELS,
@@ -271,7 +272,7 @@ def detection_figure(study):
         groups = {"detected in the MIRI band": n_detected >= 1}
     if "mips.24" in table.colnames:
         groups["MIPS 24 µm above its limit"] = ab_magnitude(table["mips.24"]) < MIPS_LIMIT
-    z = np.asarray(table["redshift"], float)
+    z = floats(table["redshift"])
     power = table["ir_luminosity"].to_value(u.Lsun)
     good = reference.field & (power > 0) & np.isfinite(z)
     figure, [[ax]] = new_figure(size=(7.0, 3.8))

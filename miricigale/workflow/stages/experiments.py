@@ -7,6 +7,7 @@ from miricigale.evaluation import photoz_metrics, recovery_metrics
 from miricigale.evaluation.coverage import interval_share
 from miricigale.fitting import GridSettings
 from miricigale.photometry.errors.error_model import HERSCHEL_DEPTHS
+from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import convert_values
 from miricigale.workflow.derived import rows_of
 from miricigale.workflow.engine.stage import stage
@@ -102,7 +103,7 @@ def fit_experiment(context, unit):
         for column in light.colnames:
             mock[column] = light[column]
     elif name == "known_redshift":
-        redshift = np.asarray(sample["redshift"], float)
+        redshift = floats(sample["redshift"])
     elif name == "no_model_error":
         options["model_error"] = 0.0
     elif name == "between":
@@ -148,7 +149,7 @@ def experiment_numbers(sample, table):
     true = rows_of(sample, table["id"])
     photoz = photoz_metrics(true["redshift"], table["redshift_mean"])
     fraction = recovery_metrics(true["frac_agn"], table["frac_agn_mean"])
-    width = np.asarray(table["frac_agn_std"], float)
+    width = floats(table["frac_agn_std"])
     width = width[np.isfinite(width)]
     power = np.full(len(true), np.nan)
     if "accretion_power" in true.colnames and "accretion_power_mean" in table.colnames:
@@ -170,6 +171,6 @@ def experiment_numbers(sample, table):
         numbers["photoz_sigma_mad"] = np.nan
         numbers["photoz_outliers"] = np.nan
     for name in RANKED:
-        rank = np.asarray(table[f"{name}_rank"], float)
+        rank = floats(table[f"{name}_rank"])
         numbers[f"{name}_coverage"] = interval_share(rank)
     return numbers

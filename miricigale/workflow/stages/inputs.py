@@ -17,6 +17,7 @@ from miricigale.scene import read_catalog
 from miricigale.utils.caching import cached
 from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import convert_values, subset
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import ab_magnitude
@@ -320,7 +321,7 @@ def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False
     wanted = "leaves none of the catalog's bands"
     require(bands, "sed", "max_wavelength", wanted, options.max_wavelength)
     photometry = QTable({"id": catalog["id"]})
-    photometry["redshift"] = np.asarray(catalog["redshift"], float)
+    photometry["redshift"] = floats(catalog["redshift"])
     for name in bands:
         photometry[name] = catalog[name]
         photometry[error_column(name)] = measured_error(catalog, name, options.catalog_error)

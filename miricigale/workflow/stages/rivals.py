@@ -7,6 +7,7 @@ from astropy.table import QTable, vstack
 from miricigale import photometry
 from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_metrics
 from miricigale.evaluation.estimates import median
+from miricigale.utils.missing_values import floats
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.labels import texts_of
@@ -83,7 +84,7 @@ def rival_table(truth, matched, name, *, method, inside):
     true flux over the study's formal error; ``field`` marks the sources that were exposed (``inside``) and have
     a model.
     """
-    index = np.asarray(truth["sersic_index"], float)
+    index = floats(truth["sersic_index"])
     table = QTable({"id": truth["id"], "sky": truth["sky"]})
     table["flux_true"] = matched[f"{name}_true"]
     formal = matched[f"{name}_formal_err"]
@@ -111,7 +112,7 @@ def read_rivals(context):
 def _groups(table):
     """Yield kind and name of each group of sources in a table of a band, and which rows these are."""
     usable = np.asarray(table["field"]) & ~np.asarray(table["edge"])
-    snr = np.asarray(table["snr"], float)
+    snr = floats(table["snr"])
     crowded = np.asarray(table["crowded"])
     size = table["half_light_radius"].value
     shape = np.asarray(table["shape"])
@@ -201,7 +202,7 @@ def blind_offset(table, seed):
     """Estimate Source Extractor minus template fit (mag) of sources above 5 sigma: an `Estimate`."""
     blind = table["source_extractor"].value
     forced = table["yang2021"].value
-    good = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
+    good = np.asarray(table["field"]) & (floats(table["snr"]) > 5)
     good &= (blind > 0) & (forced > 0)
     delta = -2.5 * np.log10(blind[good] / forced[good])
     return bootstrap(median, delta, seed=seed)
@@ -232,7 +233,7 @@ def source_extractor_numbers(tables, seed):
     # errors of white noise in the paper's steps, as T-PHOT has them
     flux = table["yang2021"].value
     error = table[error_column("yang2021")].value
-    bright = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
+    bright = np.asarray(table["field"]) & (floats(table["snr"]) > 5)
     pulls = np.abs((flux - table["flux_true"].value) / error)[bright]
     white = bootstrap(lambda values: np.percentile(values, 99, axis=-1), pulls, seed=seed)
     numbers["errors.white"] = white

@@ -11,6 +11,7 @@ from scipy.ndimage import uniform_filter
 
 from miricigale.photometry import ErrorModel
 from miricigale.photometry.images.arrays import nearest_values
+from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import rows_of
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, error_column
@@ -147,7 +148,7 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts, cut
     flags = np.zeros(len(matched), int) + cuts
     matched["n_detected"] = detected_bands(matched, bands)
     has_model = np.all([np.isfinite(matched[f"{name}_true"].value) for name in bands], axis=0)
-    redshift = np.asarray(truth["redshift"], float)
+    redshift = floats(truth["redshift"])
     star = np.asarray(truth["star"], bool)
     flags[~np.asarray(inside)] |= SampleFlags.OUTSIDE_FIELD
     flags[star] |= SampleFlags.STAR

@@ -18,6 +18,7 @@ from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import file_place
 from miricigale.utils.meta import provenance
+from miricigale.utils.missing_values import floats
 from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
@@ -65,7 +66,7 @@ def galaxy_parameters(config, catalog, best, *, seed):
     where there is no measured flux.
     """
     table = QTable({"id": catalog["id"]})
-    table["redshift"] = np.asarray(catalog["redshift"], float)
+    table["redshift"] = floats(catalog["redshift"])
     for name in GALAXY_PARAMETERS + ("mass",):
         if f"{name}_best" in best.colnames:
             table[name] = best[f"{name}_best"]
@@ -144,7 +145,7 @@ def catalog_fractions(catalog):
     has_column = "frac_agn" in catalog.colnames
     wanted = "'catalog' needs a column frac_agn in the catalog"
     require(has_column, "sed", "frac_agn", wanted, catalog.colnames)
-    values = np.asarray(catalog["frac_agn"], float)
+    values = floats(catalog["frac_agn"])
     bad = values[~((values >= 0) & (values <= 0.99))]
     wanted = "'catalog' needs a column frac_agn of values between 0 and 0.99"
     got = f"{len(bad)} of {len(values)} others, {bad[:3]}"
