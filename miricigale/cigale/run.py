@@ -139,8 +139,10 @@ class _RunBands:
         columns = config["bands"]
         fitted, lost = band_filters(dict.fromkeys(map(_without_error, columns)), names)
         in_catalog = set(fitted.values())
-        others = [band for band in config["analysis_params"]["bands"] if band not in in_catalog]
-        predicted, lost_predictions = band_filters(dict.fromkeys(others), names)
+        other_bands = [
+            band for band in config["analysis_params"]["bands"] if band not in in_catalog
+        ]
+        predicted, lost_predictions = band_filters(dict.fromkeys(other_bands), names)
         hard = set()
         for name in fitted | predicted:
             if xray_energies(name) and name not in names:

@@ -61,12 +61,12 @@ def _nearest_command(name, names):
 
 def _nearest_option(flag, names):
     """Say which option of a command may be meant, or that an argument has none."""
-    bare = flag.lstrip("-")
-    argument = bare.replace("-", "_").upper()
+    word_typed = flag.lstrip("-")
+    argument = word_typed.replace("-", "_").upper()
     if argument in names:
         return f"; {argument} has no option before it"
     flags = [name for name in names if name.startswith("-")]
-    word = bare.replace("_", "-")
+    word = word_typed.replace("_", "-")
     for name in _other_names("options").get(word, ()):
         if name in flags:
             return _meant(name)
@@ -74,12 +74,12 @@ def _nearest_option(flag, names):
     if option in flags:
         return f"; {sentence}"
     # the last word of an option, such as --unit for --flux-unit
-    ending = [name for name in flags if name.endswith("-" + bare)]
+    ending = [name for name in flags if name.endswith("-" + word_typed)]
     if len(ending) == 1:
         return _meant(ending[0])
     # the dashes that all have make short names seem alike
     full_names = {name.lstrip("-"): name for name in flags}
-    close = difflib.get_close_matches(bare, full_names, n=1, cutoff=0.65)
+    close = difflib.get_close_matches(word_typed, full_names, n=1, cutoff=0.65)
     if close:
         return _meant(full_names[close[0]])
     return ""

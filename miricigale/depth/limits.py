@@ -198,9 +198,9 @@ def aperture_noise(
     white_noise = n_sigma**2 * variance * white / (light * electrons) ** 2
     residual_noise = (n_sigma * amplitude * sky / (light * electrons)) ** 2 * pattern / n_dithers
 
-    def limit(known):
+    def limit(value):
         # F^2 = n^2 (V + growth shot F), solved for F
-        return float((shot_noise + np.sqrt(shot_noise**2 + 4 * known)) / 2)
+        return float((shot_noise + np.sqrt(shot_noise**2 + 4 * value)) / 2)
 
     return {
         "flux": limit(white_noise + residual_noise),
@@ -292,8 +292,11 @@ def sensitivity(
     24.91 mag(AB) {'method': 'aperture'}
     """
     if isinstance(filter, (list, tuple, FilterSet)):
-        more = {"method": method, "excess": excess, "residual": residual, "n_dithers": n_dithers}
-        limits = [sensitivity(one, time, n_sigma=n_sigma, **more, **options) for one in filter]
+        settings = {"method": method, "excess": excess, "residual": residual}
+        settings |= {"n_dithers": n_dithers}
+        limits = [
+            sensitivity(band, time, n_sigma=n_sigma, **settings, **options) for band in filter
+        ]
         return u.Quantity(limits)
     if isinstance(filter, Exposure):
         exposure = filter

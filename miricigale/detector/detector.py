@@ -56,10 +56,10 @@ _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
 def _effect_class(name):
     """Return the class of effects of a name, in any spelling: CosmicRays, cosmic_rays, "cosmic rays"."""
     classes = {kind.__name__.lower(): kind for kind in ORDER}
-    bare = re.sub(r"[\s_-]", "", name).lower()
-    if bare not in classes:
+    plain_name = re.sub(r"[\s_-]", "", name).lower()
+    if plain_name not in classes:
         raise unknown_name("effect", name, [kind.__name__ for kind in ORDER])
-    return classes[bare]
+    return classes[plain_name]
 
 
 @takes_other_keywords

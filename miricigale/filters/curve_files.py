@@ -264,8 +264,8 @@ def _counts_energy(comments, kinds):
     """Whether a curve is of a detector that counts energy, by the first of CIGALE's kinds or another comment."""
     if kinds and kinds[0] == "energy":
         return True
-    stated = _DETECTOR.search("\n".join(comments))
-    return stated is not None and _ENERGY.match(stated[1]) is not None
+    detector = _DETECTOR.search("\n".join(comments))
+    return detector is not None and _ENERGY.match(detector[1]) is not None
 
 
 def _unit_beside_kind(comments, path):

@@ -300,9 +300,10 @@ def _our_names(colnames, bands, argument):
     if ids is not None:
         columns["id"] = ids
     for name in columns:
-        same = [other for other in colnames if other.lower() == name.lower()]
+        namesakes = [label for label in colnames if label.lower() == name.lower()]
         if name != "id":
-            check_that(len(same) == 1, argument, f"a table with one column for {name!r}", same)
+            wanted = f"a table with one column for {name!r}"
+            check_that(len(namesakes) == 1, argument, wanted, namesakes)
     unmatched = [name for name in colnames if name not in columns and name != ids]
     logarithmic = [name for name in unmatched if _MAGNITUDE.match(name_and_unit(name)[0])]
     linear = [name for name in unmatched if name not in logarithmic]
@@ -381,8 +382,8 @@ def _is_ab(table, name):
         return False
     unit = getattr(table[name], "unit", None)
     if unit is None:
-        plain, unit = name_and_unit(name)
+        label, unit = name_and_unit(name)
         if unit is None:
-            return _MAGNITUDE.match(plain) is not None
+            return _MAGNITUDE.match(label) is not None
     # columns of astropy keep a name such as "ABmag" as text
     return (flux_unit(unit) or unit) == u.ABmag

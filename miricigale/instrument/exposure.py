@@ -105,9 +105,9 @@ def _counts_of(filter, time, group, n_integrations, max_fill=0.6, max_groups=100
         longest = min(
             max(2, math.floor(max_fill * fills)), check_count(max_groups, "max_groups", 2)
         )
-        least = math.ceil(groups / longest)
+        n_least = math.ceil(groups / longest)
         # one more, or up to a tenth, if they come nearer
-        choices = range(least, least + max(2, least // 10 + 1))
+        choices = range(n_least, n_least + max(2, n_least // 10 + 1))
     counts = [(max(2, round(groups / n)), n) for n in choices]
     return min(counts, key=lambda pair: abs(math.prod(pair) - groups))
 

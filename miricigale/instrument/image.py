@@ -65,7 +65,7 @@ class Image(Interactive, CCDData):
         facts += [str(self.unit), str(self.meta.get("filter") or "")]
         if self._has_sky:
             facts.append(self._center.to_string("hmsdms", precision=1))
-        return f"<Image {', '.join(one for one in facts if one)}>"
+        return f"<Image {', '.join(fact for fact in facts if fact)}>"
 
     __str__ = __repr__
 
@@ -133,12 +133,12 @@ class Image(Interactive, CCDData):
 
     def _facts(self):
         ny, nx = self.shape
-        known = {} if self.mask is None else {"masked": f"{100 * np.mean(self.mask):.3g} %"}
+        entries = {} if self.mask is None else {"masked": f"{100 * np.mean(self.mask):.3g} %"}
         if self._has_sky:
-            known["center"] = self._center.to_string("hmsdms")
+            entries["center"] = self._center.to_string("hmsdms")
         shown = ("filter", "subarray", "n_exposures", "exposure_time", "background", "steps")
-        known |= {name.replace("_", " "): self.meta[name] for name in shown if name in self.meta}
-        return {"pixels": f"{ny} x {nx}", "unit": self.unit, **known}
+        entries |= {name.replace("_", " "): self.meta[name] for name in shown if name in self.meta}
+        return {"pixels": f"{ny} x {nx}", "unit": self.unit, **entries}
 
     def plot(self, ax=None, **kwargs):
         """

@@ -96,8 +96,8 @@ def make_sample(config, bands, *, executor=None):
         n_other = min(_MAX_DRAWS // len(sources), _MAX_SKIES)
         n_skies += n_other
         limit = config.agn.limit
-        others, _ = other_skies(sources, model, band, n_other, min_frac_agn=limit, seed=seed)
-        sources = vstack([sources, others], metadata_conflicts="silent")
+        agn_elsewhere, _ = other_skies(sources, model, band, n_other, min_frac_agn=limit, seed=seed)
+        sources = vstack([sources, agn_elsewhere], metadata_conflicts="silent")
     light = library_fluxes(model, sources, list(bands))
     for name in bands:
         sources[name] = light[name]

@@ -323,10 +323,10 @@ def header_grid(header):
     `~miricigale.utils.exceptions.PSFWarning`
         If two of these differ: which counts.
     """
-    stated = {}
+    scales = {}
     for key in ("PIXELSCL", "PIXSCALE"):
         if isinstance(header.get(key), (int, float)) and header[key] > 0:
-            stated[key] = float(header[key])
+            scales[key] = float(header[key])
     wcs = None
     if "CTYPE1" in header:
         wcs = header_wcs(header, where="the PSF or kernel")
@@ -343,10 +343,10 @@ def header_grid(header):
         if not str(wcs.wcs.lngtyp).startswith("RA"):
             angle = float(grid_angle(wcs, (header["NAXIS2"], header["NAXIS1"])).value)
         cell = float(np.sqrt(b * c - a * d)) * 3600
-        _warn_of_contradiction({"world coordinates": cell} | stated)
+        _warn_of_contradiction({"world coordinates": cell} | scales)
         return cell, angle
-    _warn_of_contradiction(stated)
-    return next(iter(stated.values()), None), None
+    _warn_of_contradiction(scales)
+    return next(iter(scales.values()), None), None
 
 
 def _check_square(matrix):
@@ -363,8 +363,8 @@ def _warn_of_contradiction(scales):
     """Warn if scales of pixels (arcsec), by what states them, differ."""
     if not scales:
         return
-    first, *others = scales
-    for name in others:
+    first, *further_names = scales
+    for name in further_names:
         if abs(scales[name] / scales[first] - 1) > _SAME_SCALE:
             msg = (
                 f"the header of the PSF or kernel states pixels of {scales[first]:.4g} arcsec ({first}) and of "

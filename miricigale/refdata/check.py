@@ -73,19 +73,19 @@ def _state(record):
     path = find_place(record)[1]
     if path is None:
         return ResourceState(name, "absent", record.source)
-    where = str(path)
+    place = str(path)
     try:
         record_file = stored_record(path)
         if name in READERS:
             verify_library(path, name)
         wanted = record.sha256 or (record_file or {}).get("sha256", "")
         if not wanted:
-            return ResourceState(name, "unchecked", where, "no record of its checksum")
+            return ResourceState(name, "unchecked", place, "no record of its checksum")
         if file_sha256(path) != wanted:
-            return ResourceState(name, "wrong checksum", where, "sha256 differs from its record")
+            return ResourceState(name, "wrong checksum", place, "sha256 differs from its record")
     except OSError as err:
         message = str(err)
         if not isinstance(err, DataError):
             message = f"{path} cannot be read: {err}"
-        return ResourceState(name, "damaged", where, message)
-    return ResourceState(name, "ok", where)
+        return ResourceState(name, "damaged", place, message)
+    return ResourceState(name, "ok", place)

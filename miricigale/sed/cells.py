@@ -41,6 +41,6 @@ def cell_means(x, y, edges):
     integral = cumulative_trapezoid(y, x, initial=0.0)
     step = np.clip(np.searchsorted(x, edges, side="right") - 1, 0, width.size - 1)
     slope = (y[step + 1] - y[step]) / width[step]
-    beyond = edges - x[step]
-    at_edges = integral[step] + beyond * (y[step] + 0.5 * slope * beyond)
+    distance = edges - x[step]
+    at_edges = integral[step] + distance * (y[step] + 0.5 * slope * distance)
     return np.diff(at_edges) / np.diff(edges)

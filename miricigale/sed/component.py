@@ -278,21 +278,24 @@ def in_order(components):
     if isinstance(components, (str, Mapping)):
         wanted = "a list of components or names (SEDModel.from_dict takes tables of them)"
         raise argument_error("components", wanted, type(components).__name__)
-    components = [named_component(one) if isinstance(one, str) else one for one in components]
-    for one in components:
+    parts = []
+    for component in components:
+        if isinstance(component, str):
+            component = named_component(component)
         wanted = "Component instances or names"
-        check_that(isinstance(one, Component), "components", wanted, repr(one))
-    components = tuple(sorted(components, key=lambda one: ROLES.index(one.role)))
-    roles = [one.role for one in components]
+        check_that(isinstance(component, Component), "components", wanted, repr(component))
+        parts.append(component)
+    components = tuple(sorted(parts, key=lambda part: ROLES.index(part.role)))
+    roles = [component.role for component in components]
     for role, name in (("sfh", "age"), ("stellar", "metallicity")):
         check_that(role in roles, "components", f"with a component of role {role!r}", roles)
-        one = components[roles.index(role)]
+        component = components[roles.index(role)]
         wanted = f"with a parameter {name!r} in the {role!r} component"
-        check_that(name in one.parameters, "components", wanted, one)
+        check_that(name in component.parameters, "components", wanted, component)
     check_that(len(set(roles)) == len(roles), "components", "at most one of each role", roles)
-    for role, other in (("dust", "attenuation"), ("xray", "agn")):
-        good = role not in roles or other in roles
-        check_that(good, "components", f"with {other!r} if there is {role!r}", roles)
+    for role, needed_role in (("dust", "attenuation"), ("xray", "agn")):
+        good = role not in roles or needed_role in roles
+        check_that(good, "components", f"with {needed_role!r} if there is {role!r}", roles)
     return components
 
 

@@ -268,8 +268,8 @@ class SEDModel(Interactive):
             wanted = "Component instances or names"
             check_that(isinstance(component, Component), "components", wanted, component)
             new[component.role] = component
-        kept = [component for component in self.components if component.role not in new]
-        return self._of_components([*kept, *new.values()])
+        unchanged = [component for component in self.components if component.role not in new]
+        return self._of_components([*unchanged, *new.values()])
 
     def _of_components(self, components):
         """Model of other components, with the cosmology and the AGN fractions of this one."""

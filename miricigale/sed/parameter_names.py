@@ -54,17 +54,17 @@ def by_our_names(values, known=(), *, short=False):
     usual_names = _OTHER_NAMES
     if short:
         usual_names = _OTHER_NAMES | _OTHER_ARGUMENTS
-    others = {}
+    foreign_names = {}
     for theirs, ours in usual_names.items():
         if theirs not in known:
-            others[theirs] = (ours, "")
+            foreign_names[theirs] = (ours, "")
     our_names = (*known, LIVING_MASS)
     for theirs, meaning in _cigale_parameters(our_names, short=short).items():
         if theirs not in known:
-            others.setdefault(theirs, meaning)
+            foreign_names.setdefault(theirs, meaning)
     out = values.copy()
-    for theirs in [name for name in names if name in others]:
-        ours, unit = others[theirs]
+    for theirs in [name for name in names if name in foreign_names]:
+        ours, unit = foreign_names[theirs]
         if ours in names:
             continue
         value = out[theirs]
@@ -93,10 +93,10 @@ def _cigale_parameters(known, short):
     counts = Counter(name.partition(".")[2] for name in meanings)
     without_module = {}
     for name, meaning in meanings.items():
-        bare = name.partition(".")[2]
+        short_name = name.partition(".")[2]
         # such as the temperature of both kinds of dust
-        if counts[bare] == 1:
-            without_module[bare] = meaning
+        if counts[short_name] == 1:
+            without_module[short_name] = meaning
     return meanings | without_module
 
 
@@ -110,9 +110,9 @@ def check_parameters(names, model):
         Whose message says which components have such a parameter, and what stands in their place in the model; or
         what to write in place of a name of other programs; or lists the parameters.
     """
-    known = [*model.parameters, LIVING_MASS]
+    known_names = [*model.parameters, LIVING_MASS]
     for name in names:
-        if name in known:
+        if name in known_names:
             continue
         sentences = declared("miricigale.sed", "parameter_hints.toml")["sentences"]
         by_lower_case = {label.lower(): sentence for label, sentence in sentences.items()}
@@ -123,7 +123,7 @@ def check_parameters(names, model):
         ours, owners = _components_with(name)
         if owners:
             raise _parameter_of_others(name, ours, owners, model)
-        check_names([name], "parameter", known)
+        check_names([name], "parameter", known_names)
 
 
 def _components_with(name):
@@ -149,10 +149,11 @@ def _parameter_of_others(name, ours, owners, model):
         if component.role in roles:
             names = ", ".join(component.parameters) or "no parameters"
             in_place.append(f"{component.name} ({names})")
-    has = "no such component"
+    in_model = "no such component"
     if in_place:
-        has = " and ".join(in_place)
-    msg = f"no parameter {name!r} in this model: it is of {' and '.join(owners)}{own_name}; the model has {has}"
+        in_model = " and ".join(in_place)
+    msg = f"no parameter {name!r} in this model: it is of {' and '.join(owners)}{own_name}; "
+    msg += f"the model has {in_model}"
     return KeyError(msg)
 
 

@@ -249,9 +249,9 @@ def _photosphere(atmosphere):
     wave = atmosphere.rest_wavelength.to_value(WAVE)
     fnu = atmosphere.fnu.to_value(FNU)
     # 1 % in wavelength, over lines
-    near = np.abs(wave / _OPTICAL - 1.0) < 0.005
-    check_that(near.any(), "atmosphere", "with points near 0.51 um", atmosphere)
-    optical = fnu[near].mean()
+    in_window = np.abs(wave / _OPTICAL - 1.0) < 0.005
+    check_that(in_window.any(), "atmosphere", "with points near 0.51 um", atmosphere)
+    optical = fnu[in_window].mean()
     check_that(optical > 0, "atmosphere", "with light at 0.51 um", f"{optical:g} uJy")
     # libraries have narrow absorption lines, which are finer than the points
     edges = edges_around(_WAVE_UM)

@@ -330,9 +330,9 @@ class SED(Frozen, WithTable):
         """
         if isinstance(flux, u.Magnitude):
             flux = flux.to(FNU)
-        now = self.synthetic_flux(band)
-        check_that(now > 0, "band", "one in which the spectrum has light", band)
-        return self * float(to_array(flux, FNU, "flux", ndim=0) / now.to_value(FNU))
+        flux_before = self.synthetic_flux(band)
+        check_that(flux_before > 0, "band", "one in which the spectrum has light", band)
+        return self * float(to_array(flux, FNU, "flux", ndim=0) / flux_before.to_value(FNU))
 
     def color(self, blue, red):
         """AB magnitude in one band less that in another."""

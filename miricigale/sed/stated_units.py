@@ -82,10 +82,10 @@ def _flux_unit(texts, path):
     for text in texts:
         match = _FLUX.search(text) or _ENDING.search(text)
         if match is not None:
-            stated = _ANGSTROM.sub("Angstrom", match["unit"])
+            unit_text = _ANGSTROM.sub("Angstrom", match["unit"])
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", u.UnitsWarning)
-                unit = flux_unit(stated) or u.Unit(stated, parse_strict="silent")
+                unit = flux_unit(unit_text) or u.Unit(unit_text, parse_strict="silent")
             if isinstance(unit, u.UnrecognizedUnit):
                 problem = f"names {match['unit']!r} as the unit of its fluxes, which is none that is known"
                 raise data_error(path, problem)

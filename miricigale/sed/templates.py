@@ -92,8 +92,8 @@ def _read_file(file):
     gravities = [name for name in fluxes if re.fullmatch(r"g\d\d", name)]
     with file_errors(file, "cannot be read as a spectrum"):
         # NaN where a value is lacking, which is none of a spectrum
-        stated = _stated(file, table)
-        wave_unit = stated[0] or u.AA
+        units = _stated(file, table)
+        wave_unit = units[0] or u.AA
         wave = plain_floats(table[first], first, "spectrum")
         wave = wave * unit_of_wavelengths(table[first].unit or wave_unit)
         endings = "|".join(map(re.escape, _SUFFIXES))
@@ -114,7 +114,7 @@ def _read_file(file):
                         name = stem
                     else:
                         name = f"{stem}[{part}]"
-                    unit = unit_of_fluxes(table[column].unit or stated[1] or FLAM)
+                    unit = unit_of_fluxes(table[column].unit or units[1] or FLAM)
                     out[name] = SED(wave, flux * unit)
         return out
 

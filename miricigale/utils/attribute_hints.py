@@ -85,12 +85,12 @@ def attribute_hint(cls, name, names):
     if name in sentences:
         return sentences[name]
     public = [candidate for candidate in names if not candidate.startswith("_")]
-    near = near_names(name, public)
-    if near:
-        return f"did you mean {' or '.join(map(repr, near))}?"
-    near = names_sharing_words(name, sentences)
-    if near:
-        return sentences[near[0]]
+    suggestions = near_names(name, public)
+    if suggestions:
+        return f"did you mean {' or '.join(map(repr, suggestions))}?"
+    suggestions = names_sharing_words(name, sentences)
+    if suggestions:
+        return sentences[suggestions[0]]
     if _OTHERWISE in sentences:
         return sentences[_OTHERWISE]
     if len(public) <= _MAX_LISTED:
@@ -110,24 +110,24 @@ def names_sharing_words(name, candidates):
     """Return the names that share most words with a name, the shortest first; none if no word is shared."""
     wanted = _words(name)
     shared = {candidate: len(wanted & _words(candidate)) for candidate in candidates}
-    most = max(shared.values(), default=0)
-    if most == 0:
+    n_most = max(shared.values(), default=0)
+    if n_most == 0:
         return []
-    return sorted((n for n in shared if shared[n] == most), key=lambda n: (len(n), n))
+    return sorted((n for n in shared if shared[n] == n_most), key=lambda n: (len(n), n))
 
 
 def _words(name):
     """Words of a name, each as the first one of those of the same meaning."""
-    same = _same_words()
-    words = [word for word in name.lower().split("_") if len(word) > 1 or word in same]
-    return {same.get(word, word) for word in words if word not in _EMPTY_WORDS}
+    synonyms = _same_words()
+    words = [word for word in name.lower().split("_") if len(word) > 1 or word in synonyms]
+    return {synonyms.get(word, word) for word in words if word not in _EMPTY_WORDS}
 
 
 @cached
 def _same_words():
     """First word of the same meaning by word."""
-    same = {}
+    synonyms = {}
     for words in declared("miricigale.utils", "hints.toml")["words"]["same"]:
         for word in words:
-            same[word] = words[0]
-    return same
+            synonyms[word] = words[0]
+    return synonyms

@@ -90,15 +90,15 @@ def curve_columns(table, value_name, path):
     """
     waves = [name for name in table.colnames if _is_wave(table, name)]
     wave = (waves or table.colnames)[0]
-    others = [name for name in table.colnames if name != wave and not is_quality(name)]
-    named = [name for name in others if value_name.search(name)]
+    candidates = [name for name in table.colnames if name != wave and not is_quality(name)]
+    named = [name for name in candidates if value_name.search(name)]
     # "flux" beside "flux_of_lines"
     exact = [name for name in named if value_name.fullmatch(name)]
     if len(exact) == 1:
         named = exact
     problem = f"has several columns that may be meant, {', '.join(named)}: leave one of them"
     check_data(len(named) < 2, path, problem)
-    values = named or others
+    values = named or candidates
     check_data(values, path, f"has not two columns with a curve, only {', '.join(table.colnames)}")
     return wave, values[0]
 

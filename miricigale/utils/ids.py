@@ -103,10 +103,10 @@ def likely_ids(table):
     names = []
     for name in table.colnames:
         kind = getattr(getattr(table[name], "dtype", None), "kind", "")
-        plain = _plain_name(name)
+        stem = _plain_name(name)
         looks = _ID_PART.search(name) or _ID_END.search(name)
         # source_name, objname
-        looks = looks or plain in _LIKELY or plain.endswith("name")
+        looks = looks or stem in _LIKELY or stem.endswith("name")
         if looks and kind in "iufUSO" and table[name].ndim == 1 and _is_distinct(table[name]):
             names.append(name)
     return names

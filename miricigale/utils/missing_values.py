@@ -43,7 +43,7 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
     largest = _MAX_VALUE
     if magnitudes:
         largest = _MAX_MAGNITUDE
-    beyond = np.isfinite(values) & (np.abs(values) >= largest)
+    too_large = np.isfinite(values) & (np.abs(values) >= largest)
     further = np.asarray(list(further), float)
     named = np.isin(values, further)
     none = np.zeros(np.shape(values), bool)
@@ -51,7 +51,7 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
         zero = none
         if magnitudes:
             zero = values == 0
-        return (code & (magnitudes | (values < 0))) | zero | named | beyond, none
+        return (code & (magnitudes | (values < 0))) | zero | named | too_large, none
     repeats_value = errors == values
     size = np.abs(values)
     coded = is_code(errors)
@@ -61,7 +61,7 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
     no_error |= np.isfinite(errors) & (np.abs(errors) >= largest)
     zero = (values == 0) & (~(errors > 0) if magnitudes else errors == 0)
     missing = code & (((values < 0) & (coded | ~noise)) | magnitudes | repeats_value)
-    return missing | zero | named | beyond, no_error
+    return missing | zero | named | too_large, no_error
 
 
 def negative_codes(values, errors):

@@ -41,15 +41,15 @@ def module_hint(module, name):
     hints = declared("miricigale.utils", "module_hints.toml")
     if name in hints["sentences"]:
         return hints["sentences"][name]
-    here = importlib.import_module(module).__all__
-    suggestions = difflib.get_close_matches(name, here, n=1, cutoff=0.82)
+    public_names = importlib.import_module(module).__all__
+    suggestions = difflib.get_close_matches(name, public_names, n=1, cutoff=0.82)
     if not suggestions:
         suggestions = _names_elsewhere(name)
     subject = module.rpartition(".")[2]
     if not suggestions:
         # the subject of the subpackage stands in most of its names
         words = [word for word in name.split("_") if word.lower() != subject]
-        suggestions = names_sharing_words("_".join(words), here)
+        suggestions = names_sharing_words("_".join(words), public_names)
     if not suggestions:
         return hints["subpackages"].get(subject, "")
     return f"did you mean {' or '.join(map(repr, suggestions[:_MAX_NAMES]))}?"

@@ -354,8 +354,10 @@ def _by_plain_name(colnames):
 
 def _check_only(colnames, name, argument):
     """Refuse a column of a position beside another one whose name differs in case alone."""
-    same = [other for other in colnames if other.lower() == name.lower()]
-    check_that(len(same) == 1, argument, f"a table with one column {name.lower()!r}", same)
+    namesakes = [label for label in colnames if label.lower() == name.lower()]
+    check_that(
+        len(namesakes) == 1, argument, f"a table with one column {name.lower()!r}", namesakes
+    )
 
 
 def _sky_degrees(table, pair, argument):

@@ -143,9 +143,9 @@ def _unmark_first_name(table):
     if not table.colnames:
         return
     first = table.colnames[0]
-    plain = first.lstrip("# ")
-    if first.startswith("#") and plain and plain not in table.colnames:
-        table.rename_column(first, plain)
+    stem = first.lstrip("# ")
+    if first.startswith("#") and stem and stem not in table.colnames:
+        table.rename_column(first, stem)
 
 
 def _numbers_among_words(table, id_names):

@@ -240,14 +240,14 @@ def without_comments(source, path, separator):
     lines = _lines(source, path)
     header = next((line for line in lines if line.strip()), "")
     n_cells = header.count(separator)
-    kept = []
+    rows = []
     for line in lines:
         is_comment = (
             line.startswith("#") and line is not header and line.count(separator) != n_cells
         )
         if not is_comment:
-            kept.append(line)
-    return kept
+            rows.append(line)
+    return rows
 
 
 def _has_mark(path):
@@ -308,9 +308,9 @@ def same_values(first, second):
     values = [np.ma.getdata(np.ma.asarray(column)) for column in (first, second)]
     if values[0].shape != values[1].shape or not np.array_equal(*masks):
         return False
-    there = [array[~masks[0]] for array in values]
-    are_floats = all(array.dtype.kind == "f" for array in there)
-    return np.array_equal(*there, equal_nan=are_floats)
+    present = [array[~masks[0]] for array in values]
+    are_floats = all(array.dtype.kind == "f" for array in present)
+    return np.array_equal(*present, equal_nan=are_floats)
 
 
 def differ(name):

@@ -80,9 +80,9 @@ class _Curve:
         while True:
             zero, integral = self.at(np.linspace(self.wave[0], self.wave[-1], n + 1))
             out = np.column_stack([integral, zero * (width / n)])
-            between = (np.arange(n)[:, None] + parts).ravel()
-            _, exact = self.at(self.wave[0] + between * (width / n))
-            error = np.abs(_cubic(out, between) - exact).max()
+            midpoints = (np.arange(n)[:, None] + parts).ravel()
+            _, exact = self.at(self.wave[0] + midpoints * (width / n))
+            error = np.abs(_cubic(out, midpoints) - exact).max()
             if n == MAX_CELLS or error <= _ERROR * width * self.zero[-1]:
                 return out
             n *= 2

@@ -28,15 +28,15 @@ def weighted_sums(weights, spectra):
             for i in rows:
                 if weights[i, k] != 0.0:
                     has_weight[k] = True
-        used = np.flatnonzero(has_weight)
-        four = used.size - used.size % 4
+        weighted = np.flatnonzero(has_weight)
+        four = weighted.size - weighted.size % 4
         for first in range(0, n_wave, _TILE):
             last = min(first + _TILE, n_wave)
             for k in range(0, four, 4):  # added one after the other, whatever their number
-                a = used[k]
-                b = used[k + 1]
-                c = used[k + 2]
-                d = used[k + 3]
+                a = weighted[k]
+                b = weighted[k + 1]
+                c = weighted[k + 2]
+                d = weighted[k + 3]
                 p = spectra[a, first:last]
                 q = spectra[b, first:last]
                 r = spectra[c, first:last]
@@ -51,10 +51,10 @@ def weighted_sums(weights, spectra):
                     total = out[i, first:last]
                     for j in range(last - first):
                         total[j] = (((total[j] + w * p[j]) + x * q[j]) + y * r[j]) + z * s[j]
-            for k in range(four, used.size):
-                p = spectra[used[k], first:last]
+            for k in range(four, weighted.size):
+                p = spectra[weighted[k], first:last]
                 for i in rows:
-                    w = weights[i, used[k]]
+                    w = weights[i, weighted[k]]
                     total = out[i, first:last]
                     for j in range(last - first):
                         total[j] += w * p[j]
