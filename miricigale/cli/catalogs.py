@@ -139,7 +139,7 @@ def photometry(args):
 
     paths, prior = _image_paths(args)
     images = images_of(args, paths)
-    (highres,) = images_of(args, [prior], "highres_")
+    highres = _prior_of(args, prior)
     if args.kernel:
         args.kernel = [None if name == "-" else name for name in args.kernel]
     to_screen = str(args.output) == "-"
@@ -170,17 +170,37 @@ def photometry(args):
     return 0
 
 
+def _prior_of(args, path):
+    """Return the prior with its options, or None where sources are points."""
+    if path is not None:
+        (highres,) = images_of(args, [path], "highres_")
+        return highres
+    names = [name for name in vars(args) if name.startswith("highres_")]
+    refuse(args, names, "left out without a high-resolution image")
+    refuse(args, ("patches",), "left out without a high-resolution image")
+    return None
+
+
 def _image_paths(args):
-    """Return the paths of the images and that of the prior, of options or of positional arguments."""
+    """
+    Return the paths of the images and that of the prior, of options or of positional arguments.
+
+    The prior is None where a catalog is given with a single image, or with images by option.
+    """
     if args.positional and not (args.image or args.highres):
         *paths, prior = args.positional
         if paths:
             return paths, prior
+        if args.catalog is not None:
+            return [prior], None
+    elif args.image and not args.positional and args.catalog is not None and not args.highres:
+        return args.image, None
     elif args.image and args.highres and not args.positional and len(args.highres) == 1:
         return args.image, args.highres[0]
     msg = (
         "give the images and, last, the high-resolution image (the prior): miricigale photometry "
-        "f770w.fits f444w.fits; or both by option, --image and --highres"
+        "f770w.fits f444w.fits; or both by option, --image and --highres; or an image and --catalog "
+        "for points at its positions"
     )
     raise ValueError(msg)
 

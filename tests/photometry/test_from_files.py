@@ -18,7 +18,7 @@ from helpers.mosaics import disks, render
 from miricigale.cli import main
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.instrument.image_files import write_image
-from miricigale.photometry import ForcedFlags, read_mosaic
+from miricigale.photometry import ForcedFlags, ForcedPhotometer, read_mosaic
 from miricigale.utils.exceptions import MiricigaleWarning
 
 CENTER = SkyCoord(34.3, -5.1, unit="deg")
@@ -137,6 +137,37 @@ def test_catalog_kernel_and_the_plain_form(files, tmp_path):
         found.append(table[BAND].to_value(u.uJy))
         assert_allclose(found[-1], files.flux[order], rtol=0.03, atol=0.2)
     assert_allclose(*found, rtol=0.01, atol=0.02)
+
+
+def test_positions_of_a_catalog_are_measured_as_points_without_a_prior(files, tmp_path, capsys):
+    catalog = files.folder / "positions.csv"
+    positions = {"id": files.ids, "ra": files.sky.ra.deg, "dec": files.sky.dec.deg}
+    Table(positions).write(catalog)
+    output = tmp_path / "points.ecsv"
+    options = ["--catalog", str(catalog), "--filter", BAND, "--psf", files.paths["psf"]]
+    options += ["--weight", files.paths["weight"], "--output", str(output), "--no-progress"]
+    assert main(["photometry", files.paths["image"], *options]) == 0
+    table = QTable.read(output)
+    pulls = (table[BAND].value - files.flux) / np.hypot(
+        table[f"{BAND}_err"].value, 0.01 * files.flux
+    )
+    assert np.abs(pulls).max() < 4
+    assert "points at the positions of a catalog" in output.with_suffix(".html").read_text()
+    # the same as in Python, but for the background that files are fitted with
+    image = read_mosaic(files.paths["image"], weight=files.paths["weight"], filter=BAND)
+    psf = (fits.getdata(files.paths["psf"]), COARSE * u.arcsec)
+    points = ForcedPhotometer(psf=psf, background_order=0).measure(image, files.sky)
+    assert_allclose(table[BAND], points.flux, rtol=0.01, atol=0.01 * u.uJy)
+    for wrong, message in (
+        (["--segmentation", "seg.fits"], "--segmentation must be left out without a high-res"),
+        (["--highres-filter", "F444W"], "--highres-filter must be left out without a high-res"),
+        (["--patches", "parts"], "--patches must be left out without a high-resolution image"),
+    ):
+        again = ["photometry", files.paths["image"], *options, "--overwrite", *wrong]
+        assert main(again) == 2
+        assert message in capsys.readouterr().err
+    assert main(["photometry", files.paths["image"], "--filter", BAND]) == 2
+    assert "or an image and --catalog" in capsys.readouterr().err
 
 
 @pytest.mark.slow

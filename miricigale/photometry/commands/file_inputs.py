@@ -222,10 +222,14 @@ class Inputs:
 
     def measure(self, pixels, photometers, segments, sources):
         """Measure the sources: a `Measurement`."""
+        results = self._results(pixels, photometers, segments, sources)
+        return Measurement(self, pixels, photometers, segments, results)
+
+    def _results(self, pixels, photometers, segments, sources):
+        """Return the `~miricigale.photometry.ForcedPhotometryResult` of each band: dict by name of the filter."""
         from miricigale.photometry.fit.bands import measure_prior
 
-        results = measure_prior(pixels.images, photometers, pixels.prior, segments, sources)
-        return Measurement(self, pixels, photometers, segments, results)
+        return measure_prior(pixels.images, photometers, pixels.prior, segments, sources)
 
 
 def short_band(band):
@@ -361,13 +365,7 @@ def _check_images(image, highres):
     """Refuse images that are not what they should be, or do not overlap."""
     # headers refuse what contradicts them
     headers = [(image.path, image.header), (highres.path, highres.header)]
-    name = image.header.filter
-    if name is None:
-        wanted = f"given, for the header of {image.path} does not name it"
-        raise argument_error("filter", wanted, None)
-    if name not in Filter.names() and not name.startswith("sedpy."):
-        wanted = f"a filter that 'miricigale filters' lists, for {image.path}"
-        raise argument_error("filter", wanted, repr(name))
+    check_filter(image)
     for path, header in headers:
         try:
             grid_angle(header.wcs, header.shape)
@@ -382,6 +380,17 @@ def _check_images(image, highres):
             f"{middle}, that of {highres.path} at {highres_middle} deg"
         )
         raise ValueError(msg)
+
+
+def check_filter(image):
+    """Refuse an image, a `MosaicFile`, whose filter is not known, or not one of the library."""
+    name = image.header.filter
+    if name is None:
+        wanted = f"given, for the header of {image.path} does not name it"
+        raise argument_error("filter", wanted, None)
+    if name not in Filter.names() and not name.startswith("sedpy."):
+        wanted = f"a filter that 'miricigale filters' lists, for {image.path}"
+        raise argument_error("filter", wanted, repr(name))
 
 
 def _middle(header):
@@ -424,21 +433,26 @@ def _check_psfs(image, highres, kernel):
 
 def _check_catalog(path, image, highres):
     """Refuse a catalog of another field."""
-    from astropy.coordinates import SkyCoord
-
     from miricigale.photometry.detection.prior_catalog import read_catalog
 
     sky = read_catalog(path, epoch=epoch_of(highres.header))["sky"]
     for argument, file in (("image", image), ("highres", highres)):
-        if _inside(sky, file.header):
-            continue
-        msg = f"none of the {len(sky)} sources of {path} is on {file.path} ('{argument}')"
-        is_known = np.isfinite(sky.ra.deg)
-        hours = SkyCoord(15 * sky.ra[is_known], sky.dec[is_known])
-        if _inside(hours, file.header):
-            msg += ": is ra in hours? Wanted are degrees, or a column with a unit"
-        elif is_known.any():
-            first = sky[is_known][0].to_string("decimal", precision=4)
-            middle = _middle(file.header).to_string("decimal", precision=4)
-            msg += f": the first is at {first}, the middle of the image at {middle} deg"
-        raise ValueError(msg)
+        check_on_image(sky, path, file, argument)
+
+
+def check_on_image(sky, path, file, argument):
+    """Refuse the positions of a catalog, of a path, of which none is on an image, a `MosaicFile`."""
+    from astropy.coordinates import SkyCoord
+
+    if _inside(sky, file.header):
+        return
+    msg = f"none of the {len(sky)} sources of {path} is on {file.path} ('{argument}')"
+    is_known = np.isfinite(sky.ra.deg)
+    hours = SkyCoord(15 * sky.ra[is_known], sky.dec[is_known])
+    if _inside(hours, file.header):
+        msg += ": is ra in hours? Wanted are degrees, or a column with a unit"
+    elif is_known.any():
+        first = sky[is_known][0].to_string("decimal", precision=4)
+        middle = _middle(file.header).to_string("decimal", precision=4)
+        msg += f": the first is at {first}, the middle of the image at {middle} deg"
+    raise ValueError(msg)

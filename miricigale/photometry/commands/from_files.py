@@ -5,6 +5,7 @@ from pathlib import Path
 from miricigale.instrument.image_files import write_image
 from miricigale.photometry.commands.exposure_files import with_exposures
 from miricigale.photometry.commands.file_inputs import Inputs
+from miricigale.photometry.commands.point_files import PointInputs
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing
 from miricigale.utils.named_values import without_none
@@ -26,7 +27,7 @@ _IN_PATCHES = (
 
 def measure_files(
     image,
-    highres,
+    highres=None,
     *,
     segmentation=None,
     catalog=None,
@@ -53,8 +54,9 @@ def measure_files(
         The image, or those of several bands; as `~miricigale.photometry.MosaicFile` with what is not in their
         headers, such as filters, maps of the noise and PSFs. Several exposures (``_cal``) of one filter are
         fitted together, each with its PSFs by place and roll and its own sky.
-    highres : path-like or `~miricigale.photometry.MosaicFile`
-        The prior. Its sources are looked at once for all bands.
+    highres : path-like or `~miricigale.photometry.MosaicFile`, optional
+        The prior. Its sources are looked at once for all bands. Without one the sources of the catalog are
+        measured as points.
     segmentation, catalog : path-like, optional
         See `~miricigale.photometry.read_prior`. Without a segmentation sources are detected
         on the prior.
@@ -108,11 +110,13 @@ def measure_files(
     ...     ["f770w_i2d.fits", "f1000w_i2d.fits"], "f444w_i2d.fits", output="miri.ecsv", page="miri.html"
     ... )  # doctest: +SKIP
     """
-    inputs = Inputs.of(
+    kind = PointInputs if highres is None else Inputs
+    inputs = kind.of(
         image, highres, detection=detection, segmentation=segmentation, catalog=catalog,
         kernel=kernel, confidence=confidence, psf_stars=psf_stars, seed=seed, **options,
     )  # fmt: skip
-    inputs = with_exposures(inputs)
+    if highres is not None:
+        inputs = with_exposures(inputs)
     # files that will be written, by their kind and number
     results = {("output", 0): output, ("page", 0): page}
     for k, label in enumerate(inputs.labels):

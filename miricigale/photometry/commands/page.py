@@ -63,8 +63,12 @@ def write_page(path, bands, highres, segments, confidence, seed):
     names = ", ".join(band.name for band in bands)
     files = ", ".join(Path(band.image.meta["source"]).name for band in bands)
     title = f"Forced photometry: {names}"
-    prior = Path(highres.meta["source"]).name
-    report = Page(title, subtitle=f"{files} on the prior {prior}")
+    # points have no prior: their first image stands in for it
+    has_prior = all(highres is not band.image for band in bands)
+    sources = "points at the positions of a catalog"
+    if has_prior:
+        sources = f"on the prior {Path(highres.meta['source']).name}"
+    report = Page(title, subtitle=f"{files}, {sources}")
     page = SectionWriter(report, declared("miricigale.photometry"))
     page.facts = {"confidence": f"{100 * confidence:g}", "detected": f"{_DETECTED:g}"}
     # the page of single sources, to which this one links
@@ -79,7 +83,7 @@ def write_page(path, bands, highres, segments, confidence, seed):
         result = band.result
         for k, reason in _examples(result):
             facts = {"id": result.id[k], "snr": result.snr[k], "chi2": result.chi2[k]}
-            figure = _zoom(result, highres, segments, k)
+            figure = _zoom(result, highres, segments, k, "prior" if has_prior else "first image")
             page.figure("source", figure, what=reason, band=band.name, **facts)
     page.section("magnitudes")
     for band in bands:
@@ -135,7 +139,8 @@ def _notices(page, bands, highres):
         threshold = 0.1 * pixel_scale(result.residual_image.wcs)
         if result.shift is None and np.any((abs(offset) > threshold) & (abs(offset) > 3 * error)):
             page.notice("offset", offset=_pairs(result.meta), band=band.name)
-    images["prior"] = highres
+    if highres not in images.values():
+        images["prior"] = highres
     for name, image in images.items():
         scale = image.meta.get("noise_scale")
         if image.meta.get("n_filled"):
@@ -231,8 +236,8 @@ def _examples(result):
     return chosen
 
 
-def _zoom(result, highres, segments, k):
-    """Draw prior, image, model and residual about a source: squares, white beyond the images."""
+def _zoom(result, highres, segments, k, title):
+    """Draw prior (under a title), image, model and residual about a source: squares, white beyond the images."""
 
     def square(data, wcs, fill=np.nan):
         scale = pixel_scale(wcs)
@@ -249,7 +254,7 @@ def _zoom(result, highres, segments, k):
     if highres.mask is not None:
         sharp[highres.mask] = np.nan
     sharp, form = square(sharp, highres.wcs)
-    form |= {"ax": axes[0, 0], "title": "prior"}
+    form |= {"ax": axes[0, 0], "title": title}
     if segments is None:
         plot_image(sharp, **form)
     else:
@@ -391,7 +396,8 @@ def _source_rows(result, confidence):
 def _input_table(page, bands, highres):
     page.section("inputs")
     files = [(band.name, band.image, band.kernel, "psf") for band in bands]
-    files.append(("prior", highres, bands[0].kernel, "highres_psf"))
+    if all(highres is not band.image for band in bands):
+        files.append(("prior", highres, bands[0].kernel, "highres_psf"))
     facts = {}
     for name, image, kernel, psf in files:
         psf_facts = kernel.meta.get("psfs", {}).get(psf, {})
