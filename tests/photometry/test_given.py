@@ -262,3 +262,13 @@ def test_psfs_without_pixels_are_on_those_of_their_images(images, sky, flux):
     refuses("'psf' must be a PSF that states its pixels for exposures", photometer.measure,
             [image, image], highres)  # fmt: skip
     refuses("given to measure.. where 'highres_psf'", photometer.measure, image, sky)
+
+
+def test_an_image_without_noise_asks_for_its_uncertainty(images, psfs, sky):
+    image = images[0].copy()
+    y, x = np.mgrid[:96, :96]
+    # a Gaussian, which is not quite 0 anywhere
+    image.data = np.exp(-0.5 * ((x - 48.0) ** 2 + (y - 48.0) ** 2) / 4)
+    image.uncertainty = None
+    message = "'image' must be an image with noise that can be measured, or with an uncertainty"
+    refuses(message, ForcedPhotometer(psf=psfs["psf"]).measure, image, sky)

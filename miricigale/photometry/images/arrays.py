@@ -18,6 +18,9 @@ from miricigale.utils.values import value_class
 #: Attempts to place each of some sources apart from each other.
 _ATTEMPTS = 50
 
+#: Noise of an image over its brightest pixel below which it was drawn without: rounding of numbers.
+_LEAST_NOISE = 1e-9
+
 #: uJy per MJy.
 _MICRO = 1e12
 
@@ -157,6 +160,11 @@ def _checked(image, name):
         spread = 0.0
         if usable.any():
             spread = mad_std(np.asarray(data[usable], float))
+            peak = np.max(np.abs(data[usable]))
+            wanted = "an image with noise that can be measured, or with an uncertainty"
+            got = f"a median absolute deviation of {spread:.2g}, {spread / (peak or 1):.1g} of the peak"
+            # an image drawn without noise is 0 in most pixels, to rounding
+            check_that(peak == 0 or spread > _LEAST_NOISE * peak, name, wanted, got)
         noise = np.broadcast_to(np.float64(spread), data.shape), factor
     else:
         # which takes the size of what is below 0
