@@ -1,6 +1,7 @@
 """Plans of a small sample: mock photometry, fits, ranks and the page."""
 
 import re
+import warnings
 
 import astropy.units as u
 import numpy as np
@@ -18,7 +19,7 @@ from miricigale.photometry import ErrorModel
 from miricigale.planning import Planner, area_table, comparison_table, load_plan, wall_clock
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.planner import EXISTING
-from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.exceptions import ConfigError, FitWarning
 from miricigale.utils.parallel import threads
 
 BANDS = ["miri.f770w", "miri.f1500w"]
@@ -184,6 +185,20 @@ def test_sources_of_the_caller_are_taken_as_they_are(planner):
     assert given.sources is own
     text, few = "'sources' must be a table with the columns", own["id", "redshift"]
     refuses(text, Planner, planner.config, sources=few)
+
+
+def test_scatter_of_mock_fluxes_is_not_warned_of_and_that_of_measured_ones_is(planner):
+    """Fluxes off by a factor of 2 either way: how to mend errors is no advice on those that a plan drew."""
+    band = "miri.f770w"
+    sources = planner.sources.copy()
+    sources[band] = sources[band] * np.where(np.arange(len(sources)) % 2, 2.0, 0.5)
+    off = Planner(planner.config, sources=sources)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", FitWarning)
+        off.evaluate([band])
+    measured = off.photometry([off.band_plans()[band]])
+    with pytest.warns(FitWarning, match=rf"errors allow: {band} "):
+        off.evaluate([band], measured=measured)
 
 
 def test_a_luminosity_function_gives_the_sample(tmp_path):
