@@ -12,24 +12,23 @@ from collections import namedtuple
 
 import numpy as np
 
+from miricigale.fitting._core.lanes import LANES, STEEPEST, add_exponentials
 from miricigale.utils._core.functions import exponential
 from miricigale.utils.compilation import KERNEL, PART, njit
 
 #: Least weight of a node that counts.
 _LEAST_WEIGHT = 1e-10
-#: Largest change of ln flux from the nearest node that is followed.
-_STEEPEST = 5.0
 #: How quickly the power that dust takes saturates with the amount of dust: it is interpolated over
 #: 1 - exp(-this * amount), which takes most of its change away.
 SATURATION = 4.0
 
 #: A table of one part of the light: ``table``, float32 (nz, n_models, n_columns), logarithms, of fluxes that of
-#: flux * z^2, less an ``offset`` of each column, (n_columns,), so that single precision is enough; ``log_z``,
-#: (nz,), ln(1 + z) of its nodes, one where there is no redshift; ``model``, int64, flat, the models of all
-#: values of the axes (-1 where there is none); of each axis its place among the parameters ``axis``, int64
-#: (n_axes,), its ``size``, int64, its nodes on the axis's scale, ``scaled`` (n_axes, n_largest), and the ``power``
-#: that is the scale.
-Part = namedtuple("Part", "table offset log_z model axis size scaled power")
+#: flux * z^2, less an ``offset`` of each column, (n_columns,), so that single precision is enough; ``unit``, its
+#: exponential; ``log_z``, (nz,), ln(1 + z) of its nodes, one where there is no redshift; ``model``, int64, flat,
+#: the models of all values of the axes (-1 where there is none); of each axis its place among the parameters
+#: ``axis``, int64 (n_axes,), its ``size``, int64, its nodes on the axis's scale, ``scaled`` (n_axes, n_largest),
+#: and the ``power`` that is the scale.
+Part = namedtuple("Part", "table offset unit log_z model axis size scaled power")
 #: The parts of galaxies and the AGN; ``burst`` and ``dust`` have no models where there is none. Places among the
 #: parameters, -1 where there is none: ``mixing`` of the burst's mass fraction, ``amount`` of that whose 0 is no
 #: dust, ``excess`` of the dust's light over energy balance, ``age``; ``youth`` is the age of the universe at the
@@ -37,9 +36,9 @@ Part = namedtuple("Part", "table offset log_z model axis size scaled power")
 Light = namedtuple("Light", "stars burst dust agn mixing amount excess age youth by_dust")
 #: Scratch arrays: values of all parameters, (n_axes,); of each axis weights of two more nodes and the part of the
 #: way to the next, (n_axes, 3), and where these are in the list of models, int64, and among the nodes,
-#: (n_axes, 2); nodes of a model and their weights, (n_nodes,); columns of the model, its AGN, and of another part,
-#: (3, n_columns); a place, (n_axes,).
-Work = namedtuple("Work", "value part step slot row weight flux new")
+#: (n_axes, 2); nodes of a model and their weights, (n_nodes,); columns of the model, its AGN, and memory for more,
+#: (3, n_columns), and for logarithms of columns, (n_columns,); a place, (n_axes,).
+Work = namedtuple("Work", "value part step slot row weight flux log new")
 
 
 def make_work(n_axes, n_columns):
@@ -53,6 +52,7 @@ def make_work(n_axes, n_columns):
         row=np.zeros(n_nodes, np.int64),
         weight=np.zeros(n_nodes),
         flux=np.zeros((3, n_columns)),
+        log=np.zeros(n_columns),
         new=np.zeros(n_axes),
     )
 
@@ -63,13 +63,12 @@ def place_between(nodes, n, x):
     if n <= 1:
         return 0, 0.0
     low = 0
-    high = n - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if nodes[middle] <= x:
-            low = middle
-        else:
-            high = middle
+    size = n - 1
+    # as many steps for every place, without a branch that nobody can foresee
+    while size > 1:
+        half = size // 2
+        low += half * (nodes[low + half] <= x)
+        size -= half
     return low, (x - nodes[low]) / (nodes[low + 1] - nodes[low])
 
 
@@ -206,26 +205,41 @@ def add_up(part_table, log_z, count, work, out):
         nearest_z = next_z
     nearest = table[nearest_z, work.row[0]]
     for j in range(n_columns):
-        out[j] = min(max(out[j], nearest[j] - _STEEPEST), nearest[j] + _STEEPEST)
+        out[j] = min(max(out[j], nearest[j] - STEEPEST), nearest[j] + STEEPEST)
         out[j] += part_table.offset[j]
+
+
+@njit(**PART)
+def add_light(part_table, log_z, count, work, factor, out):
+    """Add a factor times the columns of a `Part` at ln(1 + z) between the nodes in ``work`` to ``out``."""
+    table = part_table.table
+    n_columns = table.shape[2]
+    if n_columns < LANES:
+        log = work.log
+        add_up(part_table, log_z, count, work, log)
+        for j in range(n_columns):
+            out[j] += factor * exponential(log[j])
+        return
+    z, t = place_between(part_table.log_z, table.shape[0], log_z)
+    next_z = min(z + 1, table.shape[0] - 1)
+    nearest_z = z
+    if t > 0.5:
+        nearest_z = next_z
+    nodes = (work.row, work.weight, count, z, next_z, nearest_z)
+    add_exponentials(table, part_table.unit, *nodes, t, factor, out)
 
 
 @njit(**PART)
 def mixed(part_table, burst, share, log_z, value, work, out):
     """Columns of starlight, with a burst of a mass fraction, into ``out``; False where there is no model."""
-    n = part_table.table.shape[2]
+    out[: part_table.table.shape[2]] = 0.0
     count = find_nodes(part_table, value, work)
     if count == 0:
         return False
-    add_up(part_table, log_z, count, work, out)
-    for j in range(n):
-        out[j] = exponential(out[j])
+    add_light(part_table, log_z, count, work, 1.0 - share, out)
     if share > 0.0:
-        burst_columns = work.flux[2]
         count = find_nodes(burst, value, work)
-        add_up(burst, log_z, count, work, burst_columns)
-        for j in range(n):
-            out[j] = (1.0 - share) * out[j] + share * exponential(burst_columns[j])
+        add_light(burst, log_z, count, work, share, out)
     return True
 
 
@@ -263,11 +277,8 @@ def galaxy_light(light, value, log_z, work):
         return False
     power = dust_power(light, value, flux[last])
     if light.dust.table.shape[1] > 0 and power > 0.0:
-        template = work.flux[2]
         count = find_nodes(light.dust, value, work)
-        add_up(light.dust, log_z, count, work, template)
-        for j in range(last):
-            flux[j] += power * exponential(template[j])
+        add_light(light.dust, log_z, count, work, power, flux)
     if light.by_dust:
         flux[last] = power
     else:
@@ -292,9 +303,9 @@ def with_agn(light, value, frac, log_z, work):
     count = find_nodes(light.agn, value, work)
     if count == 0:
         return False
-    add_up(light.agn, log_z, count, work, agn)
+    agn[: last - 1] = 0.0
+    add_light(light.agn, log_z, count, work, power, agn)
     for j in range(last - 1):
-        agn[j] = power * exponential(agn[j])
         flux[j] += agn[j]
     return True
 

@@ -28,8 +28,10 @@ Object = namedtuple("Object", "target limits mixture log_usable masses redshift 
 Masses = namedtuple("Masses", "table log_stars per_dex")
 #: Bands that may be wrong, of the used ones: 1 / sigma^2 of the stated error, (nz, n_used), and of the broad
 #: one, (n_used,); odds of the latter without a residual, (nz, n_used); ln of the likelihood where none is wrong
-#: and there are no residuals, (nz,); scratch, (nb,).
-Mixture = namedtuple("Mixture", "narrow broad odds level weight")
+#: and there are no residuals, (nz,); memory, (4, n_used).
+Mixture = namedtuple("Mixture", "narrow broad odds level rows")
+# Rows of ``Mixture.rows``: fluxes of the model and of the data, 1 / sigma^2, and odds.
+_MODEL, _DATA, _NARROW, _ODDS = range(4)
 #: Largest number of steps to the scale with bands that may be wrong.
 _STEPS = 10
 #: Square of the last step over the variance of the scale.
@@ -37,18 +39,13 @@ _CLOSE = 1e-4
 
 
 @njit(**PART)
-def _best_scale(flux, weight, target, limits):
+def _best_scale(p, q, flux, limits):
     """
-    Best scale of a model for weights of the bands, R, variance of the scale, and chi2 of the fluxes.
+    Best scale of a model, R, variance of the scale, and chi2 of the fluxes.
 
-    R is chi2 of no model less that of this one, and chi2 of the fluxes is less that of no model.
+    R is chi2 of no model less that of this one, and chi2 of the fluxes is less that of no model. ``p`` and ``q``
+    are products of the fluxes of the model with those measured and with themselves.
     """
-    p = 0.0
-    q = 0.0
-    for b in target.bands:
-        wm = weight[b] * flux[b]
-        p += wm * target.flux[b]
-        q += wm * flux[b]
     if limits is not None:
         for i in range(len(limits.bands)):
             limits.slope[i] = flux[limits.bands[i]] * limits.inverse[i]
@@ -62,8 +59,6 @@ def _best_scale(flux, weight, target, limits):
 @njit(**PART)
 def _widened(weight, b, flux, agn, target, agn_error):
     """Part that is left of the weight of a band with an error of the AGN's light."""
-    if agn_error == 0.0 or flux[len(flux) - 1] <= 0.0:
-        return 1.0
     return 1.0 / (1.0 + weight * (agn_error * agn[b] / flux[b] * target.flux[b]) ** 2)
 
 
@@ -96,42 +91,86 @@ def _likelihood(observed, limits, mixture, z, fluxes):
     """
     flux = fluxes[0]
     agn = fluxes[1]
-    scratch = fluxes[2]
+    weight = fluxes[2]
     target = observed.target
+    # without light of an AGN its error changes nothing
     agn_error = observed.agn_error
-    log_change = _widen(flux, agn, z, target, agn_error, scratch)
-    s, r, variance, chi2 = _best_scale(flux, scratch, target, limits)
+    if flux[len(flux) - 1] <= 0.0:
+        agn_error = 0.0
+    log_change = 0.0
+    p = 0.0
+    q = 0.0
+    if agn_error == 0.0:
+        for b in target.bands:
+            wm = target.weight[z, b] * flux[b]
+            p += wm * target.flux[b]
+            q += wm * flux[b]
+    else:
+        log_change = _widen(flux, agn, z, target, agn_error, weight)
+        for b in target.bands:
+            wm = weight[b] * flux[b]
+            p += wm * target.flux[b]
+            q += wm * flux[b]
+    s, r, variance, chi2 = _best_scale(p, q, flux, limits)
     log = 0.5 * (r + target.level[z] + log_change)
     if mixture is not None:
-        weight = mixture.weight
+        log_errors = _used_bands(mixture, z, flux, agn, target, agn_error)
+        model = mixture.rows[_MODEL]
+        data = mixture.rows[_DATA]
+        narrow = mixture.rows[_NARROW]
+        odds = mixture.rows[_ODDS]
         product = 1.0
         for _ in range(_STEPS):
-            log = mixture.level[z]
+            log = mixture.level[z] + log_errors
             product = 1.0
             if limits is not None:
                 log += 0.5 * (r - limits.dark + chi2)
-            for j, b in enumerate(target.bands):
-                d = target.flux[b] - s * flux[b]
-                narrow = mixture.narrow[z, j]
+            p = 0.0
+            q = 0.0
+            residual = 0.0
+            for j in range(len(target.bands)):
+                d = data[j] - s * model[j]
+                square = d * d
                 broad = mixture.broad[j]
-                odds = mixture.odds[z, j]
-                part = _widened(narrow, b, flux, agn, target, agn_error)
-                if part < 1.0:
-                    narrow = narrow * part
-                    odds = odds / math.sqrt(part)
-                    log += 0.5 * math.log(part)
-                may_be_wrong = odds > 0.0
-                exponent = max(0.5 * (broad - narrow) * d * d, -600.0)
+                may_be_wrong = odds[j] > 0.0
+                exponent = max(0.5 * (broad - narrow[j]) * square, -600.0)
                 good = exponential(exponent) if may_be_wrong else 1.0
-                log -= 0.5 * (broad if may_be_wrong else narrow) * d * d
-                product *= good + odds
-                weight[b] = (good * narrow + odds * broad) / (good + odds)
+                residual += (broad if may_be_wrong else narrow[j]) * square
+                product *= good + odds[j]
+                wm = (good * narrow[j] + odds[j] * broad) / (good + odds[j]) * model[j]
+                p += wm * data[j]
+                q += wm * model[j]
+            log -= 0.5 * residual
             before = s
-            s, r, variance, chi2 = _best_scale(flux, weight, target, limits)
+            s, r, variance, chi2 = _best_scale(p, q, flux, limits)
             if (s - before) ** 2 < _CLOSE * variance:
                 break
         log += math.log(product)
     return s, log, variance
+
+
+@njit(**PART)
+def _used_bands(mixture, z, flux, agn, target, agn_error):
+    """
+    Put what the likelihood takes of the used bands side by side; returned is what its ln changes by.
+
+    That is due to the error of the AGN's light, which makes errors and odds larger.
+    """
+    log_errors = 0.0
+    rows = mixture.rows
+    for j, b in enumerate(target.bands):
+        rows[_MODEL, j] = flux[b]
+        rows[_DATA, j] = target.flux[b]
+        rows[_NARROW, j] = mixture.narrow[z, j]
+        rows[_ODDS, j] = mixture.odds[z, j]
+    if agn_error > 0.0:
+        for j, b in enumerate(target.bands):
+            part = _widened(rows[_NARROW, j], b, flux, agn, target, agn_error)
+            if part < 1.0:
+                rows[_NARROW, j] *= part
+                rows[_ODDS, j] /= math.sqrt(part)
+                log_errors += 0.5 * math.log(part)
+    return log_errors
 
 
 @njit(**PART)

@@ -300,7 +300,7 @@ class Continuation(Frozen):
         odds = part / (1.0 - part) / np.sqrt(narrow) / wide
         # of fluxes in units of the errors without that of templates
         level = 0.5 * np.log(narrow * np.square(sigma[used])).sum(axis=1)
-        return _core.Mixture(narrow, wide**-2.0, odds, level, np.zeros(len(broad)))
+        return _core.Mixture(narrow, wide**-2.0, odds, level, np.zeros((4, len(used))))
 
     def index_of_nodes(self, node):
         """Find redshift, galaxy, AGN model and fraction of nodes of the axes, (n, n_axes): (n, 4), -1 for none."""

@@ -99,6 +99,7 @@ def make_part(names, axes, powers, table, redshift, place, model=None):
     return _core.Part(
         table=table,
         offset=offset,
+        unit=_units(offset),
         log_z=np.log1p(np.asarray(redshift, float)),
         model=np.ascontiguousarray(model, np.int64).ravel(),
         axis=np.array([place[name] for name in names], np.int64),
@@ -123,6 +124,12 @@ def _single(table):
     return single, offset
 
 
+def _units(offset):
+    """Exponentials of offsets of columns, infinite of those that are no logarithms."""
+    with np.errstate(over="ignore"):
+        return np.exp(offset)
+
+
 def empty_part(n_columns):
     """Make a `_core.Part` without models."""
     return make_part((), {}, {}, np.zeros((0, 1, n_columns)), np.zeros(1), {})
@@ -131,7 +138,7 @@ def empty_part(n_columns):
 def with_columns(part, table):
     """Return a `_core.Part` of the same models with columns (n_models, k) that do not depend on redshift."""
     table, offset = _single(np.asarray(table, float)[:, None])
-    return part._replace(table=table, offset=offset, log_z=np.zeros(1))
+    return part._replace(table=table, offset=offset, unit=_units(offset), log_z=np.zeros(1))
 
 
 def part_columns(part, values):
