@@ -7,7 +7,7 @@ model that can matter are listed by their bounds (`pairs`, down to those of `flo
 `summarize` turns the sums into moments and quantiles. `weigh_masses` (`masses`) puts a prior of mass in,
 `find_models` (`mixture`) finds wrong bands. `interpolate_light` (`interpolation`) and `evaluate_places`
 (`population`, `nuclei`, `importance`) are of models between nodes, `part_fits` fits what proposes them, and
-`allocation` says where more are wanted.
+`allocation` says where more are wanted; `lanes` adds their light up, `summaries` what results are of.
 `structs` says what the kernels take and where it stands there, `workspace` makes it.
 """
 
@@ -58,6 +58,7 @@ from miricigale.fitting._core.scan import (
     scan_nodes,
 )
 from miricigale.fitting._core.structs import BLOCK, Request, Tables
+from miricigale.fitting._core.summaries import sort_draws
 from miricigale.fitting._core.workspace import (
     JOINT,
     aligned,

@@ -5,6 +5,7 @@ from functools import cached_property
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting import _core
 from miricigale.fitting.posterior.posterior import cell_percentiles
 from miricigale.utils.options import check_that
 from miricigale.utils.units import LUMINOSITY, MASS, frozen_array
@@ -54,7 +55,10 @@ def draws_summary(value, *, with_log=True, weight=None):
     """
     finite = np.isfinite(value)
     if weight is not None:
-        return _weighted_summary(value[finite], weight[finite], with_log)
+        if not finite.all():
+            value = value[finite]
+            weight = weight[finite]
+        return _weighted_summary(value, weight, with_log)
     value = value[finite]
     if not value.size:
         return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
@@ -72,20 +76,17 @@ def _weighted_summary(value, weight, with_log):
     total = weight.sum()
     if not total > 0:
         return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
-    order = np.argsort(value)
-    value = value[order]
-    weight = weight[order] / total
-    mean = np.sum(weight * value)
-    std = np.sqrt(np.sum(weight * np.square(value - mean)))
-    upto = np.cumsum(weight)
-    log = np.nan
-    # values above 0 are the last ones
-    first = np.searchsorted(value, 0.0, "right")
-    if with_log and first < value.size:
-        lit = weight[first:]
-        log = np.sum(lit * np.log10(value[first:])) / lit.sum()
-    # a value stands for half of its weight on either side
-    return np.array([mean, std, log]), np.interp(DERIVED_LEVELS, upto - 0.5 * weight, value)
+    (values, middles, _), moments = _sorted_draws(value, weight, with_log)
+    return moments, np.interp(DERIVED_LEVELS, middles, values)
+
+
+def _sorted_draws(value, weight, with_log):
+    """Sort draws with weights, and compute their moments; see `~miricigale.fitting._core.sort_draws`."""
+    table = np.empty((3, value.size))
+    moments = np.empty(3)
+    value = np.ascontiguousarray(value, float)
+    _core.sort_draws(value, weight, np.argsort(value), with_log, table, moments)
+    return table, moments
 
 
 def percentile_error(values, weight):
@@ -108,16 +109,12 @@ def percentile_error(values, weight):
     those above. The percentiles at shares that are a standard error smaller and larger say what that means for the
     value, also between two peaks, where there is no density to divide by.
     """
-    order = np.argsort(values)
-    values = values[order]
-    weight = weight[order]
-    middles = np.cumsum(weight) - 0.5 * weight
+    (values, middles, square_upto), _ = _sorted_draws(values, weight, with_log=False)
     low, high = np.interp(_INTERVAL[[0, -1]], middles, values)
     half_width = 0.5 * (high - low)
     # values that differ by rounding are one
     if not half_width > _SAME * max(abs(low), abs(high)):
         return 0.0
-    square_upto = np.cumsum(np.square(weight))
     below = np.interp(_INTERVAL, middles, square_upto)
     above = square_upto[-1] - below
     share_error = np.sqrt(np.square(1.0 - _INTERVAL) * below + np.square(_INTERVAL) * above)
