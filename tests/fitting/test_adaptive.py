@@ -260,7 +260,9 @@ def test_densities_are_those_of_t_distributions(mixture):
     n, n_axes = 2048, 3
     choice, _, normal, spread = (x[:n] for x in quasi_random(n_axes, 11, 1))
     label, y = np.empty(n, np.int64), np.empty((n, n_axes))
-    _core.propose(labels, parts, choice, normal, spread, label, y)
+    _core.propose(labels, parts, np.cumsum(parts.share), choice, normal, spread, label, y)
+    # each part has its share of the draws
+    assert np.mean(y[:, 0] > 0) == pytest.approx(parts.share[parts.mean[:, 0] > 0].sum(), abs=0.02)
     density = np.zeros((2, n))
     column = np.array([0, 1])
     places = (np.array([[0, n]]), y, np.empty((n_axes + 2, n)), density)
@@ -313,7 +315,8 @@ def test_local_parts_go_where_weights_are_large():
         choice, _, normal, spread = quasi_random(n_axes, 15, 1)
         label = np.empty(size, np.int64)
         y = np.empty((size, n_axes))
-        _core.propose(_labels(n_axes), parts, choice, normal, spread, label, y)
+        upto = np.cumsum(parts.share)
+        _core.propose(_labels(n_axes), parts, upto, choice, normal, spread, label, y)
         density = np.zeros((1, size))
         places = (np.array([[0, size]]), y, np.empty((n_axes + 2, size)), density)
         _core.add_density(_labels(n_axes), parts, np.zeros(n_parts, np.int64), *places)
@@ -414,6 +417,29 @@ def test_percentiles_between_peaks_get_more_models(fitter, table):
     assert converged.any()
     assert scatter[converged].max() < 0.3
     assert np.mean(scatter[converged] < 0.15) > 0.9
+
+
+def test_weights_are_posteriors_over_densities():
+    """Of two peaks and three labels, over what they were proposed by; places without probability have none."""
+    rng = np.random.default_rng(4)
+    n, first = 1000, 7
+    share = rng.random((3, 2))
+    label = rng.integers(0, 3, n)
+    of_peak = np.exp(rng.normal(0.0, 30.0, (2, first + n + 5)))
+    density = np.empty(n)
+    _core.mix_peaks(share, label, of_peak, first, density)
+    want = np.sum(share[label].T * of_peak[:, first : first + n], axis=0)
+    assert_allclose(density, want, rtol=1e-12)
+    evaluated = rng.normal(-1e4, 30.0, (n, 5))
+    evaluated[:50, 0] = _core.NEVER
+    weight = np.empty(n)
+    top, mean = _core.weigh_places(evaluated, density, weight)
+    log = evaluated[:, 0] - np.log(density)
+    assert top == pytest.approx(log.max(), rel=1e-12)
+    assert_allclose(weight, np.exp(np.maximum(log - log.max(), -700.0)), rtol=1e-8)
+    assert mean == pytest.approx(weight.mean())
+    evaluated[:, 0] = _core.NEVER
+    assert _core.weigh_places(evaluated, density, weight)[0] < 0.5 * _core.NEVER
 
 
 def test_places_go_where_they_are_inefficient():

@@ -11,7 +11,12 @@ model that can matter are listed by their bounds (`pairs`, down to those of `flo
 `structs` says what the kernels take and where it stands there, `workspace` makes it.
 """
 
-from miricigale.fitting._core.allocation import allocate_places, make_group_sets
+from miricigale.fitting._core.allocation import (
+    allocate_places,
+    make_group_sets,
+    mix_peaks,
+    weigh_places,
+)
 from miricigale.fitting._core.evaluate import sum_up
 from miricigale.fitting._core.histogram import (
     N_SHARE,

@@ -4,12 +4,17 @@ from collections import namedtuple
 
 import numpy as np
 
+from miricigale.fitting._core.population import NEVER
+from miricigale.utils._core.functions import exponential, log10
 from miricigale.utils.compilation import KERNEL, njit
 
 #: Sets of groups that have to have an effective number of their own: ``start``, int64 (n_sets + 1,), of each in
 #: ``group``, int64, flat.
 GroupSets = namedtuple("GroupSets", "start group")
 
+_LN_10 = np.log(10.0)
+#: Smallest normal number.
+_LEAST_DENSITY = 2.3e-308
 #: Places with an effective number of 1 that are added to those of a group for its efficiency, the effective number
 #: over that of places: few of its own say little.
 _N_EXPECTED = 20.0
@@ -25,6 +30,65 @@ def make_group_sets(sets):
     """Make `GroupSets` of arrays of groups."""
     start = np.concatenate([[0], np.cumsum([len(groups) for groups in sets])])
     return GroupSets(start.astype(np.int64), np.concatenate(sets).astype(np.int64))
+
+
+@njit(**KERNEL)
+def mix_peaks(share, label, of_peak, first, density):
+    """
+    Add the densities of the parts of peaks up with the shares that labels have in these.
+
+    Parameters
+    ----------
+    share : `~numpy.ndarray`, shape (n_labels, n_peaks)
+        Shares of the places.
+    label : `~numpy.ndarray` of int, shape (n,)
+        Labels of the places.
+    of_peak : `~numpy.ndarray`, shape (n_peaks, first + n) or longer
+        Densities of the parts of each peak, of these places from column ``first`` on.
+    first : int
+        That column.
+    density : `~numpy.ndarray`, shape (n,)
+        Gets the sums.
+    """
+    n_peaks = share.shape[1]
+    for i in range(len(label)):
+        total = 0.0
+        for peak in range(n_peaks):
+            total += share[label[i], peak] * of_peak[peak, first + i]
+        density[i] = total
+
+
+@njit(**KERNEL)
+def weigh_places(evaluated, density, weight):
+    """
+    Weigh places by the posterior over the density of what proposed them.
+
+    Parameters
+    ----------
+    evaluated : `~numpy.ndarray`, shape (n, 5)
+        What `evaluate_places` says of them.
+    density : `~numpy.ndarray`, shape (n,)
+        Densities, above 0.
+    weight : `~numpy.ndarray`, shape (n,)
+        Gets weights, the largest of which is 1.
+
+    Returns
+    -------
+    top, mean : float
+        Ln of the weight that became 1, and mean of the weights.
+    """
+    n = len(weight)
+    for i in range(n):
+        weight[i] = log10(max(density[i], _LEAST_DENSITY))
+    top = 2.0 * NEVER
+    for i in range(n):
+        weight[i] = evaluated[i, 0] - _LN_10 * weight[i]
+        top = max(top, weight[i])
+    total = 0.0
+    for i in range(n):
+        weight[i] = exponential(max(weight[i] - top, -700.0))
+        total += weight[i]
+    return top, total / n
 
 
 @njit(**KERNEL)

@@ -146,7 +146,7 @@ def evaluate_places(space, labels, target, label, y, x, evaluated, work):
 
 
 @njit(**KERNEL)
-def propose(labels, parts, choice, normal, spread, label, y):
+def propose(labels, parts, upto, choice, normal, spread, label, y):
     """
     Draw places from a mixture.
 
@@ -154,6 +154,8 @@ def propose(labels, parts, choice, normal, spread, label, y):
     ----------
     labels, parts : `Labels`, `Parts`
         The mixture.
+    upto : `~numpy.ndarray`, shape (n_parts,)
+        Shares of the parts up to each.
     choice, normal, spread : `~numpy.ndarray`, shapes (n,), (n, n_axes) and (n,)
         Uniform numbers, which choose parts; standard normal numbers; roots of ``FREEDOM`` over numbers of a chi2
         distribution.
@@ -162,11 +164,15 @@ def propose(labels, parts, choice, normal, spread, label, y):
     """
     n_axes = y.shape[1]
     for i in range(len(y)):
+        # the first part up to which there is as much
         p = 0
-        upto = parts.share[0]
-        while upto < choice[i] and p + 1 < len(parts.share):
-            p += 1
-            upto += parts.share[p]
+        last = len(upto) - 1
+        while p < last:
+            middle = (p + last) // 2
+            if upto[middle] < choice[i]:
+                p = middle + 1
+            else:
+                last = middle
         part_label = parts.label[p]
         label[i] = part_label
         for c in range(n_axes):

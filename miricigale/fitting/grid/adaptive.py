@@ -145,6 +145,7 @@ class AdaptiveSampler:
         self.place = np.empty((size, n_axes))
         self.evaluated = np.empty((size, 5))
         self.peak = np.zeros(size, np.int64)
+        self.group = np.empty(size, np.int64)
         self.density = np.zeros(size)
         self.scratch = np.empty((n_axes + 2, _MAX_ROUND_SIZE))
         self.n_fitted = _MAX_FLAT
@@ -290,15 +291,14 @@ class AdaptiveSampler:
             self._add_density(parts.kernel, ends, density, parts.group % len(self.peaks))
             total += size * guarded
             rows = slice(first, self.n)
-            share_of_peak = total.reshape(-1, len(self.peaks))[self.label[rows]]
-            self.density[rows] = np.sum(share_of_peak.T * density[:, rows], axis=0) / total.sum()
+            share = (total / total.sum()).reshape(-1, len(self.peaks))
+            _core.mix_peaks(share, self.label[rows], density, first, self.density[rows])
             sample = self._weigh(rows)
             if sample is None:
                 return None
             n = self.n - first
             sample = replace(sample, enough=sample.enough and n >= _MIN_RESULT_PLACES)
-            group = self._groups(self.label[rows], self.peak[rows])
-            n_each = np.bincount(group, minlength=self.n_groups)
+            n_each = np.bincount(self.group[rows], minlength=self.n_groups)
             missing = np.maximum(sample.wanted - n_each, 0.02 * sample.wanted)
             collection.missing = missing
             collection.sample = sample
@@ -334,7 +334,7 @@ class AdaptiveSampler:
         group = self.peak[rows]
         is_wanted = np.ones(len(self.peaks), bool)
         if self.pursue:
-            group = self._groups(self.label[rows], self.peak[rows])
+            group = self.group[rows]
             share = np.bincount(group, weight, minlength=self.n_groups)
             is_wanted = self.pursued | (share > MIN_WEIGHT * share.sum())
         chosen = fitted_groups(is_wanted, np.bincount(group, minlength=is_wanted.size))
@@ -358,7 +358,7 @@ class AdaptiveSampler:
 
     def _end_pursuit(self, sample, *, is_long):
         """Pursue labels no more that have been seen, and after long those without weight."""
-        group = self._groups(self.label[sample.rows], self.peak[sample.rows])
+        group = self.group[sample.rows]
         share = np.bincount(group, sample.weight, minlength=self.n_groups)
         square = np.bincount(group, np.square(sample.weight), minlength=self.n_groups)
         self.pursued &= np.square(share) < _SEEN * square
@@ -367,14 +367,12 @@ class AdaptiveSampler:
 
     def _weigh(self, rows):
         """Weigh places by the posterior over the density of the proposal; None if none is possible."""
-        log = self.evaluated[rows, 0] - np.log(self.density[rows])
-        top = log.max()
+        weight = np.empty(rows.stop - rows.start)
+        top, mean = _core.weigh_places(self.evaluated[rows], self.density[rows], weight)
         if not top > 0.5 * _core.NEVER:
             return None
-        weight = np.exp(np.maximum(log - top, -700.0))
-        log_mean = top + np.log(weight.mean())
         effective, enough, wanted = self._wanted(weight, rows)
-        return WeightedPlaces(rows, weight, log_mean, effective, enough, wanted)
+        return WeightedPlaces(rows, weight, top + np.log(mean), effective, enough, wanted)
 
     def _add_round(self, mixture, size):
         """Draw places of a mixture and evaluate them; returned are their ends for `_core.add_density`."""
@@ -383,7 +381,9 @@ class AdaptiveSampler:
         choice, _, normal, spread = self.points
         label = np.empty(size, np.int64)
         score = np.empty((size, self.score.shape[1]))
-        _core.propose(self.labels, mixture, choice[new], normal[new], spread[new], label, score)
+        points = (choice[new], normal[new], spread[new])
+        upto = np.cumsum(mixture.share)
+        _core.propose(self.labels, mixture, upto, *points, label, score)
         # by redshift, so that models that lie near each other in memory are met together
         order = np.argsort(_APART * label + score[:, 0])
         label = label[order]
@@ -394,6 +394,7 @@ class AdaptiveSampler:
         _core.evaluate_places(self.space, self.labels, self.target, *of_new)
         if self.borders.size:
             self.peak[new] = np.searchsorted(self.borders, self._redshift(self.place[new, 0]))
+        self.group[new] = self._groups(label, self.peak[new])
         ends = self.n + np.searchsorted(label, np.arange(len(self.labels.n_active) + 1))[None]
         self.n += size
         return ends
@@ -404,7 +405,7 @@ class AdaptiveSampler:
         if n <= size:
             return
         size = max(2 * size, n)
-        for name in ("label", "score", "place", "evaluated", "peak", "density"):
+        for name in ("label", "score", "place", "evaluated", "peak", "group", "density"):
             values = getattr(self, name)
             larger = np.empty((size, *values.shape[1:]), values.dtype)
             larger[: self.n] = values[: self.n]
@@ -430,7 +431,7 @@ class AdaptiveSampler:
 
         Labels, peaks, and components that count have enough of their own.
         """
-        group = self._groups(self.label[rows], self.peak[rows])
+        group = self.group[rows]
         least_each = max(_EFFECTIVE_PART * self.wanted, _MIN_EFFECTIVE)
         limits = (float(self.wanted), float(least_each), MIN_WEIGHT)
         sums = np.empty((3, self.n_groups))
@@ -511,12 +512,12 @@ class AdaptiveSampler:
         Labels and peaks keep the weights that the sample gives them; places begin from all that there are.
         """
         rows = sample.rows
-        index = self._groups(self.label[rows], self.peak[rows])
+        index = self.group[rows]
         share = np.bincount(index, sample.weight, minlength=self.n_groups)
         share = share / share.sum()
         share[share < _MIN_MOVED_WEIGHT] = 0.0
         share = share / share.sum()
-        group = self._groups(self.label[: self.n], self.peak[: self.n])
+        group = self.group[: self.n]
         log = self.evaluated[: self.n, 0] - np.log(self.density[: self.n])
         picked = []
         weight = []
