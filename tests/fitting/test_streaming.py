@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.errors import refuses
 from helpers.grids import draw_photometry, node_fitter
 from helpers.results import assert_joined, assert_same, assert_same_tables
-from miricigale.fitting import FitFlags, fit_file, open_results
+from miricigale.fitting import FitFlags, FitResults, fit_file, open_results
 from miricigale.fitting.results.io import FitFolder
 from miricigale.utils.exceptions import CatalogWarning, DataError
 from miricigale.utils.row_files import write_rows
@@ -100,6 +100,23 @@ def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalog, in_pieces, chunk_ro
     assert_joined(results.parts(), whole)
     twice = (whole.flags & FitFlags.DUPLICATE_ID) > 0
     assert np.flatnonzero(twice).tolist() == [i for i in (5, 120, 140) if i < len(catalog)]
+
+
+def test_a_part_is_a_file_of_results_without_their_table(fitter, on_disk, tmp_path):
+    path, out = on_disk
+    results = fit_file(fitter, path, out, chunk_rows=150)
+    (part,) = results.paths
+    whole = FitResults.read(part)
+    whole.write(tmp_path / "whole.fits")
+    names = {}
+    for item in (part, tmp_path / "whole.fits"):
+        with fits.open(item) as hdus:
+            names[item] = {hdu.name for hdu in hdus}
+    assert names[tmp_path / "whole.fits"] - names[part] == {"TABLE"}
+    shown = QTable.read(tmp_path / "whole.fits", hdu="TABLE")
+    table = results.to_table()
+    assert shown.colnames == table.colnames
+    assert_array_equal(shown["mass_p50"].value, table["mass_p50"].value)
 
 
 @pytest.mark.parametrize("how", ["column", "values", "prior", "priors", "prior column"])

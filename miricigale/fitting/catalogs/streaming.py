@@ -26,6 +26,7 @@ from miricigale.fitting.results.io import (
     part_chi2,
     part_ids,
     part_name,
+    write_part,
 )
 from miricigale.fitting.results.pulls import warn_of_pulls
 from miricigale.fitting.results.sample_flags import chi2_limit, chi2_step
@@ -70,8 +71,9 @@ def fit_file(
 
     The results are those of `BayesFitter.fit` for the whole catalog, number for number; only
     one piece is in memory. They lie in a folder: ``part-00000.fits`` and so on, each a file that
-    `FitResults.read` reads, and ``manifest.json``, which says of what fit they are. A call that
-    was stopped resumes with the same arguments and fits what is missing.
+    `FitResults.read` reads, and ``manifest.json``, which says of what fit they are. Their table is
+    that of `FitResultsFiles.to_table` and `FitResultsFiles.write_table`. A call that was stopped
+    resumes with the same arguments and fits what is missing.
 
     Parameters
     ----------
@@ -297,7 +299,7 @@ def _save_part(folder, name, results):
     # the same bytes, whenever they and the grid are made
     results = results._changed(meta=undated(results.meta))
     with _WRITING:
-        folder.save(name, results.write)
+        folder.save(name, partial(write_part, results))
     return {name: folder.describe(name)}, len(results), int(np.count_nonzero(results.fitted))
 
 

@@ -41,6 +41,16 @@ _FACTS = ("redshift_fixed", "constants", "least_std", "meta")
 
 def write_results(results, path, *, overwrite=False):
     """Write results: their table, a table extension of all arrays, and a text extension of all else."""
+    shown = results._several().to_table()
+    _write_results(results, path, shown=shown, overwrite=overwrite)
+
+
+def write_part(results, path):
+    """Write results as `write_results` does, without their table, which is that of all parts."""
+    _write_results(results, path, shown=None, overwrite=False)
+
+
+def _write_results(results, path, *, shown, overwrite):
     single = results.isscalar
     results = results._several()
     ascii_ids(results.ids, "ids")
@@ -59,7 +69,7 @@ def write_results(results, path, *, overwrite=False):
     }
     # FITS has no columns of arrays without elements
     full = {name: array for name, array in table.items() if array.size or not len(array)}
-    parts = {"shown": results.to_table(), "text": text, "tables": {"RESULTS": Table(full)}}
+    parts = {"shown": shown, "text": text, "tables": {"RESULTS": Table(full)}}
     write_parts(path, _RESULTS, **parts, overwrite=overwrite)
 
 
