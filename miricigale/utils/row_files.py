@@ -91,6 +91,8 @@ class RowFile:
         self.chunk_rows = chunk_rows
         self._hdu = hdu
         self._id_names = id_names
+        # the piece that was read last, by its number: fits read each one several times, and most catalogs are one
+        self._pieces = {}
 
     @cached_property
     def _table(self):
@@ -134,9 +136,19 @@ class RowFile:
         table : `~astropy.table.QTable`
             As `QTable.read` gives these rows of the whole file; text is text, not bytes.
         """
-        table = self._read(slice(*self.span(i)))
+        # what one reader changes is not there for the next
+        table = self._piece(i).copy()
         table.rename_columns(table.colnames, list(self.colnames))
         return table
+
+    def _piece(self, i):
+        """Read piece ``i``, unless it was the last that was read."""
+        if i not in self._pieces:
+            # not two at the same time
+            self._pieces.clear()
+            # rows of a mapped file would keep it open
+            self._pieces[i] = self._read(slice(*self.span(i))).copy()
+        return self._pieces[i]
 
     def _read(self, rows):
         return self._table[rows]
@@ -160,7 +172,7 @@ class _FitsRows(RowFile):
             self._header.remove(key, ignore_missing=True)
         self._header["PCOUNT"] = 0
         # two columns of the file may be one of the table, as those of a SkyCoord are
-        self.colnames = tuple(self._read(slice(0, 0)).colnames)
+        self.colnames = tuple(self._piece(0).colnames)
 
     def _choose(self, hdus):
         tables = [i for i, item in enumerate(hdus) if isinstance(item, fits.BinTableHDU)]

@@ -54,6 +54,22 @@ def test_pieces_that_were_read_take_no_memory(table, tmp_path):
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize("suffix", ["fits", "ecsv"])
+def test_what_a_reader_changes_is_not_there_for_the_next(table, tmp_path, suffix):
+    path = tmp_path / f"t.{suffix}"
+    Table(table).write(path)
+    rows = open_rows(path, 300)
+    name = rows.colnames[0]
+    first = rows.chunk(2)
+    value = first[name][0]
+    first[name] = first[name][::-1]
+    first.meta["note"] = "changed"
+    first.remove_column(rows.colnames[1])
+    again = rows.chunk(2)
+    assert (again[name][0], again.colnames) == (value, list(rows.colnames))
+    assert "note" not in again.meta
+
+
 def test_a_column_of_csv_is_what_all_of_its_rows_can_be(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("id,a,b,c\n1,1,,2\nn2,2,,2.5\n")
