@@ -15,9 +15,9 @@ from miricigale.utils.compilation import njit
 
 #: How square images are made from transforms, by products of small matrices: frequencies kx and ky (rad per pixel)
 #: at ky >= 0, then at ky <= 0, (2 ny nx,), what their squares count in the sum over all pixels; the PSF's
-#: transform, (2, ny, nx); cosines and sines along y, (2, size, 2 ny), and along x, (2, 2 nx, size), and their
-#: derivatives to the place.
-Plan = collections.namedtuple("Plan", "kx ky weight response inner outer")
+#: transform, (2, ny, nx); cosines and sines along y, (2, half + 1, ny), and cosines and negative sines along x,
+#: (2, half + 1, nx), at distances from the middle pixel.
+Plan = collections.namedtuple("Plan", "kx ky weight response waves_y waves_x")
 
 
 def make_plan(size, transform, passed):
@@ -27,7 +27,7 @@ def make_plan(size, transform, passed):
     Parameters
     ----------
     size : int
-        Pixels along a side of the images.
+        Pixels along a side of the images, odd.
     transform : complex `~numpy.ndarray`, shape (period, period // 2 + 1)
         `scipy.fft.rfft2` of the PSF about the first pixel.
     passed : float
@@ -50,83 +50,101 @@ def make_plan(size, transform, passed):
     response *= (1 + twice[:nx]) / period
     frequency = 2 * np.pi / period
     ky, kx = np.meshgrid(frequency * np.arange(ny), frequency * np.arange(nx), indexing="ij")
-    waves_y = np.exp(1j * (np.arange(size)[:, None] * ky[:, 0]))
-    waves_x = np.exp(1j * (kx[0, :, None] * np.arange(size)))
-    # images move against the pixels: derivatives to the place are -i k times the waves
-    slopes_y = -1j * ky[:, 0] * waves_y
-    slopes_x = -1j * kx[0, :, None] * waves_x
-    inner = [np.hstack([waves_y.real, waves_y.imag]), np.hstack([slopes_y.real, slopes_y.imag])]
-    outer = [np.vstack([waves_x.real, -waves_x.imag]), np.vstack([slopes_x.real, -slopes_x.imag])]
+    distance = np.arange(size // 2 + 1)[:, None]
+    phase_y = distance * ky[:, 0]
+    phase_x = distance * kx[0]
     return Plan(
         kx=np.tile(kx.ravel(), 2).astype(np.float32),
         ky=np.append(ky, -ky).astype(np.float32),
         weight=weight.astype(np.float32),
         response=response.astype(np.complex64),
-        inner=np.array(inner).astype(np.float32),
-        outer=np.array(outer).astype(np.float32),
+        waves_y=np.array([np.cos(phase_y), np.sin(phase_y)]).astype(np.float32),
+        waves_x=np.array([np.cos(phase_x), -np.sin(phase_x)]).astype(np.float32),
     )
 
 
 @njit()
-def _placed(plan, x, y):
-    """Move the PSF's transform to a place, (4, ny, nx): its two parts, the real and the imaginary one of each."""
-    _, ny, nx = plan.response.shape
-    along = np.empty(nx, np.complex64)
-    for j in range(nx):
-        # the shift theorem, along x
-        along[j] = np.exp(-1j * x * plan.kx[j])
-    placed = np.empty((4, ny, nx), np.float32)
-    for i in range(ny):
-        # and along y
-        turn = np.complex64(np.exp(-1j * y * plan.ky[i * nx]))
-        for j in range(nx):
-            positive = plan.response[0, i, j] * along[j] * turn
-            negative = plan.response[1, i, j] * along[j] * np.conj(turn)
-            placed[0, i, j] = positive.real
-            placed[1, i, j] = positive.imag
-            placed[2, i, j] = negative.real
-            placed[3, i, j] = negative.imag
-    return placed
+def _turns(frequency, shift, n):
+    """Return the factors (n,) by which a shift turns the phases of multiples of a frequency."""
+    turns = np.empty(n, np.complex64)
+    step = complex(np.cos(shift * frequency), -np.sin(shift * frequency))
+    turn = complex(1.0, 0.0)
+    for j in range(n):
+        turns[j] = turn
+        turn *= step
+    return turns
 
 
 @njit(fastmath=FAST)
-def _images(plan, curves, placed, n_moved, size):
+def _quarters(plan, curves, x, y, n_moved, size):
     """
-    Draw images, (size, n, size), of transforms, (n, 2, ny, nx), on a square of at most the plan's size.
+    Draw images of transforms, (n, 2, ny, nx), on a square of at most the plan's size, with a center (x, y) on it.
 
-    After them come the derivatives of the first ``n_moved`` to x and to y, (size, n_moved, size) each.
+    After the first image come its derivatives to x and to y if ``n_moved`` is 1. The result, (2, 2, half + 1, m,
+    half + 1), has the parts of the m images that are even and odd along x, of each those that are even and odd
+    along y, by the distances from the middle pixel along y and x.
     """
     n, _, ny, nx = curves.shape
-    # sums and differences of the two at +-ky, real and imaginary parts
-    right = np.empty((2 * ny, n, 2 * nx), np.float32)
+    m = n + 2 * n_moved
+    half = size // 2
+    step = 0
+    if nx > 1:
+        step = 1
+    # the shift theorem, from the middle pixel
+    along_x = _turns(plan.kx[step], x - half, nx)
+    step = 0
+    if ny > 1:
+        step = nx
+    along_y = _turns(plan.ky[step], y - half, ny)
+    # real and imaginary parts of the sums of the two at +-ky, and of their differences times i
+    sums = np.empty((2, 2, ny, m, nx), np.float32)
+    placed = np.empty((4, nx), np.float32)
     for i in range(ny):
+        turn = along_y[i]
+        for j in range(nx):
+            positive = plan.response[0, i, j] * along_x[j] * turn
+            negative = plan.response[1, i, j] * along_x[j] * np.conj(turn)
+            placed[0, j] = positive.real
+            placed[1, j] = positive.imag
+            placed[2, j] = negative.real
+            placed[3, j] = negative.imag
         for c in range(n):
+            k = c
+            if c > 0:
+                k = c + 2 * n_moved
             for j in range(nx):
-                positive = curves[c, 0, i, j]
-                negative = curves[c, 1, i, j]
-                positive_real = positive * placed[0, i, j]
-                positive_imag = positive * placed[1, i, j]
-                negative_real = negative * placed[2, i, j]
-                negative_imag = negative * placed[3, i, j]
-                right[i, c, j] = positive_real + negative_real
-                right[i, c, nx + j] = positive_imag + negative_imag
-                right[ny + i, c, j] = negative_imag - positive_imag
-                right[ny + i, c, nx + j] = positive_real - negative_real
+                at_positive = curves[c, 0, i, j]
+                at_negative = curves[c, 1, i, j]
+                positive_real = at_positive * placed[0, j]
+                positive_imag = at_positive * placed[1, j]
+                negative_real = at_negative * placed[2, j]
+                negative_imag = at_negative * placed[3, j]
+                sums[0, 0, i, k, j] = positive_real + negative_real
+                sums[1, 0, i, k, j] = positive_imag + negative_imag
+                sums[0, 1, i, k, j] = negative_imag - positive_imag
+                sums[1, 1, i, k, j] = positive_real - negative_real
+        if n_moved:
+            # derivatives to the place: -i k times the transform
+            ky = plan.ky[i * nx]
+            for parity in range(2):
+                for j in range(nx):
+                    kx = plan.kx[j]
+                    sums[0, parity, i, 1, j] = kx * sums[1, parity, i, 0, j]
+                    sums[1, parity, i, 1, j] = -kx * sums[0, parity, i, 0, j]
+            for part in range(2):
+                for j in range(nx):
+                    sums[part, 0, i, 2, j] = -ky * sums[part, 1, i, 0, j]
+                    sums[part, 1, i, 2, j] = ky * sums[part, 0, i, 0, j]
     # inverse transforms along y, then along x, as products of matrices
-    outer = plan.outer[:, :, :size].copy()
-    middle = np.dot(plan.inner[0, :size], right.reshape(2 * ny, -1)).reshape(size, n, 2 * nx)
-    images = np.dot(middle.reshape(-1, 2 * nx), outer[0]).reshape(size, n, size)
-    form = (size, n_moved, size)
-    if n_moved == 0:
-        return images, np.empty(form, np.float32), np.empty(form, np.float32)
-    if n_moved < n:
-        middle = middle[:, :n_moved].copy()
-        right = right[:, :n_moved].copy()
-    # derivatives: the waves of one axis are replaced by their slopes
-    along_x = np.dot(middle.reshape(-1, 2 * nx), outer[1])
-    middle = np.dot(plan.inner[1, :size], right.reshape(2 * ny, -1))
-    along_y = np.dot(middle.reshape(-1, 2 * nx), outer[0])
-    return images, along_x.reshape(form), along_y.reshape(form)
+    halves = np.empty((2, 2, half + 1, m * nx), np.float32)
+    quarters = np.empty((2, 2, half + 1, m, half + 1), np.float32)
+    for part in range(2):
+        for parity in range(2):
+            waves = plan.waves_y[parity, : half + 1]
+            np.dot(waves, sums[part, parity].reshape(ny, m * nx), halves[part, parity])
+        rows = halves[part].reshape(-1, nx)
+        np.dot(rows, plan.waves_x[part, : half + 1].T, quarters[part].reshape(-1, half + 1))
+    return quarters
 
 
 @njit()
@@ -147,27 +165,37 @@ def draw_curves(plan, curves, x, y, n_derivatives):
 
     Returns
     -------
-    images : float32 `~numpy.ndarray`, shape (size, n + n_derivatives, size)
+    images : float32 `~numpy.ndarray`, shape (n + n_derivatives, size, size)
     """
     _, ny, nx = plan.response.shape
-    placed = _placed(plan, x, y)
-    n_moved = n_derivatives // 2
-    size = plan.inner.shape[1]
+    half = plan.waves_x.shape[1] - 1
+    size = 2 * half + 1
     curves = curves.reshape(-1, 2, ny, nx)
-    images, along_x, along_y = _images(plan, curves, placed, n_moved, size)
-    return np.concatenate((images[:, :n_moved], along_x, along_y, images[:, n_moved:]), axis=1)
+    quarters = _quarters(plan, curves, x, y, n_derivatives // 2, size)
+    images = np.empty((len(curves) + n_derivatives, size, size), np.float32)
+    # the inverse of no noise
+    inverse = np.ones((size, size), np.float32)
+    for k in range(len(images)):
+        _whiten(quarters, k, inverse, 0, 0, images[k].reshape(-1))
+    return images
 
 
 @njit()
-def _whiten(images, k, inverse, y, x, column):
-    """Write image k of (size, n, size) over the noise into a column: the pixels of a rectangle, from (y, x) on."""
-    size = len(images)
+def _whiten(quarters, k, inverse, y, x, column):
+    """Write image k of `_quarters` over the noise into a column: the pixels of a rectangle, from (y, x) on."""
+    half = quarters.shape[2] - 1
     width = inverse.shape[1]
-    # by pixel: expressions of short pieces of arrays take longer than their pixels
-    for row in range(size):
-        for i in range(size):
-            noise = inverse[y + row, x + i]
-            column[(y + row) * width + x + i] = images[row, k, i] * noise
+    for row in range(2 * half + 1):
+        i = abs(row - half)
+        sign = np.float32(1.0 if row >= half else -1.0)
+        noise = inverse[y + row]
+        middle = (y + row) * width + x + half
+        # by pixel: expressions of short pieces of arrays take longer than their pixels
+        for j in range(half + 1):
+            even = quarters[0, 0, i, k, j] + sign * quarters[0, 1, i, k, j]
+            odd = quarters[1, 0, i, k, j] + sign * quarters[1, 1, i, k, j]
+            column[middle + j] = (even + odd) * noise[x + half + j]
+            column[middle - j] = (even - odd) * noise[x + half - j]
 
 
 @njit()
@@ -190,16 +218,13 @@ def _products(plan, table, inverse, squares, parameters, columns):
         first = s * k
         fill_curves(plan.kx, plan.ky, shape, table, curves.reshape(len(curves), -1))
         # each source is drawn on a square of its own
-        placed = _placed(plan, parameters[s, 0] - squares[s, 0], parameters[s, 1] - squares[s, 1])
-        images, along_x, along_y = _images(plan, curves, placed, n_moved, squares[s, 2])
-        x = squares[s, 0] - x0
-        y = squares[s, 1] - y0
-        _whiten(images, 0, inverse, y, x, columns[first])
-        if n_moved:
-            _whiten(along_x, 0, inverse, y, x, columns[first + 1])
-            _whiten(along_y, 0, inverse, y, x, columns[first + 2])
-        for j in range(3, k):
-            _whiten(images, j - 2, inverse, y, x, columns[first + j])
+        center_x = parameters[s, 0] - squares[s, 0]
+        center_y = parameters[s, 1] - squares[s, 1]
+        quarters = _quarters(plan, curves, center_x, center_y, n_moved, squares[s, 2])
+        for j in range(k):
+            x = squares[s, 0] - x0
+            y = squares[s, 1] - y0
+            _whiten(quarters, j, inverse, y, x, columns[first + j])
     if n == 1:
         return np.dot(columns, columns.T)
     products[last, last] = np.dot(columns[last], columns[last])
@@ -412,31 +437,6 @@ def minimum(plan, table, white, inverse, squares, start, mean, precision, limits
     return chi2, flux, parameters, evidence, covariance, matrix
 
 
-@njit(fastmath=FAST)
-def _center_products(images, along_x, along_y, s, inverse, white, products):
-    """Sum products, (3, 4), of a whitened model and its derivatives to the center with these and the data."""
-    aa = ab = ac = ad = bb = bc = bd = cc = cd = 0.0
-    for row in range(len(images)):
-        for i in range(len(images)):
-            noise = inverse[row, i]
-            d = white[row, i]
-            a = images[row, s, i] * noise
-            b = along_x[row, s, i] * noise
-            c = along_y[row, s, i] * noise
-            aa += a * a
-            ab += a * b
-            ac += a * c
-            ad += a * d
-            bb += b * b
-            bc += b * c
-            bd += b * d
-            cc += c * c
-            cd += c * d
-    products[0] = (aa, ab, ac, ad)
-    products[1] = (ab, bb, bc, bd)
-    products[2] = (ac, bc, cc, cd)
-
-
 @njit()
 def _product(a, b):
     """Sum of the products of two vectors: expressions of whole arrays take seconds to compile."""
@@ -447,15 +447,26 @@ def _product(a, b):
 
 
 @njit(fastmath=FAST)
-def _image_products(images, s, inverse, white):
-    """Sum the squares of a whitened model, and its products with the data."""
+def _image_products(quarters, inverse, white):
+    """Sum the squares of the first whitened image of `_quarters`, and its products with the data."""
+    half = quarters.shape[2] - 1
     power = 0.0
     projection = 0.0
-    for row in range(len(images)):
-        for i in range(len(images)):
-            value = images[row, s, i] * inverse[row, i]
-            power += value * value
-            projection += value * white[row, i]
+    for row in range(2 * half + 1):
+        i = abs(row - half)
+        sign = np.float32(1.0 if row >= half else -1.0)
+        noise = inverse[row]
+        data = white[row]
+        for j in range(half + 1):
+            even = quarters[0, 0, i, 0, j] + sign * quarters[0, 1, i, 0, j]
+            odd = quarters[1, 0, i, 0, j] + sign * quarters[1, 1, i, 0, j]
+            right = (even + odd) * noise[half + j]
+            left = (even - odd) * noise[half - j]
+            if j == 0:
+                # the middle counts once
+                left = 0.0
+            power += right * right + left * left
+            projection += right * data[half + j] + left * data[half - j]
     return power, projection
 
 
@@ -504,7 +515,7 @@ def evidence_of(
     images.
     """
     _, ny, nx = plan.response.shape
-    size = plan.inner.shape[1]
+    size = squares[0, 2]
     x0 = best[0, 0] - squares[0, 0]
     y0 = best[0, 1] - squares[0, 1]
     columns = np.empty((3, white.size))
@@ -516,14 +527,12 @@ def evidence_of(
         data += _product(row, row)
     # the best one first, whose center is free
     fill_curves(plan.kx, plan.ky, best[0, 2:], table, curve)
-    images, along_x, along_y = _images(plan, curves, _placed(plan, x0, y0), 1, size)
-    products = np.empty((3, 4))
-    _center_products(images, along_x, along_y, 0, inverse, white, products)
+    quarters = _quarters(plan, curves, x0, y0, 1, size)
+    for i in range(3):
+        _whiten(quarters, i, inverse, 0, 0, columns[i])
+    products = np.dot(columns, columns.T)
     if len(neighbors):
         # neighbors' light that was taken off is the best together with this one's
-        _whiten(images, 0, inverse, 0, 0, columns[0])
-        _whiten(along_x, 0, inverse, 0, 0, columns[1])
-        _whiten(along_y, 0, inverse, 0, 0, columns[2])
         shared = np.dot(columns, neighbors.T)
         for b in range(len(neighbors)):
             neighbor_data[b] = flux[0] * shared[0, b]
@@ -543,11 +552,10 @@ def evidence_of(
     likelihoods = np.zeros((len(shapes), 2))
     for s in range(len(shapes)):
         fill_curves(plan.kx, plan.ky, shapes[s], table, curve)
-        placed = _placed(plan, x0 + drift[s, 0], y0 + drift[s, 1])
-        images, _, _ = _images(plan, curves, placed, 0, size)
-        power, projection = _image_products(images, 0, inverse, white)
+        quarters = _quarters(plan, curves, x0 + drift[s, 0], y0 + drift[s, 1], 0, size)
+        power, projection = _image_products(quarters, inverse, white)
         if len(neighbors):
-            _whiten(images, 0, inverse, 0, 0, columns[0])
+            _whiten(quarters, 0, inverse, 0, 0, columns[0])
             shared_light = np.dot(neighbors, columns[0])
             power -= _product(shared_light, shared_light)
             projection -= _product(shared_light, neighbor_data)

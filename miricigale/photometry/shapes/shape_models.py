@@ -42,7 +42,7 @@ class ShapeModels:
         return self._responses[size]
 
     def plan(self, size):
-        """Return the `~miricigale.photometry._core.shape_fits.Plan` of squares of a size (pixels)."""
+        """Return the `~miricigale.photometry._core.shape_fits.Plan` of squares of an odd size (pixels)."""
         if size not in self._plans:
             self._plans[size] = make_plan(size, self._transform(_period((size,))), _PASSED)
         return self._plans[size]
@@ -65,7 +65,8 @@ class ShapeModels:
         images : `~numpy.ndarray`, shape (1 + derivatives, *shape)
             The model and its derivatives to the first parameters, in single precision.
         """
-        plan = self.plan(max(shape))
+        # squares have a middle pixel
+        plan = self.plan(max(shape) | 1)
         parameters = np.asarray(parameters, float)
         x, y = parameters[:2]
         # derivatives to the four parameters of the shape are curves, those to the place are not
@@ -74,7 +75,7 @@ class ShapeModels:
         curves = np.empty((n_curves, len(plan.kx)), np.float32)
         fill_curves(plan.kx, plan.ky, parameters[2:], profile_table(), curves)
         images = draw_curves(plan, curves, x, y, n_moved)
-        return np.ascontiguousarray(images.swapaxes(0, 1)[:, : shape[0], : shape[1]])
+        return np.ascontiguousarray(images[:, : shape[0], : shape[1]])
 
     def convolve(self, images, origin, shape):
         """

@@ -60,13 +60,13 @@ class DrawnCutout:
     @property
     def shape(self):
         """Shape of ``data``."""
-        size = self.plan.inner.shape[1]
+        size = 2 * self.plan.waves_x.shape[1] - 1
         return size, size
 
     @property
     def data(self):
         """The image, which is drawn anew each time."""
-        return draw_curves(self.plan, self.curve[None], self.x, self.y, 0)[:, 0]
+        return draw_curves(self.plan, self.curve[None], self.x, self.y, 0)[0]
 
     @property
     def layers(self):
