@@ -12,11 +12,13 @@ from miricigale.fitting.data.likelihood import (
     unused_bands,
 )
 from miricigale.fitting.data.nuclei import (
+    WHOLE,
     NucleusColumns,
     nucleus_columns,
     read_nuclei,
     with_units,
 )
+from miricigale.fitting.data.whole_points import WholePoints
 from miricigale.fitting.posterior.priors import known_redshifts
 from miricigale.fitting.results.results import FitResults
 from miricigale.utils.exceptions import FitWarning, warn
@@ -55,7 +57,8 @@ class CatalogFits(Interactive):
             optional["zero_point"] = self.zero_points
             optional["error_factor"] = self._reader.error_factor
         if self.nuclei:
-            optional["nuclei"] = True
+            optional["nuclei"] = self.nuclei
+        if self.nuclei is True:
             optional["nuclear_stars"] = float(self.backend.given.nuclear_stars)
         return {
             "engine": self._engine_name,
@@ -145,21 +148,32 @@ class CatalogFits(Interactive):
             seed = check_seed(seed)
         data, priors, settings = self._prepare(photometry, redshift, redshift_prior, repeated)
         backend = self.backend
+        points = None
         if self.nuclei:
             columns = self._nucleus_columns(photometry)
-            backend = backend.with_nuclei(columns.bands)
             values, left_out = read_nuclei(photometry, columns, data, self._reader)
             flags = data.flags | np.where(left_out, int(FitFlags.NUCLEUS_LEFT_OUT), 0)
-            data = data._changed(nuclei=values, flags=flags)
-            settings |= backend.settings()
+            data = data._changed(flags=flags)
+            if self.nuclei == WHOLE:
+                bands = [self.bands.index(band) for band in columns.bands]
+                points = WholePoints.of_values(data, values, bands, backend.wrong_part)
+                settings |= {"nuclei": list(columns.bands), "nuclear_light": WHOLE}
+            else:
+                backend = backend.with_nuclei(columns.bands)
+                data = data._changed(nuclei=values)
+                settings |= backend.settings()
         task = backend.task(pairs, seed, priors)
         # the measured errors take no part, and what goes to other processes is kept small
         task_data = data._changed(flux_err=None)
+        if points is not None:
+            task_data = points.combined._changed(flux_err=None)
         slices = list(chunks(len(data), chunk_size)) or [slice(0, 0)]
         pieces = [(task_data[rows], priors[rows]) for rows in slices]
         # numerical libraries use one thread each, in threads too, which share this setting with their process
         with single_threaded():
             results = FitResults.concatenate(parallel_map(task, pieces, desc="fit", **parallel))
+        if points is not None:
+            results = points.put_into(results)
         logger.debug("fitted %d objects", len(data))
         if seed is not None:
             settings["seed"] = seed

@@ -8,6 +8,7 @@ from miricigale.filters.band_names import known_filter
 from miricigale.fitting.catalog_fits import CatalogFits
 from miricigale.fitting.data import fitted_bands
 from miricigale.fitting.data.likelihood import PhotometryReader, filter_names, per_band
+from miricigale.fitting.data.nuclei import WHOLE
 from miricigale.fitting.fitter_options import (
     check_scale_error,
     chosen_settings,
@@ -117,11 +118,13 @@ class BayesFitter(CatalogFits):
         Reproduce choices of CIGALE that are not ours: no ``scale_error``, nodes alone, no result where the best
         chi2 is above 1417 (its weights, from which the best chi2 is not subtracted, all vanish;
         flagged ``NO_LIKELIHOOD``), and no standard deviation below 5 % of the mean.
-    nuclei : bool, optional
+    nuclei : bool or "whole", optional
         Of a grid: whether fluxes of the point in the center of galaxies are fitted as those of the AGN, beside the
         total fluxes and with their covariance (`miricigale.fitting.grid.nuclei`). They are columns
         ``<name>_flux_point`` (or ``<name>_nucleus``) with ``..._err``, ``..._corr`` (correlation with the total; 0
         without it) and ``..._limit``, as `~miricigale.photometry.ForcedPhotometryResult.to_table` writes them.
+        With ``"whole"`` the models are nothing but a point, as stars and little red dots, and points have all of
+        their light (`miricigale.fitting.data.whole_points`).
     settings : `GridSettings` or `SamplerSettings`, optional
         More settings of the engine.
 
@@ -254,7 +257,8 @@ class BayesFitter(CatalogFits):
                 settings = replace(settings, mass_function=calibration.mass_function)
         self.engine = engine
         self.calibration = calibration
-        check_that(isinstance(nuclei, bool), "nuclei", "True or False", repr(nuclei))
+        has_choice = isinstance(nuclei, bool) or nuclei == WHOLE
+        check_that(has_choice, "nuclei", f"True or False, or {WHOLE!r}", repr(nuclei))
         check_that(on_grid or not nuclei, "nuclei", "False with a sampler", repr(nuclei))
         self.nuclei = nuclei
         self.template_error = of_grid["template_error"]

@@ -455,6 +455,45 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
 
 
 @pytest.mark.slow
+def test_points_tell_stars_from_galaxies_of_their_colors(catalog, tmp_path):
+    """A star with the spectrum of a galaxy: without points the two are the same."""
+    axes = SEDModel.yang2021_axes("quick")
+    sed = SEDModel.yang2021(agn=False).evaluate(
+        redshift=catalog["z_spec"][0], tau=axes["tau"][0], age=axes["age"][0],
+        ebv=axes["ebv"][0], alpha=axes["alpha"][0], mass=1e10,
+    )  # fmt: skip
+    inside = (sed.wave > 0.2 * u.um) & (sed.wave < 60 * u.um)
+    flam = sed.fnu.to(u.erg / u.s / u.cm**2 / u.AA, u.spectral_density(sed.wave))
+    columns = np.column_stack([sed.wave.to_value(u.AA), flam.value])
+    np.savetxt(tmp_path / "galaxy.dat", columns[inside])
+    table = vstack([catalog[:1]] * 3)
+    table["id"] = [1, 2, 3]
+    for name in ("miri.f770w", "miri.f1500w"):
+        point = [0.0, 1.0, np.nan] * table[name]
+        table[f"{name}_flux_point"] = point
+        table[f"{name}_flux_point_err"] = 0.1 * table[name] + 0.0 * point
+        table[f"{name}_flux_point_corr"] = [-0.4, -0.4, -0.4]
+    table.write(tmp_path / "cat.fits")
+    argv = fit(tmp_path / "cat.fits", "--nuclei", "--stars", str(tmp_path / "galaxy.dat"))
+    with no_pictures():
+        assert main(argv) == 0
+    classes = QTable.read(tmp_path / "out" / "table.fits")
+    assert classes["class"][:2].tolist() == ["galaxy", "star"]
+    assert np.all(classes["class_probability"][:2] > 0.99)
+    # two fluxes that differ by d of sigma sqrt(V_P + V_T - 2 c) = 0.135 of them
+    galaxies = open_results(tmp_path / "out")[:]
+    stars = open_results(tmp_path / "out" / "star")[:]
+    without = stars.log_evidence[2]
+    variance = 0.1**2 + 0.05**2 + 2 * 0.4 * 0.1 * 0.05
+    width = np.array([table[name][0].to_value("uJy") for name in BANDS[4:]]) * np.sqrt(variance)
+    density = -np.log(np.sqrt(2.0 * np.pi) * width).sum()
+    assert_allclose(stars.chi2[0] - stars.chi2[2], 2 / variance, rtol=0.1)
+    assert galaxies.n_bands.tolist() == stars.n_bands.tolist() == [8, 8, 6]
+    # the colors fit so that the density of the differences is all that is added
+    assert_allclose(stars.log_evidence[1] - without, density, atol=0.3)
+
+
+@pytest.mark.slow
 def test_a_catalog_is_calibrated_by_its_known_redshifts(tmp_path, capsys, monkeypatch):
     """A zero point that is 15 % off is found, used, kept for the next call, and shown on the page."""
     axes, rng, n = SEDModel.yang2021_axes("quick"), np.random.default_rng(6), 104

@@ -7,12 +7,14 @@ import astropy.units as u
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import norm
 
 from helpers import grids
 from helpers.errors import refuses
-from miricigale.fitting import BayesFitter, FitFlags, GridSettings
+from miricigale.fitting import BayesFitter, FitFlags, GridSettings, compare_classes
 from miricigale.fitting.grid.nuclei import _cholesky
 from miricigale.fitting.posterior.posterior import randomized_ranks
+from miricigale.fitting.results.pulls import without_warnings
 from miricigale.utils.exceptions import FitWarning
 
 N = 5
@@ -262,6 +264,119 @@ def test_points_tell_agn_from_galaxies(grid, catalog):
     assert np.all(limited < 0.5 * bright)
 
 
+@pytest.fixture(scope="module")
+def points():
+    """Models without AGN, as of stars, in bands of known wavelengths."""
+    return replace(grids.make_grid(seed=7, frac=[0.0]), filters=REAL_BANDS)
+
+
+def table_of_points(grid, n, rng, part, *, factor=20.0):
+    """Models of a grid, of whose light the points have a part, (n,), with errors of 1 uJy."""
+    weight = grid.allowed / grid.allowed.sum()
+    place = rng.choice(weight.size, n, p=weight.ravel())
+    z, galaxy = np.unravel_index(place, weight.shape)
+    flux = grid.galaxy[z, galaxy]
+    flux = factor * flux / np.median(flux, axis=1, keepdims=True)
+    noise = rng.standard_normal(flux.shape)
+    table = grids.photometry_table(grid.filters, flux + noise, 1.0)
+    for band, correlation in zip(grid.filters[::2], CORRELATION.values(), strict=True):
+        j = grid.filters.index(band)
+        own = np.sqrt(1.0 - correlation**2) * rng.standard_normal(n)
+        light = part * flux[:, j] + 2.0 * (correlation * noise[:, j] + own)
+        table[f"{band}_nucleus"] = light * u.uJy
+        table[f"{band}_nucleus_err"] = np.full(n, 2.0) * u.uJy
+        table[f"{band}_nucleus_corr"] = np.full(n, correlation)
+    return table
+
+
+def test_posterior_of_points_alone_is_that_of_correlated_data(points):
+    """All of the light is in the point: totals and points are the same model twice."""
+    settings = GridSettings(interpolate=0)
+    fitter = BayesFitter(points, model_error=0.0, nuclei="whole", settings=settings)
+    table = table_of_points(points, N, np.random.default_rng(2), np.ones(N))
+    results = fitter.fit(table)
+    names = list(REAL_BANDS[::2])
+    assert results.meta["fit"]["nuclei"] == names
+    places = [REAL_BANDS.index(name) for name in names]
+    model = np.concatenate([points.galaxy, points.galaxy[..., places]], axis=-1)
+    priors = fitter.priors
+    prior = priors.redshift[:, None] * points.allowed * priors.galaxy / priors.galaxy.sum()
+    n = len(REAL_BANDS)
+    covariance = np.diag([1.0] * n + [4.0] * len(names))
+    for j, correlation in enumerate(CORRELATION.values()):
+        covariance[n + j, places[j]] = covariance[places[j], n + j] = 2.0 * correlation
+    for i in range(N):
+        columns = [*REAL_BANDS, *(f"{name}_nucleus" for name in names)]
+        data = np.array([table[name][i].value for name in columns])
+        chi2 = best_chi2(data, covariance, model)
+        weight = prior * np.exp(-0.5 * chi2)
+        constant = 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
+        assert_allclose(results.pdf["redshift"][i], weight.sum(axis=1) / weight.sum(), atol=1e-6)
+        assert_allclose(results.chi2[i], chi2[prior > 0].min(), rtol=1e-8)
+        assert_allclose(results.log_evidence[i], np.log(weight.sum()) - constant, rtol=1e-6)
+        assert results.n_bands[i] == n + len(names)
+        # what was measured is kept
+        assert_allclose(results.flux[i], data[:n])
+        assert_allclose(results.sigma[i], 1.0)
+
+
+@pytest.mark.parametrize("outliers", [None, 0.02])
+def test_classes_are_as_probable_as_they_say(points, outliers):
+    """Half of the sources are points, the others galaxies without AGN of the same colors."""
+    n = 600
+    rng = np.random.default_rng(4)
+    is_point = rng.permutation(n) < n // 2
+    # faint, so that points are told from galaxies in part
+    table = table_of_points(points, n, rng, np.where(is_point, 1.0, 0.0), factor=2.0)
+    grid = replace(grids.make_grid(seed=7, frac=[0.0, 0.5]), filters=REAL_BANDS)
+    settings = GridSettings(interpolate=0, nuclear_stars=0.0)
+    options = {"model_error": 0.0, "settings": settings, "outliers": outliers}
+    priors = {"frac_agn": [1.0, 0.0]}
+    # many are too faint for any scale
+    with without_warnings():
+        galaxies = BayesFitter(grid, nuclei=True, priors=priors, **options).fit(table)
+        stars = BayesFitter(points, nuclei="whole", **options).fit(table)
+    probability = compare_classes({"galaxy": galaxies, "star": stars})["probability_star"]
+    # the sum of probabilities is the number of points, of all sources and of doubtful ones
+    for low, high in ((0.0, 1.0), (0.1, 0.5), (0.5, 0.9)):
+        chosen = (probability >= low) & (probability <= high)
+        p = probability[chosen]
+        error = np.sqrt(np.sum(p * (1.0 - p)))
+        assert chosen.sum() > 50
+        assert abs(p.sum() - is_point[chosen].sum()) < 2.5 * error
+
+
+def test_limits_beside_points_alone(points):
+    settings = GridSettings(interpolate=0)
+    fitter = BayesFitter(points, model_error=0.0, nuclei="whole", settings=settings)
+    table = table_of_points(points, 4, np.random.default_rng(2), np.ones(4))
+    band = REAL_BANDS[0]
+    for name in (band, f"{band}_nucleus"):
+        table[f"{name}_limit"] = np.zeros(4, bool)
+    # far limits say nothing: a flux of the total or the point alone, or neither
+    for name, rows in ((band, (1, 3)), (f"{band}_nucleus", (2, 3))):
+        for row in rows:
+            table[name][row] = 1e4 * u.uJy
+            table[f"{name}_limit"][row] = True
+    results = fitter.fit(table)
+    other = table.copy()
+    other[band][1] = table[f"{band}_nucleus"][1]
+    other[f"{band}_err"][1] = table[f"{band}_nucleus_err"][1]
+    other[band][3] = np.nan * u.uJy
+    other[f"{band}_limit"] = False
+    other[f"{band}_nucleus"][1:] = np.nan * u.uJy
+    other[f"{band}_nucleus_err"][1:] = np.nan * u.uJy
+    other[f"{band}_nucleus_limit"] = False
+    expected = fitter.fit(other)
+    assert_allclose(results.pdf_2d, expected.pdf_2d, atol=1e-6)
+    assert_allclose(results.log_evidence, expected.log_evidence, rtol=1e-6)
+    assert np.all(results.limit[:, 0] == [False, True, False, True])
+    # a limit that lies one error below the point has the probability of that
+    table[band][1] = table[f"{band}_nucleus"][1] - np.hypot(1.0, 2.0) * u.uJy
+    lower = fitter.fit(table).log_evidence[1] - results.log_evidence[1]
+    assert lower == pytest.approx(norm.logcdf(-1.0), abs=1e-6)
+
+
 def test_unusable_fluxes_are_flagged(grid, catalog):
     fitter = BayesFitter(grid, nuclei=True, settings=GridSettings(interpolate=0))
     table = catalog.copy()
@@ -324,3 +439,7 @@ def test_refuses(grid, catalog):
     galaxies = grids.make_grid(frac=[0.0])
     fitter = BayesFitter(galaxies, nuclei=True, settings=GridSettings(interpolate=0))
     refuses("False for models without AGN", fitter.fit, catalog)
+    fits = {"galaxy": make(nuclei=True).fit(catalog)}
+    with pytest.warns(FitWarning, match="fluxes of nuclei are not fitted"):
+        fits["star"] = make().fit(catalog)
+    refuses("'star' of the same data as 'galaxy', got fluxes of nuclei", compare_classes, fits)

@@ -12,10 +12,10 @@ from miricigale.fitting.catalogs.class_names import chosen_classes
 from miricigale.fitting.catalogs.classification import class_columns
 from miricigale.fitting.catalogs.from_files import fit_catalog
 from miricigale.fitting.catalogs.page_numbers import thinned
+from miricigale.fitting.data.nuclei import WHOLE
 from miricigale.fitting.results.pulls import without_warnings
 from miricigale.pages import number
 from miricigale.plotting.axes import WIDTH, new_figure
-from miricigale.utils.options import check_that
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.tables import described_table
 
@@ -38,7 +38,8 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
     path, output, **options
         As for `~miricigale.fitting.fit_catalog`, which fits the galaxies. All classes have the same
         bands, errors of models, limits and known redshifts, but stars are at redshift 0, and in front of the Milky
-        Way's dust. ``priors`` and ``pairs`` are of galaxies alone.
+        Way's dust. ``priors`` and ``pairs`` are of galaxies alone. With ``nuclei`` the fluxes of points are those
+        of the AGN of galaxies and quasars, and all of the light of little red dots and stars.
     classes : iterable of str or str, optional
         Classes besides galaxies: ``"quasars"``, ``"red_dots"``, ``"stars"`` (with ``stars``), or ``"all"``; as
         text with commas between them. The arguments below ask for one each.
@@ -63,9 +64,6 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
         What `~miricigale.fitting.fit_catalog` warns of, once for all classes.
     """
     names = chosen_classes(classes, quasars=quasars, red_dots=red_dots, stars=stars)
-    # evidences of classes are compared for the same data
-    has_nuclei = bool(options.get("nuclei")) and bool(names)
-    check_that(not has_nuclei, "nuclei", "False with other classes than galaxies", "True")
     spectra = None
     if "stars" in names:
         from miricigale.sed import read_spectra
@@ -91,6 +89,8 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
             keywords = options | class_options
             fits[name] = fit_catalog(path, Path(output) / name, models=models, **keywords)
 
+        # little red dots and stars are points
+        of_points = {"nuclei": WHOLE if options.get("nuclei") else False}
         # sources of another class have large residuals
         with without_warnings():
             if "quasars" in names:
@@ -99,14 +99,14 @@ def fit_classes(path, output, *, classes=(), quasars=False, red_dots=False, star
                 # lines that cross the bands are exact at the nodes, and these lie close
                 priors = {"redshift": red_dot_prior(red_dot_axes()["redshift"])}
                 models = partial(red_dot_grid, ebv=options.get("ebv", 0.0))
-                fit("red_dot", models, interpolate=0, agn_error=0.0, priors=priors)
+                fit("red_dot", models, interpolate=0, agn_error=0.0, priors=priors, **of_points)
             options.pop("redshift", None)
             if spectra is not None:
 
                 def stars_in(bands):
                     return template_grid(spectra, bands, beyond="rayleigh-jeans"), None
 
-                fit("star", stars_in)
+                fit("star", stars_in, **of_points)
     return fits
 
 

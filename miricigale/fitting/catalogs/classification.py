@@ -193,6 +193,8 @@ def _check_same(whose, first, name, second):
         got = "other objects"
     elif set(bands) != set(second.fitted_filters):
         got = f"the bands {list(second.fitted_filters)}"
+    elif _nuclei(first) != _nuclei(second):
+        got = f"fluxes of nuclei in {_nuclei(second)}"
     else:
         first_columns = places(bands, first.filters)
         second_columns = places(bands, second.filters)
@@ -202,6 +204,11 @@ def _check_same(whose, first, name, second):
             if not np.array_equal(a, b, equal_nan=values != "limit"):
                 got = f"other values of {values!r}"
     check_that(got is None, "results", f"{name!r} of the same data as {whose!r}", got)
+
+
+def _nuclei(fit):
+    """List the bands whose fluxes of nuclei were fitted."""
+    return list(fit.meta.get("fit", {}).get("nuclei", ()))
 
 
 def _prior(prior, names, n):

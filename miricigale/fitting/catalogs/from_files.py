@@ -83,9 +83,10 @@ def fit_catalog(
     interpolate, agn_error, agn_bins : optional
         Models between the nodes for each object (0: nodes alone), the error of the light of AGN, and bins in
         which posteriors of AGN are kept, as in `miricigale.fitting.GridSettings`.
-    nuclei : bool, optional
+    nuclei : bool or "whole", optional
         Whether fluxes of the point in the center of galaxies (columns ``<filter>_flux_point`` or
-        ``<filter>_nucleus``) are fitted as those of AGN, as with `~miricigale.fitting.BayesFitter`.
+        ``<filter>_nucleus``) are fitted as those of AGN, or ``"whole"``: of all of the light, as with
+        `~miricigale.fitting.BayesFitter`.
     nuclear_stars : float, optional
         With these: part of the light of hosts that may be such a point, as in `miricigale.fitting.GridSettings`.
     hdu, chunk_rows, **options

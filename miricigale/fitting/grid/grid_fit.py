@@ -160,6 +160,13 @@ class GridFit:
         stars = float(self.given.nuclear_stars)
         return replace(self, nuclei=NuclearGrid(self.engine, index, stars, error))
 
+    @property
+    def wrong_part(self):
+        """Prior fraction of wrong fluxes of each band: shape (nb,)."""
+        if self.engine.mixture is None:
+            return np.zeros(len(self.filters))
+        return self.engine.mixture.part
+
     def with_relative_errors(self, part):
         """
         Return the fit for data to whose errors parts of the expected flux are to be added.
