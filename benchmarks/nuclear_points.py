@@ -1,7 +1,7 @@
 """
 How well AGN fractions are recovered with and without fluxes of nuclei: photometry without images.
 
-    python benchmarks/nuclear_points.py coverage [--n 300] [--chain] [--model-error 0.05]
+    python benchmarks/nuclear_points.py coverage [--n 300] [--chain] [--model-error 0.05] [--above F]
     python benchmarks/nuclear_points.py detection [--n 100] [--shallow 1 5] [--miri miri.f770w]
     python benchmarks/nuclear_points.py pulls [--n 40]
 
@@ -11,8 +11,9 @@ light of 0 +- 0.05, as the fit has it.
 
 coverage: models between the nodes of the axes of surveys, drawn with the prior of the fit, in which 80 % have an
 AGN of any fraction (``--chain``: their fluxes by the chain, not by interpolation). Each line: median offset of
-fracAGN and share of truths in the 68 % interval (randomized ranks) of all, of points above 10 sigma, and by true
-fraction.
+fracAGN and share of truths in the 68 % interval (randomized ranks) of all, of points above 10 sigma, of galaxies
+without dust, whose AGN have no light at any fraction, and of the others by true fraction. With ``--above`` true
+fractions are above F.
 
 detection: the fits have `agn_fraction_prior` (92.5 % without an AGN). Galaxies without an AGN whose median
 fraction is above 0.2, and AGN of 10^44 erg/s with fractions of 0.1 to 0.95 whose 16th percentile is above 0.1,
@@ -173,12 +174,18 @@ def signal_of_points(table):
     return np.max(signal, axis=0)
 
 
-def coverage(n, chain, model_error, seed):
+def coverage(n, chain, model_error, above, seed):
     """Print offsets and coverage of truths drawn from the prior."""
     rng = np.random.default_rng(seed)
     prior = np.array([WITHOUT_AGN] + 6 * [(1.0 - WITHOUT_AGN) / 6])
     fitter = make_fitter(list(DEPTHS), prior, model_error)
-    values = draw_values(fitter, 2 * n, rng)
+    n_drawn = 2 * n
+    if above > 0:
+        n_drawn = 20 * n
+    values = draw_values(fitter, n_drawn, rng)
+    if above > 0:
+        chosen = np.flatnonzero(values["frac_agn"] > above)
+        values = {name: column[chosen] for name, column in values.items()}
     flux, light, _ = fluxes_of(fitter, values, chain=chain)
     rows = np.flatnonzero(np.isfinite(flux).all(axis=1))[:n]
     values = {name: column[rows] for name, column in values.items()}
@@ -190,13 +197,17 @@ def coverage(n, chain, model_error, seed):
     fraction = values["frac_agn"]
     bright = signal_of_points(table) > BRIGHT
     samples = {"all": np.full(rows.size, True), "point > 10": bright, "none": fraction == 0}
+    dark = (fraction > 0) & (light.max(axis=1) == 0)
+    samples["no dust"] = dark
     for low, high in ((0.0, 0.15), (0.15, 0.3), (0.3, 0.5), (0.5, 0.7), (0.7, 0.95)):
-        samples[f"{low:g}-{high:g}"] = (fraction > low) & (fraction <= high)
+        samples[f"{low:g}-{high:g}"] = (fraction > low) & (fraction <= high) & ~dark
     for label, results in fits(fitter, table):
         ranks = posterior_ranks(fraction, *_cdf(results), seed=1)
         median = results.median("frac_agn").value
         low, high = results.percentile("frac_agn", (0.16, 0.84)).value.T
         for name, chosen in samples.items():
+            if not chosen.any():
+                continue
             held = np.mean(np.abs(ranks[chosen] - 0.5) < HALF_OF_INTERVAL)
             offset = np.median((median - fraction)[chosen])
             width = np.median((high - low)[chosen]) / 2.0
@@ -310,11 +321,12 @@ def main():
     parser.add_argument("--shallow", type=float, nargs="+", default=[1.0, 5.0])
     parser.add_argument("--miri", nargs="+", default=MIRI, help="bands, with F770W")
     parser.add_argument("--model-error", type=float, default=0.05, help="part of the flux")
+    parser.add_argument("--above", type=float, default=0.0, help="least true fraction")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     if args.what == "coverage":
-        coverage(args.n, args.chain, args.model_error, args.seed)
+        coverage(args.n, args.chain, args.model_error, args.above, args.seed)
     elif args.what == "pulls":
         pulls(args.n, args.seed)
     else:
