@@ -86,7 +86,9 @@ def read_prior(highres, *, segmentation=None, catalog=None):
         return segments, _from_segments(highres, segments, ids)
     sources = read_catalog(catalog, epoch=epoch_of(highres))
     if isinstance(catalog, (str, os.PathLike)):
-        sources = sources["id", "sky"]
+        # other columns of a file may be called as ours without being meant
+        kept = [name for name in ("id", "sky", "components") if name in sources.colnames]
+        sources = sources[kept]
     else:
         catalog = "the catalog"
     if segments is not None:
