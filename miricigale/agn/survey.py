@@ -15,6 +15,7 @@ from miricigale.agn.added_light import (
     draw_agn_parameters,
     nucleus_noise_curves,
 )
+from miricigale.agn.images import N_IMAGES
 from miricigale.agn.numbers import FLOOR, SampleNumbers, prior_table
 from miricigale.agn.shares import draw_shares
 from miricigale.evaluation import classify
@@ -173,7 +174,7 @@ class AGNSurvey:
         self.n_draws = check_count(n_draws, "n_draws")
         self.seed = check_seed(seed)
 
-    def run(self, path, output, **options):
+    def run(self, path, output, *, images=None, **options):
         """
         Fit a catalog, and the same with AGN added to it, and count AGN.
 
@@ -184,6 +185,9 @@ class AGNSurvey:
         output : path-like
             Folder: ``fits`` and ``injected`` in it hold the fits, which a later call resumes; the tables of the
             result and ``page.html`` are made anew.
+        images : `AGNImages`, optional
+            Images of the field, whose photometry has the ids of the catalog: AGN are injected into them and
+            measured in their bands, and added to the photometry of other bands alone.
         **options
             As for `~miricigale.fitting.catalogs.classes.fit_classes`, with which both are fitted alike.
 
@@ -204,7 +208,7 @@ class AGNSurvey:
         fits = fit_classes(path, output / "fits", agn_bins=self.bins, **options)
         sample = _Sample.of_fits(fits, self.bins, self.limit)
         check_that(sample.used.any(), "path", "a catalog of which objects can be fitted", "none")
-        injected = self._inject(path, fits, sample, output, options)
+        injected = self._inject(path, fits, sample, output, images, options)
         result = self._result(sample, injected)
         output.mkdir(parents=True, exist_ok=True)
         result.write(output, overwrite=True)
@@ -215,7 +219,7 @@ class AGNSurvey:
 
     # ------------------------------------------------------------------- injection
 
-    def _inject(self, path, fits, sample, output, options):
+    def _inject(self, path, fits, sample, output, images, options):
         """Table of injected AGN and what was fitted of them."""
         results = fits["galaxy"]
         texts = declared("miricigale.agn", "columns.toml")["injected"]
@@ -225,7 +229,7 @@ class AGNSurvey:
             for name in texts:
                 columns[name] = np.zeros(0)
             return described_columns(columns, texts)
-        photometry, truth = self._photometry(path, results, truth, options)
+        photometry, truth = self._photometry(path, results, truth, images, options)
         catalog = output / "injected.fits"
         _write_injected(photometry, catalog, resume=options.get("resume", True))
         fit_options = without(options, _OF_CATALOG)
@@ -246,7 +250,10 @@ class AGNSurvey:
             "redshift_fitted": refitted.redshift,
             "log_luminosity_fitted": refitted.log_luminosity,
             "frac_agn_fitted": refitted.frac_agn,
+            "n_images": np.zeros(len(truth), int),
         }
+        if N_IMAGES in truth.colnames:
+            columns["n_images"] = np.asarray(truth[N_IMAGES])
         return described_columns(columns, texts)
 
     def _injections(self, results, sample):
@@ -276,7 +283,7 @@ class AGNSurvey:
         rows = np.array(chosen)
         return {"row": rows, "log_luminosity": np.array(luminosity), "rng": rng}
 
-    def _photometry(self, path, results, truth, options):
+    def _photometry(self, path, results, truth, images, options):
         """Photometry of the hosts with AGN, and what is known of the AGN: two tables."""
         hosts = results[truth["row"]]
         bands = list(hosts.fitted_filters)
@@ -304,13 +311,17 @@ class AGNSurvey:
         luminosity = (10.0 ** truth["log_luminosity"] * u.erg / u.s).to(LUMINOSITY)
         parameters = draw_agn_parameters(hosts.axes, len(hosts), truth["rng"])
         check_that("frac_agn" in hosts.axes, "models", "with several AGN fractions", "others")
+        lit_bands = bands
+        if images is not None:
+            lit_bands = bands + _bands_of_images(images, bands)
         light, fraction = agn_light(
-            results.model, hosts, luminosity, parameters, bands, quantity=self.bins.quantity
+            results.model, hosts, luminosity, parameters, lit_bands, quantity=self.bins.quantity
         )
         usable = np.all([np.isfinite(light[band]) for band in bands], axis=0)
         for j, band in enumerate(bands):
             light[band] = np.where(usable, light[band].to_value(FNU) / points[j], 0.0) * FNU
-        table = add_light(table, light, curves=curves, seed=self.seed)
+        of_bands = {band: light[band] for band in bands}
+        lit = add_light(table, of_bands, curves=curves, seed=self.seed)
         truth_table = QTable({"host": hosts.ids, "redshift": hosts.best["redshift"].value})
         truth_table["log_luminosity"] = truth["log_luminosity"]
         truth_table["frac_agn"] = fraction
@@ -318,7 +329,14 @@ class AGNSurvey:
         if n_lost:
             text = "injected AGN are left out: the best models of their galaxies have no dust, or are too old"
             warn(f"{n_lost} of {len(hosts)} {text}", FitWarning)
-        return table[usable], truth_table[usable]
+        if images is None:
+            return lit[usable], truth_table[usable]
+        of_usable = {band: values[usable] for band, values in light.items()}
+        truth_table = truth_table[usable]
+        lit = images.add_agn(table[usable], lit[usable], truth_table["host"], of_usable)
+        truth_table[N_IMAGES] = lit[N_IMAGES]
+        lit.remove_column(N_IMAGES)
+        return lit, truth_table
 
     # ---------------------------------------------------------------------- result
 
@@ -407,6 +425,18 @@ class AGNSurvey:
         if weight is not None:
             weight = weight[chosen]
         return np.bincount(flat, weight, n_z * n_lum).reshape(n_z, n_lum)
+
+
+def _bands_of_images(images, bands):
+    """List the filters of images that no band is, which is that of the prior alone."""
+    lacking = [band for band in images.bands if band not in bands]
+    check_that(not lacking, "images", f"of bands that are fitted ({', '.join(bands)})", lacking)
+    check_that(
+        images.prior_band is not None, "images", "with a prior whose filter is known", "another"
+    )
+    if images.prior_band in bands:
+        return []
+    return [images.prior_band]
 
 
 def _write_injected(photometry, path, *, resume):

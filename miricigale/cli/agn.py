@@ -1,10 +1,13 @@
 """The command that counts AGN."""
 
-from miricigale.cli.catalogs import fit_options, fit_workers
-from miricigale.cli.options import filled
+from miricigale.cli.catalogs import fit_options, fit_workers, images_of, photometer_options
+from miricigale.cli.options import declarations, destination, filled, refuse
+from miricigale.utils.named_values import attributes, without_none
 
 #: CPU-seconds of a fit of an object as a galaxy, and as each other class.
 _SECONDS = 0.1
+#: Options of the prior and its sources.
+_OF_PRIOR = ("segmentation", "catalog", "psf_stars")
 
 
 def agn(args):
@@ -20,17 +23,44 @@ def agn(args):
     if args.redshift_bins is not None:
         settings["redshift"] = args.redshift_bins
     survey = AGNSurvey(**settings)
+    images = _images(args)
     if args.plan:
         print(_plan(args, survey))
         return 0
     with fit_workers(args) as executor:
-        result = survey.run(**fit_options(args), executor=executor)
+        result = survey.run(images=images, **fit_options(args), executor=executor)
     for row in result.totals:
         interval = f"{row['n_low']:.1f} to {row['n_high']:.1f}"
         shipped = f"{row['n_shipped']:.1f} with the shipped prior"
         print(f"AGN with fracAGN >= {row['frac_agn']:g}: {row['n']:.1f} ({interval}); {shipped}")
     print(f"{result.totals['n_selected'][0]} selected objects; page: {args.output / 'page.html'}")
     return 0
+
+
+def _images(args):
+    """Make the `~miricigale.agn.AGNImages` of the options of images; None without any."""
+    if args.images is None:
+        names = []
+        for flag in declarations()["agn"]["as_in"]["photometry"]:
+            option = declarations()["photometry"]["options"][flag]
+            if "{prefix}" in flag:
+                for prefix in ("", "highres-"):
+                    names.append(destination(flag.replace("{prefix}", prefix), option))
+            else:
+                names.append(destination(flag, option))
+        refuse(args, names, "given with --images")
+        return None
+    from miricigale.agn import AGNImages
+
+    if len(args.images) < 2:
+        msg = f"--images must be one image at least and the prior, got {args.images}"
+        raise ValueError(msg)
+    paths = args.images[:-1]
+    options = photometer_options(args) | without_none(attributes(args, _OF_PRIOR))
+    if args.kernel:
+        options["kernel"] = [None if name == "-" else name for name in args.kernel]
+    (highres,) = images_of(args, args.images[-1:], "highres_")
+    return AGNImages(images_of(args, paths), highres, n_threads=args.n_threads, **options)
 
 
 def _plan(args, survey):

@@ -63,6 +63,44 @@ def recovered_rows(positions, fluxes, former, former_fluxes, sky, flux, radius):
     return rows
 
 
+def check_psfs(photometer):
+    """Refuse a `~miricigale.photometry.ForcedPhotometer` of which the PSFs of image and prior are not known."""
+    if photometer.bare:
+        wanted = "given with their PSFs, which injected sources are drawn with"
+        raise argument_error("kernel", wanted, "a kernel without 'highres_psf'")
+
+
+def field_psfs(photometer, header, result):
+    """
+    PSFs of an image and of its prior, as stars have corrected them.
+
+    Parameters
+    ----------
+    photometer : `~miricigale.photometry.ForcedPhotometer`
+        What measured the image.
+    header : `~miricigale.photometry.images.mosaic_headers.MosaicHeader`
+        Of the prior.
+    result : `~miricigale.photometry.ForcedPhotometryResult`
+        What it measured.
+
+    Returns
+    -------
+    psf, prior_psf : `~miricigale.psf.InstrumentPSF`
+    """
+    kernel = photometer.mean_kernel
+    if result.psf_stars is not None:
+        kernel = result.psf_stars.kernel
+        kernel = getattr(kernel, "mean", kernel)
+    form = {"pixel_scale": kernel.pixel_scale, "frame": "sky"}
+    form["angle"] = grid_angle(header.wcs, header.shape)
+    target = np.asarray(kernel.target)
+    source = np.asarray(kernel.source)
+    return (
+        make_psf(target, enclosed=min(1.0, float(target.sum())), **form),
+        make_psf(source, enclosed=min(1.0, float(source.sum())), **form),
+    )
+
+
 class PriorField:
     """
     A field that is measured on a high-resolution prior.
@@ -87,9 +125,7 @@ class PriorField:
     def photometers(self):
         """What measures the image, by band."""
         photometers = self.inputs.photometers(self.n_threads)
-        if photometers[self.band].bare:
-            wanted = "given with their PSFs, which injected sources are drawn with"
-            raise argument_error("kernel", wanted, "a kernel without 'highres_psf'")
+        check_psfs(photometers[self.band])
         return photometers
 
     def psfs(self, result):
@@ -105,19 +141,7 @@ class PriorField:
         -------
         psf, prior_psf : `~miricigale.psf.InstrumentPSF`
         """
-        kernel = self.photometers[self.band].mean_kernel
-        if result.psf_stars is not None:
-            kernel = result.psf_stars.kernel
-            kernel = getattr(kernel, "mean", kernel)
-        header = self.inputs.highres.header
-        form = {"pixel_scale": kernel.pixel_scale, "frame": "sky"}
-        form["angle"] = grid_angle(header.wcs, header.shape)
-        target = np.asarray(kernel.target)
-        source = np.asarray(kernel.source)
-        return (
-            make_psf(target, enclosed=min(1.0, float(target.sum())), **form),
-            make_psf(source, enclosed=min(1.0, float(source.sum())), **form),
-        )
+        return field_psfs(self.photometers[self.band], self.inputs.highres.header, result)
 
     def usable(self, image, prior):
         """Pixels of the image that have data, in the prior too: bool, (ny, nx)."""

@@ -283,6 +283,52 @@ def test_injected_agn_are_in_the_nuclei_that_were_measured(model, truth, photome
     assert np.all(np.abs(apart[good]) < 0.1)
 
 
+class StubImages:
+    """Images on which AGN are measured as twice as bright as they are."""
+
+    bands = (BANDS[3],)
+    prior_band = "nircam.f444w"
+
+    def add_agn(self, photometry, lit, hosts, light):
+        table = lit.copy()
+        band = BANDS[3]
+        table[band] = photometry[band] + 2.0 * light[band]
+        table["n_images"] = np.arange(len(table)) % 2
+        self.light = light
+        self.hosts = hosts
+        return table
+
+
+def test_injected_agn_are_measured_on_images(run, model, tmp_path):
+    catalog = run("first")[1].parent / "catalog.ecsv"
+    survey = AGNSurvey(
+        20 * u.arcmin**2, redshift=(0.5, 1.5), log_luminosity=(43.5, 44.5), n_injections=6, seed=2
+    )
+    images = StubImages()
+    options = OPTIONS | {"models": lambda _: (model, AXES)}
+    result = survey.run(catalog, tmp_path / "agn", images=images, **options)
+    injected = QTable.read(tmp_path / "agn" / "injected.fits")
+    table = QTable.read(catalog)
+    rows = np.searchsorted(table["id"], images.hosts)
+    added = injected[BANDS[3]] - table[BANDS[3]][rows]
+    np.testing.assert_allclose(added.value, 2.0 * images.light[BANDS[3]].value, rtol=1e-5)
+    # other bands have the light itself, and the prior's is known
+    added = injected[BANDS[0]] - table[BANDS[0]][rows]
+    error = injected[f"{BANDS[0]}_err"].value
+    assert np.all(np.abs(added - images.light[BANDS[0]]).value < 4.0 * error)
+    assert np.all(images.light["nircam.f444w"].value > 0)
+    assert result.injected["n_images"].tolist() == [0, 1, 0, 1, 0, 1]
+    images.bands = ("miri.f560w",)
+    refuses(
+        "'images' must be of bands that are fitted",
+        survey.run,
+        catalog,
+        tmp_path / "b",
+        images=images,
+        **options,
+    )
+
+
 def test_other_injections_replace_nothing(photometry, tmp_path):
     path = tmp_path / "injected.fits"
     photometry = photometry.copy()
@@ -319,5 +365,9 @@ def test_command_states_its_plan_and_names_its_options(photometry, tmp_path, cap
     assert "24 objects and 76 injected AGN in 2 classes: 200 fits" in said
     assert not (tmp_path / "agn").exists()
     assert "--limit must be from 0.1" in command(capsys, *arguments, "--limit", 0, status=2).err
+    said = command(capsys, *arguments, "--components", 2, status=2).err
+    assert "--components must be given with --images" in said
+    said = command(capsys, *arguments, "--images", "a.fits", status=2).err
+    assert "--images must be one image at least and the prior" in said
     said = command(capsys, *arguments, "--interpolate", 0, status=2).err
     assert "--interpolate must be above 0" in said

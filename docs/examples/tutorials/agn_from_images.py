@@ -178,7 +178,8 @@ shown
 # ------------
 # Objects with a high AGN fraction are no census. :class:`~miricigale.agn.AGNSurvey` fits the catalog as galaxies
 # and as quasars, fits it again with AGN of known luminosity added to the galaxies, and measures on the sample
-# itself how frequent AGN are. It takes total fluxes: AGN that are added to the photometry have no points.
+# itself how frequent AGN are. Here it takes total fluxes; ``nuclei=True`` adds points, and ``images`` puts the AGN
+# into the images (:class:`~miricigale.agn.AGNImages`).
 
 joined.remove_columns([*points, "sky", "components"])
 joined.write("catalog.ecsv", overwrite=True)
