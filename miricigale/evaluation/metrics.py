@@ -251,7 +251,13 @@ def recovery_metrics(true, measured, *, relative=False):
     if delta.size:
         median = float(np.median(delta))
         error = 1.2533 * sigma / np.sqrt(delta.size)
-    return RecoveryMetrics(delta.size, int(np.sum(~good)), median, error, sigma)
+    return RecoveryMetrics(
+        n=delta.size,
+        n_unusable=int(np.sum(~good)),
+        median=median,
+        median_err=error,
+        sigma_mad=sigma,
+    )
 
 
 def running_median(x, y, *, size=20):

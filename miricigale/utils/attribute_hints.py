@@ -3,6 +3,7 @@
 import difflib
 
 from miricigale.utils.caching import cached
+from miricigale.utils.hinted_errors import HintedAttributeError
 from miricigale.utils.package_tables import declared
 
 #: Most names that a message suggests, and most that it lists if none is near.
@@ -16,11 +17,9 @@ _OTHERWISE = "_"
 _EMPTY_WORDS = {"to", "from", "get", "set", "is", "has", "by", "of", "at", "as", "my", "the", "all"}
 
 
-class UnknownAttributeError(AttributeError):
+class UnknownAttributeError(HintedAttributeError):
     """
-    An attribute that is not there, with what to write instead.
-
-    Near names are looked up when the message is read: most of such errors only answer ``hasattr``.
+    An attribute that an object does not have, with what to write instead.
 
     Parameters
     ----------
@@ -31,26 +30,17 @@ class UnknownAttributeError(AttributeError):
     """
 
     def __init__(self, owner, name):
-        # not `obj`, by which Python would append a suggestion of its own
         if isinstance(owner, type):
-            what = f"class {owner.__name__!r}"
+            label = f"class {owner.__name__!r}"
         else:
-            what = f"{type(owner).__name__!r} object"
-        super().__init__(f"{what} has no attribute {name!r}", name=name)
-        self._owner = owner
+            label = f"{type(owner).__name__!r} object"
+        super().__init__(owner, name, label)
 
-    def __str__(self):
-        message = self.args[0]
+    def _hint(self):
         cls = self._owner
         if not isinstance(cls, type):
             cls = type(cls)
-        hint = attribute_hint(cls, self.name, dir(self._owner))
-        if hint:
-            return f"{message}; {hint}"
-        return message
-
-    def __reduce__(self):
-        return type(self), (self._owner, self.name)
+        return attribute_hint(cls, self.name, dir(self._owner))
 
 
 def attribute_hint(cls, name, names):

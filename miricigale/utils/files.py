@@ -351,6 +351,28 @@ def packed_open(path):
     return open(path, "rb")
 
 
+def has_match(path, pattern, *, overlap):
+    """
+    Whether a file, packed or not, has a match of a pattern.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    pattern : `re.Pattern`
+        Of bytes.
+    overlap : int
+        Bytes of a piece that are looked at with the next one too.
+    """
+    before = b""
+    with packed_open(path) as stream:
+        while piece := stream.read(_CHUNK):
+            if pattern.search(before + piece):
+                return True
+            before = piece[-overlap:]
+    return False
+
+
 @cached_by_file(256)
 def _count(path, limit):
     """Bytes after unpacking; one more than the most if there are more."""

@@ -2,12 +2,12 @@
 
 import lazy_loader
 
+from miricigale.utils.hinted_errors import HintedAttributeError
 
-class UnknownModuleAttributeError(AttributeError):
+
+class UnknownModuleAttributeError(HintedAttributeError):
     """
     A name that a subpackage does not have, with what to write instead.
-
-    The hint is looked up when the message is read: most of such errors only answer ``hasattr``.
 
     Parameters
     ----------
@@ -18,22 +18,13 @@ class UnknownModuleAttributeError(AttributeError):
     """
 
     def __init__(self, module, name):
-        # not `obj`, by which Python would append a suggestion of its own
-        super().__init__(f"module {module!r} has no attribute {name!r}", name=name)
-        self._module = module
+        super().__init__(module, name, f"module {module!r}")
 
-    def __str__(self):
-        message = self.args[0]
+    def _hint(self):
         # loads numpy, which ``import miricigale`` does without
         from miricigale.utils.module_hints import module_hint
 
-        hint = module_hint(self._module, self.name)
-        if hint:
-            return f"{message}; {hint}"
-        return message
-
-    def __reduce__(self):
-        return type(self), (self._module, self.name)
+        return module_hint(self._owner, self.name)
 
 
 def attach_stub(package_name, filename):

@@ -14,7 +14,7 @@ from astropy.table import Column, MaskedColumn, Table
 from astropy.utils.exceptions import AstropyWarning
 
 from miricigale.utils.exceptions import CatalogWarning, warn
-from miricigale.utils.files import is_zip, packed_open
+from miricigale.utils.files import has_match, is_zip, packed_open
 from miricigale.utils.fits_tables import check_names_differ
 from miricigale.utils.ids import WRITTEN_INDEX, ids_of_text, is_id_name, is_written_index
 from miricigale.utils.missing_values import between_missing, is_missing_word
@@ -171,7 +171,7 @@ def _ids_as_written(table, path, source, layout, names):
     """Put the ids of a text file in place that stand there, 0007 or 18446744073709551615."""
     for name in names:
         column = MaskedColumn(table[name])
-        if column.dtype.kind in "iu" and not _has_odd_numbers(path):
+        if column.dtype.kind in "iu" and not has_match(path, _ODD_NUMBER, overlap=4):
             continue
         if column.dtype.kind == "U":
             texts = np.asarray(column)
@@ -193,17 +193,6 @@ def _ids_as_written(table, path, source, layout, names):
             table[name] = MaskedColumn(texts_as_numbers, mask=missing)
         else:
             table[name] = Column(texts_as_numbers)
-
-
-def _has_odd_numbers(path):
-    """Whether a file has a number with a leading zero or plus sign, anywhere."""
-    before = b""
-    with packed_open(path) as stream:
-        while piece := stream.read(_PIECE):
-            if _ODD_NUMBER.search(before + piece):
-                return True
-            before = piece[-4:]
-    return False
 
 
 def first_bytes(path):

@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from miricigale.utils.exceptions import CatalogWarning, warn
-from miricigale.utils.files import packed_open
+from miricigale.utils.files import has_match, packed_open
 from miricigale.utils.ids import WRITTEN_INDEX, is_id_name
 from miricigale.utils.missing_values import is_missing_word
 
@@ -20,6 +20,8 @@ _HEAD = 1 << 20
 _BARRED = 50
 #: A line between names and rows: of Markdown, or after the units of VizieR.
 _RULE = re.compile(r"[-:|;,\t ]+")
+#: A line after the first that begins with the mark of a comment.
+_LATER_COMMENT = re.compile(rb"\n#")
 #: First line of a catalog of SExtractor: number, name and meaning of the first column.
 _SEXTRACTOR = re.compile(rb"#\s*1\s+[A-Za-z]\w*(?:\s|$)")
 
@@ -235,7 +237,7 @@ def without_comments(source, path, separator):
         The same if there is no such line: one that begins with ``#`` and has not as many cells as the first line,
         so that ids such as ``#1`` stay.
     """
-    if isinstance(source, str) and not _has_mark(path):
+    if isinstance(source, str) and not has_match(path, _LATER_COMMENT, overlap=1):
         return source
     lines = _lines(source, path)
     header = next((line for line in lines if line.strip()), "")
@@ -248,17 +250,6 @@ def without_comments(source, path, separator):
         if not is_comment:
             rows.append(line)
     return rows
-
-
-def _has_mark(path):
-    """Whether a line after the first begins with the mark of a comment."""
-    last = b""
-    with packed_open(path) as stream:
-        while piece := stream.read(_HEAD):
-            if b"\n#" in last + piece:
-                return True
-            last = piece[-1:]
-    return False
 
 
 def drop_repeated(table, path):
