@@ -241,17 +241,21 @@ def plot_sed_fit(
     # a band that was left out may have an error that is none
     with_error = have & (err > 0)
     pull = np.where(with_error, (flux - model) / np.where(with_error, err, 1.0), np.nan)
-    residual_ax.axhline(0.0, color="0.6", linewidth=0.8)
-    for rows, _, style in points:
-        residual_ax.plot(wave[rows], pull[rows], **style)
-    # of limits only those that the model passes have to be seen
-    shown_pull = with_error & ~(limit & (pull > 0))
-    size = np.nanmax(np.abs(pull[shown_pull]), initial=2.5) * 1.15
-    if np.any(bound):
-        residual_ax.errorbar(wave[bound], pull[bound], yerr=0.25 * size, **_ARROW)
-    residual_ax.set(ylim=(-size, size), ylabel="residual (sigma)")
-    residual_ax.set_xlabel("observed wavelength (µm)")
+    _draw_residuals(residual_ax, wave, pull, points, bound)
     return ax, residual_ax
+
+
+def _draw_residuals(ax, wave, pull, points, limit):
+    """Draw residuals in units of the errors, NaN without one; those of upper limits as arrows."""
+    ax.axhline(0.0, color="0.6", linewidth=0.8)
+    for rows, _, style in points:
+        ax.plot(wave[rows], pull[rows], **style)
+    # of limits only those that the model passes have to be seen
+    visible = np.isfinite(pull) & ~(limit & (pull > 0))
+    size = np.nanmax(np.abs(pull[visible]), initial=2.5) * 1.15
+    if np.any(limit):
+        ax.errorbar(wave[limit], pull[limit], yerr=0.25 * size, **_ARROW)
+    ax.set(ylim=(-size, size), ylabel="residual (sigma)", xlabel="observed wavelength (µm)")
 
 
 def _points(groups, is_used, limit):

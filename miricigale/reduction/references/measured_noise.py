@@ -163,43 +163,61 @@ def measure_noise(ramp):
         rows += [(signal[part].mean(), *_noise(data[:, part])) for part in parts]
         if blind[0].size >= _FEWEST:
             dark.append(_noise(_parts(ramp, k, blind)[1])[:2])
-    m, v, v_err, s, s_err = np.array(rows).T
-    read, _ = _mean(s, s_err)
+    signal, added, added_err, single, single_err = np.array(rows).T
+    read, _ = _mean(single, single_err)
     rounded = ramp.data.dtype.kind == "u"
     # of one read: the photons that neighbors share make the noise of averaged ones smaller
     n_frames = ramp.exposure.n_frames
-    read += shared_photons(n_frames) * _mean(v, v_err)[0]
+    read += shared_photons(n_frames) * _mean(added, added_err)[0]
     read -= read_variance(0.0, n_frames, rounded=rounded)
     read_noise = np.sqrt(max(n_frames * read, 0.0))
-    mean, mean_err = _mean(v, v_err)
+    return MeasuredNoise(float(read_noise), **_photon_transfer(signal, added, added_err, dark))
+
+
+def _photon_transfer(signal, added, added_err, dark):
+    """
+    Gain by how the variance that a group adds grows with its signal, and the slow noise of the read-out.
+
+    The variance is signal / gain + slow, DN^2: photon noise, and noise that does not go with the signal. Where the
+    signal is too even for a slope, the mean variance less that of ``dark`` pixels (variances and errors of
+    integrations, of pixels without light) is taken for photon noise.
+
+    Returns
+    -------
+    values : dict of str to float
+        ``gain`` (infinite where no photon noise is seen), ``gain_err``, ``slow_noise`` and ``effective`` of
+        `MeasuredNoise`.
+    """
+    mean, mean_err = _mean(added, added_err)
+    slow = 0.0
+    slow_err = 0.0
     if dark:
         slow, slow_err = _mean(*np.array(dark).T)
-    else:
-        slow = 0.0
-        slow_err = 0.0
-    # v = m / gain and slow noise of the read-out, which does not go with the signal
-    weight = 1 / v_err**2
-    middle = _mean(m, v_err)[0]
-    squares = (weight * (m - middle) ** 2).sum()
-    inverse = (weight * (m - middle) * v).sum() / squares
-    residual = weight * (v - mean - inverse * (m - middle)) ** 2
-    inverse_err = max(np.sqrt(residual.sum() / (len(rows) - 2)), 1.0) / np.sqrt(squares)
-    detected = inverse > _SEEN * inverse_err
-    if not detected:
+    # weighted least squares about the mean signal
+    weight = 1 / added_err**2
+    offset = signal - _mean(signal, added_err)[0]
+    squares = (weight * offset**2).sum()
+    inverse = (weight * offset * added).sum() / squares
+    residual = weight * (added - mean - inverse * offset) ** 2
+    inverse_err = max(np.sqrt(residual.sum() / (len(signal) - 2)), 1.0) / np.sqrt(squares)
+    has_slope = inverse > _SEEN * inverse_err
+    if not has_slope:
+        middle = _mean(signal, added_err)[0]
         inverse = (mean - slow) / middle
         inverse_err = np.hypot(mean_err, slow_err) / abs(middle)
+    gain = np.inf
+    gain_err = np.nan
     if inverse > _SEEN * inverse_err:
         gain = 1 / inverse
         gain_err = inverse_err / inverse**2
     else:
-        gain = np.inf
-        gain_err = np.nan
         slow = mean
-    effective = not detected and not dark and np.isfinite(gain)
-    slow_noise = np.sqrt(max(slow, 0.0))
-    return MeasuredNoise(
-        *map(float, (read_noise, gain, gain_err)), bool(effective), float(slow_noise)
-    )
+    return {
+        "gain": float(gain),
+        "gain_err": float(gain_err),
+        "effective": bool(not has_slope and not dark and np.isfinite(gain)),
+        "slow_noise": float(np.sqrt(max(slow, 0.0))),
+    }
 
 
 def _sampled_pixels(mask):
