@@ -134,6 +134,12 @@ def legend(ax, **options):
     return ax.legend(**{"fontsize": 8, "frameon": False} | options)
 
 
+def corner_note(ax, text, side="right"):
+    """Write a text in an upper corner of axes, ``"left"`` or ``"right"``."""
+    place = {"left": 0.04, "right": 0.96}
+    ax.text(place[side], 0.95, text, transform=ax.transAxes, ha=side, va="top", fontsize=8)
+
+
 def add_borders(ax, labels, x, y, **kwargs):
     """
     Draw the borders between cells of different labels; around those at the edge too, unless their label is 0.

@@ -11,6 +11,7 @@ from miricigale.plotting.axes import (
     SECOND,
     TRUE,
     WIDTH,
+    corner_note,
     label_outer,
     legend,
     new_figure,
@@ -234,8 +235,7 @@ def _draw_differences(ax, magnitude, difference, rows):
     title = f"{ax.get_title()} ({np.count_nonzero(rows)})"
     plot_offsets(x, y, running=running_median(x, y), ax=ax, title=title)
     if y.size:
-        note = f"median {np.median(y):+.3f} mag"
-        ax.text(0.96, 0.95, note, transform=ax.transAxes, ha="right", va="top", fontsize=8)
+        corner_note(ax, f"median {np.median(y):+.3f} mag")
 
 
 #: Least star-formation rate and stellar mass that the figure of the inputs shows.

@@ -24,6 +24,7 @@ from miricigale.plotting.axes import (
     STYLES,
     TRUE,
     WIDTH,
+    corner_note,
     label_outer,
     legend,
     new_figure,
@@ -201,7 +202,7 @@ def disk_figure(study):
     for label, ax in axes.items():
         true, fitted, note = values[label]
         ax.loglog(true, fitted, ".", ms=4, color=MEASURED, alpha=0.6)
-        ax.text(0.04, 0.95, note, transform=ax.transAxes, fontsize=8, va="top")
+        corner_note(ax, note, "left")
         ax.plot(ends, ends, color=TRUE, lw=1)
         ax.fill_between(ends, ends / 2, ends * 2, color=TRUE, alpha=0.12, lw=0)
         ax.set(xlim=ends, ylim=ends)
@@ -318,8 +319,7 @@ def shape_figure(study):
         place = np.clip(error[crowded], -0.97, 0.97)
         ax.plot(mag[crowded], place, "o", ms=6, mfc="none", mec="0.35", mew=0.7)
         if mag.size:
-            text = f"median {np.median(error):+.3f}"
-            ax.text(0.96, 0.95, text, transform=ax.transAxes, ha="right", va="top", fontsize=8)
+            corner_note(ax, f"median {np.median(error):+.3f}")
     label_outer(axes)
     return figure
 

@@ -234,6 +234,22 @@ def _truth_plan(config, unit):
     return values
 
 
+def _light(config, catalog, star, model, parameters, bands):
+    """Return fluxes of galaxies by their models and of stars (``star`` is True), and the errors of the catalog."""
+    light = library_fluxes(model, parameters, bands)
+    light.rename_column("flags", "sed_flags")
+    if np.any(star):
+        stars = star_fluxes(catalog[star], catalog_bands(catalog), bands)
+        for band in bands:
+            light[band][star] = stars[band]
+    for band, depth in existing_bands(config).items():
+        if depth is None:
+            error = measured_error(catalog, band, config.sed.catalog_error)
+            has_flux = np.isfinite(catalog[band])
+            light[error_column(band)] = np.where(has_flux, error, np.nan * error.unit)
+    return light
+
+
 @stage(
     "truth",
     "model fluxes",
@@ -253,11 +269,10 @@ def make_truth(context, name):
     effects = context.plan.get("perturbations", {})
     catalog = context.table("catalog.ecsv")
     best = FitPieces(context, "input_seds", len(catalog)).to_table()
-    parameters = galaxy_parameters(config, catalog, best, seed=context.seed)
     prior = config.highres.filter
-    existing = existing_bands(config)
-    bands = list(dict.fromkeys([*existing, *config.exposures.filters, prior]))
+    bands = list(dict.fromkeys([*existing_bands(config), *config.exposures.filters, prior]))
     model = sed.SEDModel.yang2021(agn=frac_agn != 0)
+    parameters = galaxy_parameters(config, catalog, best, seed=context.seed)
     if frac_agn == FIELD:
         add_field_agn(parameters, model, bands[0], context.seed)
     elif model.has_agn:
@@ -269,18 +284,8 @@ def make_truth(context, name):
         models = (model, perturbed)
         parameters = perturbed_parameters(effects, parameters, models, prior, seed=context.seed)
         model = perturbed
-    light = library_fluxes(model, parameters, bands)
-    light.rename_column("flags", "sed_flags")
     star = np.asarray(catalog["star"], bool)
-    if np.any(star):
-        stars = star_fluxes(catalog[star], catalog_bands(catalog), bands)
-        for band in bands:
-            light[band][star] = stars[band]
-    for band, depth in existing.items():
-        if depth is None:
-            error = measured_error(catalog, band, config.sed.catalog_error)
-            has_flux = np.isfinite(catalog[band])
-            light[error_column(band)] = np.where(has_flux, error, np.nan * error.unit)
+    light = _light(config, catalog, star, model, parameters, bands)
     # what a column frac_agn of the catalog says is of the truth of that name only
     computed = {"frac_agn", *light.colnames, *parameters.colnames}
     facts = [c for c in catalog.colnames if c not in computed and "." not in c]
