@@ -6,20 +6,19 @@ from dataclasses import field
 import astropy.units as u
 import numpy as np
 from astropy.constants import c
-from astropy.table import QTable
 
 from miricigale.filters import FilterSet, as_filter
 from miricigale.filters.spectra import spectrum_arrays
 from miricigale.sed.cosmology import COSMOLOGY, distance
 from miricigale.sed.flux_units import flux_density_unit
+from miricigale.sed.frequency_integral import frequency_integral
+from miricigale.sed.spectrum_conversions import specutils_spectrum, synphot_spectrum
 from miricigale.sed.spectrum_parts import Parts
-from miricigale.sed.spectrum_tables import spectrum_columns
+from miricigale.sed.spectrum_tables import spectrum_columns, spectrum_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import full_meta
-from miricigale.utils.named_values import without
-from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.table_formats import table_suffix
@@ -417,13 +416,8 @@ class SED(Frozen, WithTable):
         is_inside = wave[0] <= first < last <= wave[-1]
         span = f"{self.rest_wavelength[0]:.4g} and {self.rest_wavelength[-1]:.4g}"
         check_that(is_inside, "low, high", f"in order, and within {span}", f"{low}, {high}")
-        x = np.concatenate([[first], wave[(wave > first) & (wave < last)], [last]])
-        y = np.interp(x, wave, self.fnu.value)
-        slope = np.diff(y) / np.diff(x)
-        # of (a + b x) / x^2
-        constant = y[:-1] - slope * x[:-1]
-        parts = constant * (1 / x[:-1] - 1 / x[1:]) + slope * np.log(x[1:] / x[:-1])
-        return np.sum(parts) * FNU * c / WAVE
+        integral = frequency_integral(wave, self.fnu.value, first, last)
+        return integral * FNU * c / WAVE
 
     @classmethod
     def from_table(cls, table):
@@ -451,16 +445,7 @@ class SED(Frozen, WithTable):
 
     def to_table(self):
         """The spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""
-        table = QTable({"wave": self.wave, "fnu": self.fnu})
-        for name, part in self.components.items():
-            table[name] = part.fnu
-        table.meta["redshift"] = self.redshift
-        for values in (self.parameters, self.derived):
-            table.meta |= {
-                name: float(u.Quantity(quantity).value) for name, quantity in values.items()
-            }
-        table.meta |= without(self.meta, ("parameters", "derived"))
-        return table
+        return spectrum_table(self)
 
     def write(self, path, *, overwrite=False):
         """
@@ -567,18 +552,11 @@ class SED(Frozen, WithTable):
             As observed (its ``z`` is 0: the wavelengths are shifted already). Between the
             points synphot interpolates in photons, not in F_nu.
         """
-        from synphot import SourceSpectrum
-        from synphot.models import Empirical1D
-
-        return SourceSpectrum(
-            Empirical1D, points=self.wave.to(u.AA), lookup_table=self.fnu, meta=self.meta
-        )
+        return synphot_spectrum(self)
 
     def to_specutils(self):
         """This spectrum for specutils (``Spectrum``, or ``Spectrum1D`` before its version 2)."""
-        specutils = require("specutils", extra="specutils")
-        kind = getattr(specutils, "Spectrum", None) or specutils.Spectrum1D
-        return kind(spectral_axis=self.wave, flux=self.fnu, meta=dict(self.meta))
+        return specutils_spectrum(self)
 
     def plot(self, ax=None, *, components=False, rest_frame=False, unit=FNU, **kwargs):
         """
@@ -610,32 +588,9 @@ class SED(Frozen, WithTable):
         `~astropy.units.UnitsError`
             If the unit is none of these.
         """
-        from miricigale.plotting.curves import plot_spectrum
+        from miricigale.sed.spectrum_plot import plot_sed
 
-        wave = self.wave.value
-        if rest_frame:
-            wave = self.rest_wavelength.value
-        unit, symbol = flux_density_unit(unit)
-        axes = {"rest_frame": rest_frame, "label_y": symbol}
-        density = u.spectral_density(self.wave)
-        values = self.fnu.to_value(unit, density)
-        if not components:
-            return plot_spectrum(wave, values, ax=ax, **axes, **kwargs)
-        check_that(self.components, "components", "False for a spectrum without components", True)
-        kwargs = {"color": "black", "lw": 1.5, "label": "sum"} | kwargs
-        ax = plot_spectrum(wave, values, ax=ax, **axes, **kwargs)
-        low, high = ax.get_ylim()
-        for name, part in self.components.items():
-            if np.any(part.fnu > 0):
-                style = "--" if name.endswith("_intrinsic") else "-"
-                label = name.replace("_", " ")
-                options = {"label": label, "ls": style, "lw": 1}
-                values = part.fnu.to_value(unit, density)
-                plot_spectrum(wave, values, ax=ax, **axes, **options)
-        # faint parts would stretch the axis by many decades
-        ax.set_ylim(max(low, 1e-6 * high), high)
-        ax.legend(fontsize="small")
-        return ax
+        return plot_sed(self, ax, components, rest_frame, unit, **kwargs)
 
     def __repr__(self):
         return (

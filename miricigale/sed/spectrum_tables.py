@@ -1,7 +1,8 @@
-"""Columns of tables with spectra: their units, and samples that are not to be used."""
+"""Tables of spectra: their columns and units, and samples that are not to be used."""
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.instrument import DQ
 from miricigale.utils.curve_columns import (
@@ -13,6 +14,7 @@ from miricigale.utils.curve_columns import (
 )
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import without
 from miricigale.utils.units import FNU
 
 
@@ -52,6 +54,18 @@ def spectrum_columns(table, path):
         if is_other and isinstance(unit, u.UnitBase) and unit.is_equivalent(FNU):
             lights.append(name)
     return wave, fnu, lights
+
+
+def spectrum_table(sed):
+    """A spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""
+    table = QTable({"wave": sed.wave, "fnu": sed.fnu})
+    for name, part in sed.components.items():
+        table[name] = part.fnu
+    table.meta["redshift"] = sed.redshift
+    for values in (sed.parameters, sed.derived):
+        table.meta |= {name: float(u.Quantity(quantity).value) for name, quantity in values.items()}
+    table.meta |= without(sed.meta, ("parameters", "derived"))
+    return table
 
 
 def _with_unit(column, parse):

@@ -1,0 +1,31 @@
+"""Integrals of spectra over frequency."""
+
+import numpy as np
+
+
+def frequency_integral(wave, fnu, first, last):
+    """
+    Integrate a flux density over frequency, exactly for straight lines in wavelength between the samples.
+
+    By nu = c / x, the integral of F_nu dnu from nu(last) to nu(first) is c times that of F_nu / x^2 dx from
+    first to last; F_nu = a + b x between two samples gives a (1/x_0 - 1/x_1) + b ln(x_1 / x_0).
+
+    Parameters
+    ----------
+    wave, fnu : `~numpy.ndarray`, shape (n,)
+        Wavelengths, ascending, and flux densities.
+    first, last : float
+        Wavelengths between which to integrate, within those of the samples.
+
+    Returns
+    -------
+    integral : float
+        In units of flux density over wavelength, to be multiplied by the speed of light.
+    """
+    is_between = (wave > first) & (wave < last)
+    x = np.concatenate([[first], wave[is_between], [last]])
+    y = np.interp(x, wave, fnu)
+    slope = np.diff(y) / np.diff(x)
+    constant = y[:-1] - slope * x[:-1]
+    parts = constant * (1 / x[:-1] - 1 / x[1:]) + slope * np.log(x[1:] / x[:-1])
+    return np.sum(parts)
