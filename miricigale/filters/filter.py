@@ -1,7 +1,6 @@
 """Passbands."""
 
 import dataclasses
-import re
 from pathlib import Path
 
 import astropy.units as u
@@ -11,6 +10,7 @@ from astropy.table import QTable
 from miricigale.filters import _core
 from miricigale.filters.band_names import find_filter, unknown_filter
 from miricigale.filters.curve_files import read_curve
+from miricigale.filters.filter_search import searched_wavelength
 from miricigale.filters.library import FILTERS, load_curve
 from miricigale.filters.spectra import are_spectra, check_wave, spectrum_arrays
 from miricigale.utils.caching import cached, cached_property
@@ -229,21 +229,9 @@ class Filter(Frozen, WithTable):
         >>> Filter.search("25.5 um")
         ('miri.f2550w', 'mips.24')
         """
-        try:
-            # text alone may be a unit too
-            is_wave = not isinstance(text, str) or re.match(r"\s*[\d.]+\s*[A-Za-zµ]", text)
-            wave = None
-            if is_wave:
-                wave = text
-                if isinstance(text, str):
-                    # an A alone is no ampere here
-                    wave = re.sub(r"([\d.]\s*)A$", r"\1AA", text)
-                wave = u.Quantity(wave)
-        except (TypeError, ValueError):
-            wave = None
+        wave = searched_wavelength(text)
         if wave is None:
             return tuple(name for name in FILTERS.names() if str(text).lower() in name)
-        wave = to_array(wave, WAVE, "text", ndim=0, finite=True)
         matches = []
         for name in FILTERS.names():
             band = Filter.from_name(name)

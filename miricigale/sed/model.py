@@ -25,17 +25,6 @@ from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import WAVE
 
 
-def _single_models(parameters):
-    """Parameters of each model, of parameters some of which are arrays of one length."""
-    arrays = {name: value for name, value in parameters.items() if np.ndim(value) == 1}
-    lengths = {name: len(value) for name, value in arrays.items()}
-    got = ", ".join(f"{length} of {name!r}" for name, length in lengths.items())
-    check_that(len(set(lengths.values())) == 1, "parameters", "arrays of one length", got)
-    n_models = next(iter(lengths.values()))
-    for row in range(n_models):
-        yield parameters | {name: value[row] for name, value in arrays.items()}
-
-
 class SEDModel(Interactive):
     """
     A model of spectra: a chain of components.
@@ -499,7 +488,7 @@ class SEDModel(Interactive):
             check_that(not twice, "values", "without those given by keyword", twice)
             parameters = dict(values) | parameters
         if any(np.ndim(value) == 1 for value in parameters.values()):
-            return [self.evaluate(model) for model in _single_models(parameters)]
+            return [self.evaluate(model) for model in parameter_names.single_models(parameters)]
         return tables.spectra(self, self.values(parameters))
 
     __call__ = evaluate

@@ -235,3 +235,14 @@ def plain_mass(values):
         out["mass"] = 10.0**exponent * u.Msun
     del out[name]
     return out
+
+
+def single_models(parameters):
+    """Parameters of each model, of parameters some of which are arrays of one length."""
+    arrays = {name: value for name, value in parameters.items() if np.ndim(value) == 1}
+    lengths = {name: len(value) for name, value in arrays.items()}
+    got = ", ".join(f"{length} of {name!r}" for name, length in lengths.items())
+    check_that(len(set(lengths.values())) == 1, "parameters", "arrays of one length", got)
+    n_models = next(iter(lengths.values()))
+    for row in range(n_models):
+        yield parameters | {name: value[row] for name, value in arrays.items()}
