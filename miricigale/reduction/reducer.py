@@ -49,7 +49,7 @@ from miricigale.utils.options import (
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
-from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, positive
 
 # pixels of mosaics
 _SCALE = 0.11 * ANGLE
@@ -322,7 +322,7 @@ class Reducer(Interactive):
         """
         return subtract_dithers(self, list(images), wcs=wcs)
 
-    def mosaic(self, images, wcs=None, *, pixel_scale=_SCALE):
+    def mosaic(self, images, wcs=None, *, pixel_scale=None):
         """
         Drizzle images onto one grid.
 
@@ -334,7 +334,7 @@ class Reducer(Interactive):
         wcs : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or image, optional
             Of the output, with ``pixel_shape``; by default as of `run`.
         pixel_scale : `~astropy.units.Quantity`, optional
-            Of the output without ``wcs``.
+            Of the output without ``wcs``; that of the settings by default.
 
         Returns
         -------
@@ -352,8 +352,7 @@ class Reducer(Interactive):
         """
         images = [as_exposure(image) for image in exposure_list(images)]
         if wcs is None:
-            to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
-            wcs = own_grid(images, pixel_scale)
+            wcs = own_grid(images, self._pixel_scale(pixel_scale))
         else:
             wcs = as_wcs(wcs)
         return self.drizzle(images, wcs)[0].image
@@ -413,7 +412,7 @@ class Reducer(Interactive):
         return rate, *self.subtract_background(exposure)
 
     @takes_other_keywords
-    def run(self, ramps, *, wcs=None, pixel_scale=_SCALE, align=None, progress_bar=False):
+    def run(self, ramps, *, wcs=None, pixel_scale=None, align=None, progress_bar=False):
         """
         Reduce the dithers of one filter.
 
@@ -445,7 +444,7 @@ class Reducer(Interactive):
         ValueError
             If there are no ramps, of more than one filter, or one of them twice.
         """
-        to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
+        pixel_scale = self._pixel_scale(pixel_scale)
         rates = []
         images = []
         backgrounds = []
@@ -473,7 +472,7 @@ class Reducer(Interactive):
     __call__ = run
 
     def combine(
-        self, images, backgrounds, *, rates=(), wcs=None, pixel_scale=_SCALE, align=None, planes=()
+        self, images, backgrounds, *, rates=(), wcs=None, pixel_scale=None, align=None, planes=()
     ):
         """
         Put the images of one filter together.
@@ -505,4 +504,13 @@ class Reducer(Interactive):
         if isinstance(align, str) and align == "visits":
             images, _ = align_images(images, groups=map(visit_of, images))
             align = None
+        pixel_scale = self._pixel_scale(pixel_scale)
         return combine(self, images, backgrounds, rates, wcs, pixel_scale, align, planes)
+
+    def _pixel_scale(self, pixel_scale):
+        """Return the pixel of a mosaic: that of a call, else of the settings, else MIRI's."""
+        if pixel_scale is None:
+            pixel_scale = self.mosaics.pixel_scale
+        if pixel_scale is None:
+            return _SCALE
+        return positive(pixel_scale, ANGLE, "pixel_scale") * ANGLE

@@ -2,10 +2,13 @@
 
 import dataclasses
 
+import astropy.units as u
+
 from miricigale.detector.effects.reset import ResetAnomaly
 from miricigale.instrument import DetectorProperties
 from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
+from miricigale.utils.units import ANGLE, positive
 
 #: Known backends.
 BACKENDS = ("native", "jwst")
@@ -144,6 +147,8 @@ class MosaicSettings:
         Sigma for the comparison of three or more dithers; None for none.
     pixfrac : float, optional
         Side of the drizzle's drops in input pixels.
+    pixel_scale : `~astropy.units.Quantity`, optional
+        Pixel of mosaics without a WCS of their own; 0.11 arcsec, MIRI's, if not given.
 
     Raises
     ------
@@ -162,8 +167,11 @@ class MosaicSettings:
     match_sky: bool = True
     outlier_threshold: float | None = 5.0
     pixfrac: float = 1.0
+    pixel_scale: u.Quantity | None = None
 
     def __post_init__(self):
+        if self.pixel_scale is not None:
+            positive(self.pixel_scale, ANGLE, "pixel_scale")
         check_positive(self.outlier_threshold, "outlier_threshold", optional=True)
         check_that(0 < self.pixfrac <= 1, "pixfrac", "above 0 and at most 1", self.pixfrac)
 
