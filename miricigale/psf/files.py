@@ -373,6 +373,13 @@ def _warn_of_contradiction(scales):
             warn(msg, PSFWarning)
 
 
+def states_pixel(path):
+    """Return whether a file of a PSF states the size of its pixels."""
+    if split_extension(path)[1] is None and is_written(path):
+        return True
+    return PSFFile.open(path).cell is not None
+
+
 def read_psf(
     path,
     *,
@@ -441,7 +448,7 @@ def read_psf(
     if oversampling is None:
         oversampling = _stated_oversampling(path, header)
     pixel_scale = psf_file.pixel_scale(pixel_scale, oversampling=oversampling)
-    wanted = "given where the header does not state it"
+    wanted = f"given, such as ({str(path)!r}, 0.11 * u.arcsec), for the header does not state it"
     check_that(pixel_scale is not None, "pixel_scale", wanted, None)
     if frame is None:
         frame = "sky"

@@ -22,7 +22,11 @@ _log = logging.getLogger(__name__)
 
 
 def named_psf(psf):
-    """Return the PSF of a file, of the name of a filter, or of a pair of PSF and pixel; anything else itself."""
+    """Return the PSF of a file, of the name of a filter or of a pair with its pixel; anything else itself."""
+    if isinstance(psf, tuple) and len(psf) == 2 and isinstance(psf[0], (str, os.PathLike)):
+        from miricigale.psf.files import read_psf
+
+        return read_psf(psf[0], pixel_scale=psf[1])
     if isinstance(psf, tuple):
         return instrument_psf(psf)
     is_path = isinstance(psf, os.PathLike)

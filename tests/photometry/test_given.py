@@ -5,6 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+from astropy.io import fits
 from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.table import QTable
 from matplotlib.figure import Figure
@@ -242,7 +243,7 @@ def test_catalogs_of_pandas_with_missing_positions(images, psfs, sky):
     assert np.flatnonzero(~np.isfinite(result.flux.value)).tolist() == [2]
 
 
-def test_psfs_without_pixels_are_on_those_of_their_images(images, sky, flux):
+def test_psfs_without_pixels_are_on_those_of_their_images(images, sky, flux, tmp_path):
     image, highres = images
     # the pixels' response is in the stars, which are drawn by their integrals over pixels
     half = 20
@@ -255,6 +256,10 @@ def test_psfs_without_pixels_are_on_those_of_their_images(images, sky, flux):
     sampled = ForcedPhotometer(psf=array).measure(image, sky)
     assert_allclose(sampled.flux.value, stated.flux.value, rtol=1e-4)
     assert np.all(np.abs(sampled.flux.value - flux) < 5 * sampled.flux_err.value)
+    # so is a file whose header is bare
+    fits.writeto(tmp_path / "psf.fits", array)
+    of_file = ForcedPhotometer(psf=tmp_path / "psf.fits").measure(image, sky)
+    assert_allclose(of_file.flux.value, stated.flux.value, rtol=1e-4)
     photometer = ForcedPhotometer(psf=array, highres_psf=stamps[0.03], template="psf")
     assert "PSFs on the pixels of the images" in repr(photometer)
     both = photometer.measure(image, highres, catalog=sky)

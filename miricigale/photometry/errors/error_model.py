@@ -29,6 +29,7 @@ from miricigale.utils.ids import id_column
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, ab_quantity, to_array
@@ -367,40 +368,44 @@ class ErrorModel(WithTable):
         """
         return self._curve(filter).outside(to_array(flux, FNU, "flux"))
 
+    @takes_other_keywords
     def limiting_flux(self, filter=None, n_sigma=5.0):
         """
         Find the flux (uJy) above which the signal-to-noise exceeds a value.
 
         Parameters
         ----------
-        filter : str, optional
-            Band; needed if there are several.
+        filter : str or list of str, optional
+            Band; needed if there are several. Of a list the limit of each.
         n_sigma : float, optional
             The value.
 
         Returns
         -------
-        flux : `~astropy.units.Quantity`
+        flux : `~astropy.units.Quantity`, scalar or shape (n_filters,)
             In uJy; NaN if no flux reaches it up to the brightest that was measured.
             Errors are held constant below the faintest.
         """
         check_positive(n_sigma, "n_sigma")
+        if isinstance(filter, (list, tuple)):
+            return u.Quantity([self.limiting_flux(band, n_sigma) for band in filter])
         return limiting_flux(self._curve(filter), n_sigma) * FNU
 
+    @takes_other_keywords
     def limiting_magnitude(self, filter=None, n_sigma=5.0):
         """
         Find the AB magnitude at which the signal-to-noise reaches a value.
 
         Parameters
         ----------
-        filter : str, optional
-            Band; needed if there are several.
+        filter : str or list of str, optional
+            Band; needed if there are several. Of a list the limit of each.
         n_sigma : float, optional
             Signal-to-noise at the limit (the paper's error of 0.217 mag is one of 5.003).
 
         Returns
         -------
-        limit : `~astropy.units.Magnitude`
+        limit : `~astropy.units.Magnitude`, scalar or shape (n_filters,)
             AB; NaN if no flux reaches it.
         """
         return self.limiting_flux(filter, n_sigma).to(u.ABmag)

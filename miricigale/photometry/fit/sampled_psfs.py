@@ -1,6 +1,7 @@
 """PSFs on the pixels of images that are still to come."""
 
 import dataclasses
+import os
 
 import numpy as np
 from photutils.psf import GriddedPSFModel
@@ -9,16 +10,20 @@ from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry.fit.exposure_kernels import are_exposures
 from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.photometry.images.mosaics import as_mosaic
-from miricigale.psf import InstrumentPSF, MatchingKernel, from_photutils
+from miricigale.psf import InstrumentPSF, MatchingKernel, from_photutils, read_psf
+from miricigale.psf.files import states_pixel
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import split_extension
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE
 
 
 def is_sampled(psf):
-    """Whether a PSF is an array or a model without the size of its pixels."""
+    """Whether a PSF is an array, a model or a file without the size of its pixels."""
     if isinstance(psf, (InstrumentPSF, GriddedPSFModel)):
         return False
+    if isinstance(psf, (str, os.PathLike)):
+        return os.path.isfile(split_extension(psf)[0]) and not states_pixel(psf)
     return isinstance(psf, np.ndarray) or hasattr(psf, "param_names") or hasattr(psf, "array")
 
 
@@ -86,4 +91,6 @@ def _on_pixels(psf, image):
         return psf
     scale = pixel_scale(image.wcs) * ANGLE
     angle = grid_angle(image.wcs, image.shape)
+    if isinstance(psf, (str, os.PathLike)):
+        return read_psf(psf, pixel_scale=scale, frame="sky", angle=angle)
     return from_photutils(psf, pixel_scale=scale, frame="sky", angle=angle)
