@@ -1,5 +1,6 @@
 """Columns of tables by any name of their band."""
 
+import json
 import pickle
 
 import astropy.units as u
@@ -8,6 +9,7 @@ from astropy.table import QTable, hstack
 
 from helpers.errors import refuses
 from miricigale.filters.band_table import BandTable
+from miricigale.utils.table_files import read_table
 
 
 @pytest.fixture
@@ -43,3 +45,15 @@ def test_a_quantity_alone_is_its_posterior_median():
     assert fits["redshift"][0] == 2.0
     assert fits["redshift_odds"][0] == 0.9
     refuses("frac_agn", fits.__getitem__, "frac_agn", error=KeyError)
+
+
+def test_a_fits_file_keeps_metadata_and_dex(table, tmp_path):
+    table["mass_logmean"] = [9.0, 10.0] * u.dex(u.Msun)
+    table.meta["fit"] = {"engine": "grid", "filters": ["miri.f770w"]}
+    # without a warning, which would be an error here
+    table.write(tmp_path / "t.fits")
+    back = read_table(tmp_path / "t.fits", wanted="a table")
+    assert json.loads(back.meta["META"]) == table.meta
+    assert back["mass_logmean"].unit == table["mass_logmean"].unit
+    refuses("exists", table.write, tmp_path / "t.fits", error=OSError)
+    table.write(tmp_path / "t.fits", overwrite=True)
