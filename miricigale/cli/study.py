@@ -166,12 +166,11 @@ def _keys_of_bands(args, bands, values):
     from miricigale.instrument.published_tables import imager_filter
     from miricigale.planning.config import ExposureSection
 
-    for label in bands:
-        if "," in label:
-            hint = "--sets compares sets: --sets F770W,F1000W F1500W"
-            msg = f"--bands are separated by spaces, got {label!r}; {hint}"
-            raise ValueError(msg)
-    names = list(dict.fromkeys(imager_filter(label) for label in bands))
+    labels = []
+    for words in bands:
+        # separated by spaces or commas
+        labels += [label.strip() for label in words.split(",") if label.strip()]
+    names = list(dict.fromkeys(imager_filter(label) for label in labels))
     keys = {"exposures.bands": names}
     if args.config is None and not {"exposures.time", "exposures.depth"} & set(values):
         times = ExposureSection(bands=tuple(names)).by_band("time")

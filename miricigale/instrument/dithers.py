@@ -117,6 +117,8 @@ def dither_offsets(pattern, n=None, *, start=0):
         n = check_count(n, "n")
     start = check_count(start, "start", 0)
     if isinstance(pattern, str):
+        # APT writes 4-POINT
+        pattern = pattern.lower()
         check_names([pattern], "dither pattern", dither_patterns())
         points = _points(pattern)
         number = start + np.arange(len(points) if n is None else n)

@@ -217,7 +217,7 @@ class SED(Frozen, WithTable):
         else:
             inside = np.asarray(key)
             is_mask = inside.dtype == bool and inside.shape == self.wave.shape
-            wanted = "two wavelengths (sed[5 * u.um:10 * u.um]) or a mask of the points"
+            wanted = "two wavelengths (sed[5 * u.um:10 * u.um]) or a mask of the points; sed.fnu has all values"
             check_that(is_mask, "key", wanted, repr(key))
         parts = {name: part[inside] for name, part in self.components.items()}
         return self.replace(wave=self.wave[inside], fnu=self.fnu[inside], components=parts)

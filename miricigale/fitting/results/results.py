@@ -193,6 +193,9 @@ class FitResults(FitRows):
 
     def __repr__(self):
         bands = f"{len(self.filters)} bands"
+        calibration = self.meta.get("fit", {}).get("calibration")
+        if calibration:
+            bands += f", errors and priors of {calibration}"
         if self.isscalar:
             key = np.asarray(self.ids).item()
             return f"<FitResults of {key!r}, chi2 {self.chi2:.4g} in {self.n_bands} of {bands}>"
