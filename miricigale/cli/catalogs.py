@@ -111,7 +111,8 @@ def images_of(args, paths, prefix=""):
     from miricigale.photometry import MosaicFile
 
     options = [{} for _ in paths]
-    for name in inspect.signature(MosaicFile).parameters:
+    # a command may call something else 'path'
+    for name in inspect.signature(MosaicFile).parameters.keys() - {"path"}:
         values = getattr(args, prefix + name, None)
         if not values:
             continue

@@ -8,6 +8,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
+from helpers.commands import command
 from helpers.errors import refuses
 from helpers.mosaics import CENTER, FINE, HI, LO, lattice, places, render
 from miricigale.agn import AGNImages
@@ -137,6 +138,18 @@ def test_sets_of_positions_are_apart():
         separation = members[:, None].separation(members[None]).arcsec
         assert np.all(separation[~np.eye(len(members), dtype=bool)] >= 3)
     assert np.all(trial[chosen] >= 0)
+
+
+def test_the_command_takes_images_with_their_options(field, hosts, tmp_path, capsys):
+    catalog = tmp_path / "catalog.fits"
+    hosts[[0, 1, 3]][["id", BAND, f"{BAND}_err"]].write(catalog)
+    arguments = ["agn", catalog, "--area", 20, "--plan", "--images"]
+    arguments += [field["image"].path, field["highres"].path, "--catalog", field["catalog"]]
+    named = ["--filter", "irac.ch4", "--psf", field["image"].psf]
+    named += ["--highres-filter", PRIOR, "--highres-psf", field["highres"].psf]
+    assert "3 objects and 200 injected AGN" in command(capsys, *arguments, *named).out
+    missing = [*arguments[:7], tmp_path / "none.fits"]
+    assert "none.fits" in command(capsys, *missing, *named, status=2).err
 
 
 def test_refusals(field, hosts):
