@@ -480,12 +480,14 @@ def test_points_tell_stars_from_galaxies_of_their_colors(catalog, tmp_path):
     classes = QTable.read(tmp_path / "out" / "table.fits")
     assert classes["class"][:2].tolist() == ["galaxy", "star"]
     assert np.all(classes["class_probability"][:2] > 0.99)
-    # two fluxes that differ by d of sigma sqrt(V_P + V_T - 2 c) = 0.135 of them
+    # two fluxes that differ by all of them, of variance V_P + V_T - 2 c
     galaxies = open_results(tmp_path / "out")[:]
     stars = open_results(tmp_path / "out" / "star")[:]
     without = stars.log_evidence[2]
     variance = 0.1**2 + 0.05**2 + 2 * 0.4 * 0.1 * 0.05
-    width = np.array([table[name][0].to_value("uJy") for name in BANDS[4:]]) * np.sqrt(variance)
+    # points have the errors of models, 10 % of the flux, too
+    of_point = np.sqrt(variance + 0.1**2)
+    width = np.array([table[name][0].to_value("uJy") for name in BANDS[4:]]) * of_point
     density = -np.log(np.sqrt(2.0 * np.pi) * width).sum()
     assert_allclose(stars.chi2[0] - stars.chi2[2], 2 / variance, rtol=0.1)
     assert galaxies.n_bands.tolist() == stars.n_bands.tolist() == [8, 8, 6]

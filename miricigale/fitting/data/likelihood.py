@@ -185,7 +185,7 @@ class FitData(ObjectRows):
         `FitFlags`.
     redshift : `~numpy.ndarray`, shape (n,), optional
         Known redshifts; NaN where one is missing.
-    nuclei : `~numpy.ndarray`, shape (n, n_nuclei, 5), optional
+    nuclei : `~numpy.ndarray`, shape (n, n_nuclei, 4), optional
         Fluxes of nuclei, as of `~miricigale.fitting.data.nuclei.read_nuclei`.
     """
 

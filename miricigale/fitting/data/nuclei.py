@@ -21,7 +21,7 @@ NUCLEUS = "_nucleus"
 CORRELATION = "_corr"
 IS_LIMIT = "_limit"
 #: Values of a nucleus in `read_nuclei`.
-FLUX, SIGMA, COVARIANCE, LIMIT, ERROR = range(5)
+FLUX, SIGMA, COVARIANCE, LIMIT = range(4)
 #: ``nuclei`` of a fitter whose models are nothing but a point.
 WHOLE = "whole"
 
@@ -165,10 +165,9 @@ def read_nuclei(table, columns, data, reader):
 
     Returns
     -------
-    values : `~numpy.ndarray`, shape (n, n_nuclei, 5)
-        Of each band: flux and error in uJy, covariance with the total flux in uJy^2, 1 where the flux is an
-        upper limit, and the error without that of models. Errors are infinite where there is none that can be
-        used.
+    values : `~numpy.ndarray`, shape (n, n_nuclei, 4)
+        Of each band: flux and error in uJy, covariance with the total flux in uJy^2, and 1 where the flux is an
+        upper limit. The error is infinite where there is none that can be used.
     left_out : `~numpy.ndarray` of bool, shape (n,)
         Objects of which a flux was left out: its error or correlation cannot be used, or the band has no total.
 
@@ -178,9 +177,8 @@ def read_nuclei(table, columns, data, reader):
         As `nucleus_table`.
     """
     n = len(table)
-    values = np.zeros((n, len(columns.bands), 5))
+    values = np.zeros((n, len(columns.bands), 4))
     values[:, :, SIGMA] = np.inf
-    values[:, :, ERROR] = np.inf
     left_out = np.zeros(n, bool)
     measured = nucleus_table(table, columns)
     for j, band in enumerate(columns.bands):
@@ -207,7 +205,6 @@ def read_nuclei(table, columns, data, reader):
         values[:, j, SIGMA] = np.where(usable, sigma, np.inf)
         values[:, j, COVARIANCE] = np.where(paired, covariance, 0.0)
         values[:, j, LIMIT] = usable & limited
-        values[:, j, ERROR] = np.where(usable, error, np.inf)
     return values, left_out
 
 

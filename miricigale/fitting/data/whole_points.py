@@ -5,15 +5,15 @@ The point has all of the light: in a band the total T and the point P measure th
 but for their errors. T and P of variances V_T and V_P and covariance c are the same data as D, of variance
 V_D = V_P + V_T - 2 c, and T - k D with k = (c - V_T) / V_D, whose errors do not depend on those of D: the weighted
 mean of T and P. (T, P) -> (T - k D, D) has the determinant 1, so that the likelihood of a model is that of the
-mean times N(D; 0, V_D), which is the same for all models. Errors of models are those of T and P alike and no part
-of V_D.
+mean times N(D; 0, V_D), which is the same for all models. V_P has the part of the flux that is added to the errors
+of all nuclei, which PSFs are not better than; that of the total is added to the error of the mean.
 """
 
 import numpy as np
 from scipy.special import log_ndtr
 
 from miricigale.fitting.data.likelihood import FitData
-from miricigale.fitting.data.nuclei import COVARIANCE, ERROR, FLUX, LIMIT, SIGMA
+from miricigale.fitting.data.nuclei import COVARIANCE, FLUX, LIMIT, SIGMA
 from miricigale.utils.values import value_class
 
 #: Width of the broad part of a difference of which a flux may be wrong, in units of its error.
@@ -53,7 +53,7 @@ class WholePoints:
         ----------
         data : `~miricigale.fitting.data.likelihood.FitData`
             Photometry of n objects.
-        values : `~numpy.ndarray`, shape (n, n_points, 5)
+        values : `~numpy.ndarray`, shape (n, n_points, 4)
             As of `~miricigale.fitting.data.nuclei.read_nuclei`.
         bands : list of int
             Bands of the points.
@@ -85,19 +85,19 @@ class WholePoints:
             # a flux takes the place of a limit, which it keeps or not
             below = measured & total_limited
             apart = data.flux[below, band] - point[below, FLUX]
-            width = np.hypot(data.sigma[below, band], point[below, ERROR])
+            width = np.hypot(data.sigma[below, band], point[below, SIGMA])
             log_density[below] += _log_limit(apart / width, part[band])
             flux[below, band] = point[below, FLUX]
             sigma[below, band] = point[below, SIGMA]
             limit[below, band] = False
             above = limited & ~total_limited
             apart = point[above, FLUX] - data.flux[above, band]
-            width = np.hypot(point[above, ERROR], data.flux_err[above, band])
+            width = np.hypot(point[above, SIGMA], data.flux_err[above, band])
             log_density[above] += _log_limit(apart / width, part[band])
             # of two limits the lower one
             lower = limited & total_limited & (point[:, FLUX] < data.flux[:, band])
             flux[lower, band] = point[lower, FLUX]
-            sigma[lower, band] = point[lower, ERROR]
+            sigma[lower, band] = point[lower, SIGMA]
         combined = data._changed(flux=flux, sigma=sigma, limit=limit)
         n_points = np.isfinite(values[:, :, SIGMA]).sum(axis=1)
         return cls(data, combined, log_density, chi2, n_points)
@@ -136,7 +136,7 @@ def _mean(point, data, rows, band):
     total_variance = np.square(data.flux_err[rows, band])
     covariance = point[:, COVARIANCE]
     difference = point[:, FLUX] - total
-    variance = np.square(point[:, ERROR]) + total_variance - 2.0 * covariance
+    variance = np.square(point[:, SIGMA]) + total_variance - 2.0 * covariance
     share = (covariance - total_variance) / variance
     mean = total - share * difference
     mean_variance = total_variance - share * (covariance - total_variance)

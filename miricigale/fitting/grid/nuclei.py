@@ -124,7 +124,7 @@ class ObjectNuclei:
         ----------
         bands : `~numpy.ndarray` of int, shape (n,)
             Bands of the nuclei.
-        values : `~numpy.ndarray`, shape (n, 5)
+        values : `~numpy.ndarray`, shape (n, 4)
             As of `~miricigale.fitting.data.nuclei.read_nuclei`.
         data : `~miricigale.fitting.data.likelihood.FitData`
             Photometry of the object, as of one row.
