@@ -44,7 +44,11 @@ def write_page(result, path, name):
     if np.isfinite(result.numbers["obscured"]).any():
         page.section("obscured")
         page.table("table", _rows(result.numbers))
-    page.section("selection", n=len(result.injected), **facts)
+    where = "none of them in images"
+    n_in_images = int(np.count_nonzero(result.injected["n_images"]))
+    if n_in_images:
+        where = f"{n_in_images} of them were put into images and measured in the bands of these"
+    page.section("selection", n=len(result.injected), where=where, **facts)
     page.figure("figure", _completeness(result.numbers))
     page.section("prior")
     page.figure("figure", _prior(result.prior))

@@ -318,6 +318,8 @@ def test_injected_agn_are_measured_on_images(run, model, tmp_path):
     assert np.all(np.abs(added - images.light[BANDS[0]]).value < 4.0 * error)
     assert np.all(images.light["nircam.f444w"].value > 0)
     assert result.injected["n_images"].tolist() == [0, 1, 0, 1, 0, 1]
+    page = (tmp_path / "agn" / "page.html").read_text()
+    assert "3 of them were put into images" in page
     images.bands = ("miri.f560w",)
     refuses(
         "'images' must be of bands that are fitted",
