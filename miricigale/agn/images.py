@@ -156,7 +156,8 @@ class AGNImages:
         check_that(np.any(before >= 0), "images", wanted, f"ids {list(base.table['id'][:3])}")
         n_off = int(np.count_nonzero(before < 0))
         if n_off:
-            log.info("%d of %d injected AGN are in galaxies that no image has", n_off, len(hosts))
+            text = "galaxies that no image has: light is added to their photometry"
+            log.info("%d of %d injected AGN are in %s", n_off, len(hosts), text)
         sky = base.table["sky"][before]
         trials = separate_trials(sky, before >= 0, APART * base.fwhm)
         log.info("injecting AGN into %d sets of images", trials.max() + 1)
@@ -174,7 +175,8 @@ class AGNImages:
             after, _ = match_sky(measured["sky"], sky[rows], radius=base.fwhm / 2)
             n_lost = int(np.count_nonzero(after < 0))
             if n_lost:
-                log.info("%d AGN are in galaxies that the prior shows no more", n_lost)
+                text = "galaxies that the prior shows no more: light is added to their photometry"
+                log.info("%d AGN are in %s", n_lost, text)
             kept = after >= 0
             pairs = _Pairs(rows[kept], base.table, before[rows[kept]], measured, after[kept])
             for band in self.bands:
