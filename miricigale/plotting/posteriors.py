@@ -200,21 +200,11 @@ def plot_sed_fit(
     is_used = row_mask(used, wave.size, True)
     limit = row_mask(limit, wave.size, False)
     have = np.isfinite(flux) & np.isfinite(err)
-    shown = np.concatenate([flux[have & (flux > 0)], model[np.isfinite(model) & (model > 0)]])
-    if shown.size:
-        low = shown.min() / 4
-        high = shown.max() * 4
-    else:
-        low = 0.1
-        high = 10.0
+    low, high = _flux_range(flux[have], model)
     if spectrum is not None:
         parts = {"best model": spectrum, **(parts or {})}
-    for k, (label, (x, y)) in enumerate((parts or {}).items()):
-        x = _value(x, u.um)
-        y = _value(y, u.uJy)
-        in_range = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
-        color, line = _SPECTRA[k % len(_SPECTRA)]
-        ax.plot(x[in_range], y[in_range], color=color, ls=line, lw=1.0, zorder=1, label=label)
+    if parts:
+        _draw_spectra(ax, parts, wave)
     boxes = {"color": "tab:orange", "markersize": 7, "fillstyle": "none"}
     ax.plot(wave, model, "s", zorder=3, label="best model in the bands", **boxes)
     points = _points(groups, is_used, limit)
@@ -222,13 +212,8 @@ def plot_sed_fit(
         rows = rows & have & (flux > 0)
         ax.errorbar(wave[rows], flux[rows], err[rows], zorder=4, label=label, **style)
     negative = have & ~(flux > 0) & ~limit
-    if np.any(negative):
-        top = np.maximum(np.maximum(flux, 0.0) + 2.0 * err, low)[negative]
-        ax.plot(wave[negative], top, "v", color="tab:blue", zorder=4)
     bound = have & limit
-    if np.any(bound):
-        top = np.maximum(flux[bound], 3.0 * low)
-        ax.errorbar(wave[bound], top, yerr=0.5 * top, **_ARROW)
+    _draw_undetected(ax, wave, flux, err, low, negative, bound)
     ax.set(xscale="log", xlim=(0.7 * wave.min(), 1.4 * wave.max()))
     ax.set(yscale="log", ylim=(low, high), ylabel="flux density (µJy)")
     if parts or groups is not None:
@@ -243,6 +228,36 @@ def plot_sed_fit(
     pull = np.where(with_error, (flux - model) / np.where(with_error, err, 1.0), np.nan)
     _draw_residuals(residual_ax, wave, pull, points, bound)
     return ax, residual_ax
+
+
+def _flux_range(flux, model):
+    """Limits of the axis of fluxes: a factor 4 beyond those that are positive."""
+    flux = flux[flux > 0]
+    model = model[np.isfinite(model) & (model > 0)]
+    shown = np.concatenate([flux, model])
+    if not shown.size:
+        return 0.1, 10.0
+    return shown.min() / 4, shown.max() * 4
+
+
+def _draw_spectra(ax, spectra, wave):
+    """Draw spectra by label, within a factor 2 of the wavelengths of the bands."""
+    styles = itertools.cycle(_SPECTRA)
+    for (label, (x, y)), (color, line) in zip(spectra.items(), styles, strict=False):
+        x = _value(x, u.um)
+        y = _value(y, u.uJy)
+        in_range = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
+        ax.plot(x[in_range], y[in_range], color=color, ls=line, lw=1.0, zorder=1, label=label)
+
+
+def _draw_undetected(ax, wave, flux, err, low, negative, bound):
+    """Draw fluxes that are not positive as triangles at two errors, and upper limits as arrows."""
+    if np.any(negative):
+        top = np.maximum(np.maximum(flux, 0.0) + 2.0 * err, low)[negative]
+        ax.plot(wave[negative], top, "v", color="tab:blue", zorder=4)
+    if np.any(bound):
+        top = np.maximum(flux[bound], 3.0 * low)
+        ax.errorbar(wave[bound], top, yerr=0.5 * top, **_ARROW)
 
 
 def _draw_residuals(ax, wave, pull, points, limit):

@@ -22,8 +22,8 @@ from miricigale.utils.units import WAVE, is_ascending
 
 #: Largest number of bands whose weights are kept, each at the redshifts of one table: some 200 kB each.
 _MAX_BANDS = 256
-#: Roles whose parameters shape the galaxy.
-_COLD = 30.0  # um at rest, beyond which dust heated by the mean field shines
+#: Wavelength at rest beyond which dust heated by the mean field shines, um.
+_COLD = 30.0
 
 
 def check_axes(model, axes):
@@ -270,14 +270,10 @@ def model_grid(model, axes, filters):
     chain = model.chain
     redshift = axes["redshift"]
     agn_component = model.component("agn")
-    if agn_component:
-        of_agn = agn_component.parameters
-    else:
-        of_agn = {}
     frac_agn = np.zeros(1)
-    if of_agn:
-        frac_agn = axes.get("frac_agn", np.array([of_agn["frac_agn"].default]))
-    with_agn = bool(np.any(frac_agn > 0.0))
+    if agn_component:
+        default = agn_component.parameters["frac_agn"].default
+        frac_agn = axes.get("frac_agn", np.array([default]))
     names = _names(model, GALAXY_ROLES) + ["dust_excess"] * ("dust_excess" in axes)
     of_galaxy = subset(model.parameters, names)
     rows = _products(of_galaxy, axes)
@@ -290,20 +286,8 @@ def model_grid(model, axes, filters):
 
     nuclei = {}
     agn_spectra = np.zeros((0, chain.wave.size))
-    agn_parameters = without(of_agn, ["frac_agn"])
-    if with_agn:
-        models = [r | {"frac_agn": 0.0} for r in _products(agn_parameters, axes)]
-        _refuse_invalid(model, [defaults | row for row in models], ("agn",))
-        agn_rows, count, inert = _distinct_agn(agn_component, models)
-        parts = [chain.agn(row) for row in agn_rows]
-        agn_spectra, properties_of_agn = agn_table(model, parts)
-        nuclei = {
-            "frac_agn": frac_agn,
-            "agn_parameters": _parameter_table(agn_parameters, agn_rows),
-            "agn_properties": properties_of_agn,
-            "agn_multiplicity": count,
-            "inert": inert,
-        }
+    if np.any(frac_agn > 0.0):
+        agn_spectra, nuclei = _nuclei(model, axes, frac_agn)
     dusty = model.frac_agn_definition == "dust"
 
     # these are L_nu, and the sums take L_lambda
@@ -328,6 +312,24 @@ def model_grid(model, axes, filters):
         preset=model.preset,
         **nuclei,
     )
+
+
+def _nuclei(model, axes, frac_agn):
+    """Spectra of all distinct AGN, L_nu for one watt, and the columns of a grid about them."""
+    component = model.component("agn")
+    parameters = without(component.parameters, ["frac_agn"])
+    models = [row | {"frac_agn": 0.0} for row in _products(parameters, axes)]
+    _refuse_invalid(model, [model.defaults | row for row in models], ("agn",))
+    rows, count, inert = _distinct_agn(component, models)
+    spectra, properties = agn_table(model, [model.chain.agn(row) for row in rows])
+    columns = {
+        "frac_agn": frac_agn,
+        "agn_parameters": _parameter_table(parameters, rows),
+        "agn_properties": properties,
+        "agn_multiplicity": count,
+        "inert": inert,
+    }
+    return spectra, columns
 
 
 def _refuse_invalid(model, rows, roles):
