@@ -198,13 +198,9 @@ def aperture_noise(
     white_noise = n_sigma**2 * variance * white / (light * electrons) ** 2
     residual_noise = (n_sigma * amplitude * sky / (light * electrons)) ** 2 * pattern / n_dithers
 
-    def limit(value):
-        # F^2 = n^2 (V + growth shot F), solved for F
-        return float((shot_noise + np.sqrt(shot_noise**2 + 4 * value)) / 2)
-
     return {
-        "flux": limit(white_noise + residual_noise),
-        "flux_white": limit(white_noise),
+        "flux": _limit(shot_noise, white_noise + residual_noise),
+        "flux_white": _limit(shot_noise, white_noise),
         "radius": radius,
         "light": float(light),
         "background": noise.background.value,
@@ -316,6 +312,12 @@ def sensitivity(
         options |= {"n_sigma": n_sigma, "residual": residual, "n_dithers": n_dithers}
         aperture = aperture_noise(filter, time, **options)
         return aperture["flux"] * u.uJy
+    limit = _fit_limit(filter, time, n_sigma, residual, excess, n_dithers, options)
+    return limit * u.uJy
+
+
+def _fit_limit(filter, time, n_sigma, residual, excess, n_dithers, options):
+    """Flux in uJy that a fit measures with the given significance; options as for `sensitivity`."""
     check_positive(n_sigma, "n_sigma")
     filter = etc_setup(filter).filter
     check_least(n_dithers, "n_dithers", 1, whole=True)
@@ -340,9 +342,16 @@ def sensitivity(
     if excess is None:
         excess = "flight"
     sky, photon = fitted_noise(filter, time, residual=residual, excess=excess, **options)
-    # F^2 = n^2 (sky^2 + photon F), solved for F
-    linear = n_sigma**2 * photon
-    return float((linear + np.sqrt(linear**2 + 4 * (n_sigma * sky) ** 2)) / 2) * u.uJy
+    return _limit(n_sigma**2 * photon, (n_sigma * sky) ** 2)
+
+
+def _limit(linear, constant):
+    """
+    Flux whose own photons add to its noise: the positive root of F^2 = linear F + constant.
+
+    A flux F of n sigma with the variance V + s F has F^2 = n^2 (V + s F).
+    """
+    return float((linear + np.sqrt(linear**2 + 4 * constant)) / 2)
 
 
 def _ramps(filter, time, n_dithers, *, n_groups=None, readout="FASTR1", subarray="FULL"):

@@ -96,15 +96,29 @@ class StudyRunner:
         self.folder = Path(folder)
         if callable(stages):
             self._source = stages
+            stages = stages()
         else:
-            self._source = tuple(stages)
-        self.stages = tuple(stages() if callable(stages) else stages)
+            stages = tuple(stages)
+            self._source = stages
+        self.stages = tuple(stages)
         self.executor = executor
         self.redo = redo
         self.disk = dict(disk or {})
         self.prepare = prepare
         self.progress_bar = progress_bar
         self.n_threads = thread_count(config.run.threads or None)
+        self._list_units()
+        chosen = self._chosen(until)
+        self.keys = [key for key in self._parts if key in chosen]
+        self._again = set()
+        if again is not None:
+            self._again = self._matching(again, "again") & chosen
+            if not self._again:
+                msg = f"nothing of 'again', {again!r}, is among what 'until', {until!r}, needs"
+                raise ConfigError(msg)
+
+    def _list_units(self):
+        """List the units of all stages, and those that each of them reads."""
         self.units = {}
         # stage and name of each unit, by key
         self._parts = {}
@@ -113,7 +127,7 @@ class StudyRunner:
             if missing:
                 msg = f"stage {stage.name!r} needs {sorted(missing)}, which do not come before it"
                 raise ConfigError(msg)
-            self.units[stage.name] = stage.unit_names(config)
+            self.units[stage.name] = stage.unit_names(self.config)
             for unit in self.units[stage.name]:
                 self._parts[stage.key(unit)] = (stage, unit)
         names = convert_values(Units, self.units)
@@ -121,22 +135,20 @@ class StudyRunner:
         self._inputs = {}
         self._needed = {}
         for key, (stage, unit) in self._parts.items():
-            inputs = stage.needed(config, unit, names)
+            inputs = stage.needed(self.config, unit, names)
             self._inputs[key] = inputs
             self._needed[key] = frozenset(itertools.chain.from_iterable(inputs.values()))
-        chosen = set(self._parts)
-        if until is not None:
-            chosen = self._matching(until, "until")
+
+    def _chosen(self, until):
+        """Return keys of the units of a stage or pattern and of all that they need, of every unit if None."""
+        if until is None:
+            return set(self._parts)
+        chosen = self._matching(until, "until")
+        # a unit comes after those that it needs
         for key in reversed(self._parts):
             if key in chosen:
                 chosen |= self._needed[key]
-        self.keys = [key for key in self._parts if key in chosen]
-        self._again = set()
-        if again is not None:
-            self._again = self._matching(again, "again") & chosen
-            if not self._again:
-                msg = f"nothing of 'again', {again!r}, is among what 'until', {until!r}, needs"
-                raise ConfigError(msg)
+        return chosen
 
     def _matching(self, pattern, argument):
         """Return keys of units by stage or pattern."""
