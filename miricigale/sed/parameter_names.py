@@ -31,7 +31,7 @@ LIVING_MASS = "stellar_mass"
 _LOG_MASSES = ("log_mass", "logmass", "lmass", "log_m", "massformed", "log_massformed")
 
 
-def by_our_names(values, known=(), *, short=False):
+def by_our_names(values, parameters=(), *, short=False):
     """
     Values of parameters by our names, with the mass for its logarithm.
 
@@ -40,7 +40,7 @@ def by_our_names(values, known=(), *, short=False):
     values : dict or `~astropy.table.Table`
         By parameter. A usual name of elsewhere, such as ``z``, counts where ours is not there, and one of CIGALE
         (``sfh.tau_main``), whose numbers without a unit are in CIGALE's.
-    known : iterable of str, optional
+    parameters : iterable of str, optional
         Our names of the parameters that there are.
     short : bool, optional
         Whether CIGALE's names count without their module too (``tau_main``).
@@ -56,11 +56,11 @@ def by_our_names(values, known=(), *, short=False):
         usual_names = _OTHER_NAMES | _OTHER_ARGUMENTS
     foreign_names = {}
     for theirs, ours in usual_names.items():
-        if theirs not in known:
+        if theirs not in parameters:
             foreign_names[theirs] = (ours, "")
-    our_names = (*known, LIVING_MASS)
+    our_names = (*parameters, LIVING_MASS)
     for theirs, meaning in _cigale_parameters(our_names, short=short).items():
-        if theirs not in known:
+        if theirs not in parameters:
             foreign_names.setdefault(theirs, meaning)
     out = values.copy()
     for theirs in [name for name in names if name in foreign_names]:
@@ -76,12 +76,12 @@ def by_our_names(values, known=(), *, short=False):
 
 
 @cached
-def _cigale_parameters(known, short):
+def _cigale_parameters(our_names, short):
     """Find our name and CIGALE's unit of CIGALE's parameters that are among ours: dict by CIGALE's name."""
     tables = declared("miricigale.cigale", "names.toml")
     meanings = {}
     for ours, (theirs, unit) in tables["quantities"].items():
-        if ours not in known:
+        if ours not in our_names:
             continue
         names = [theirs]
         for of_module in tables["modules"].values():

@@ -114,7 +114,7 @@ def inputs_from_text(text):
     return Inputs(**_with_tuples(from_text(text)))
 
 
-def file_states(inputs, others=()):
+def file_states(inputs, further_paths=()):
     """
     Return size and time of each file that is read, for the digest of a stage.
 
@@ -122,7 +122,7 @@ def file_states(inputs, others=()):
     ----------
     inputs : `~miricigale.photometry.commands.file_inputs.Inputs`
         What is measured.
-    others : iterable of path-like, optional
+    further_paths : iterable of path-like, optional
         Further files.
 
     Returns
@@ -130,7 +130,7 @@ def file_states(inputs, others=()):
     states : dict of str to list of int
         By path.
     """
-    paths = list(inputs.paths) + list(others)
+    paths = list(inputs.paths) + list(further_paths)
     for file in (inputs.highres, *inputs.images, *inputs.detection):
         paths += [getattr(file, name) for name in PATHS]
     return path_states(paths)

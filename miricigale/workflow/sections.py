@@ -22,9 +22,9 @@ class RunBasics(Section):
     threads: int = option(0, "Threads; 0 for as many as there are cores.", low=0, high=10000)
 
 
-def memory_of(what):
+def memory_of(work):
     """The option of a run that limits the memory of pieces of its work."""
-    text = f"Memory (GB) of {what} side by side on a machine; 0 for half of all."
+    text = f"Memory (GB) of {work} side by side on a machine; 0 for half of all."
     return option(0.0, text, low=0.0, high=1e5)
 
 

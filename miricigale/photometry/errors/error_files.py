@@ -8,10 +8,10 @@ from miricigale.utils.files import replacing
 from miricigale.utils.table_files import read_table
 
 
-def write_ecsv(thing, path, *, overwrite=False):
+def write_ecsv(value, path, *, overwrite=False):
     """Write the table of an object as ECSV, whole or not at all."""
     with replacing(path, overwrite=overwrite) as partial:
-        thing.to_table().write(partial, format="ascii.ecsv")
+        value.to_table().write(partial, format="ascii.ecsv")
 
 
 def _reader(cls, kind):

@@ -32,9 +32,9 @@ def _sky_columns(sky):
     return {"ra": icrs.ra.deg, "dec": icrs.dec.deg}
 
 
-def _existing(thing, names):
+def _existing(owner, names):
     """Return those attributes of an object, by name, that are not None."""
-    return without_none(attributes(thing, names))
+    return without_none(attributes(owner, names))
 
 
 def _columns(table):
