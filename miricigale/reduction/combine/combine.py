@@ -100,10 +100,10 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
             images, backgrounds = subtract_dithers(reducer, unsubtracted, backgrounds, wcs)
         else:
             notes.append("backgrounds are those of single exposures: it takes three and theirs")
-    doubts = [background for background in backgrounds if not background.trusted]
-    if doubts:
-        doubt = f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted"
-        notes.append(f"{doubt} ({_reasons(doubts)})")
+    untrusted = [background for background in backgrounds if not background.trusted]
+    if untrusted:
+        doubt = f"{len(untrusted)} of {len(backgrounds)} backgrounds cannot be trusted"
+        notes.append(f"{doubt} ({_reasons(untrusted)})")
     with_background = []
     if has_backgrounds:
         for image, background in zip(images, backgrounds, strict=True):
@@ -112,12 +112,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align, planes
     mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
     subtracted = mosaic_background.level
     if has_backgrounds:
-        # of the exposures too, and what brought them to one level
-        removed = []
-        for image, data in zip(images, with_background, strict=True):
-            removed.append(with_data(image, data - image.data))
-        levels = drizzle_images(removed, wcs, pixfrac=reducer.mosaics.pixfrac).image
-        subtracted = subtracted + np.where(levels.mask, 0, levels.data)
+        subtracted = subtracted + _removed_light(reducer.mosaics, images, with_background, wcs)
     if not mosaic_background.trusted:
         reasons = _reasons([mosaic_background])
         notes.append(f"the background of the mosaic cannot be trusted ({reasons})")
@@ -149,6 +144,15 @@ def _aligned(images, align):
         align = None
     aligned, _ = align_images(images, align)
     return aligned
+
+
+def _removed_light(settings, images, with_background, wcs):
+    """Light taken from exposures on the mosaic's grid: their backgrounds, and what brought them to one level."""
+    removed = []
+    for image, data in zip(images, with_background, strict=True):
+        removed.append(with_data(image, data - image.data))
+    levels = drizzle_images(removed, wcs, pixfrac=settings.pixfrac).image
+    return np.where(levels.mask, 0, levels.data)
 
 
 def _reasons(backgrounds):

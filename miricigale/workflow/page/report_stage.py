@@ -85,12 +85,7 @@ def make_report(context, _):
     metrics = study_metrics(config, tables[shown], area)
     study = paper.study_results(config, unperturbed, study_tables, metrics)
     patch = shown_patch(config)
-    mosaics = {}
-    kernels = {}
-    for name in study_patches(config)[patch].bands:
-        mosaics[name] = context.image(f"{of_patch(f'{shown}/mosaic_{name}', patch)}.fits")
-        path = context.path(f"{of_patch(f'kernel_{name}', patch)}.fits")
-        kernels[name] = MatchingKernel.read(path)
+    mosaics, kernels = _patch_products(context, shown, patch)
     rival_tables = rivals.read_rivals(context)
     extra = paper.extra_numbers(study, metrics, kernels)
     extra |= rivals.source_extractor_numbers(rival_tables, context.seed)
@@ -104,9 +99,7 @@ def make_report(context, _):
     metrics["fits"] = metrics["truths"][shown]["fits"]
     if metrics["n_sample"] == 0:
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
-    # JSON does not know NaN
-    text = json.dumps(json.loads(json.dumps(metrics), parse_constant=lambda _: None), indent=1)
-    context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
+    _save_metrics(context, metrics)
     subtitle = f"{metrics['n_field']} galaxies in {field_text(config)}, injected fracAGN "
     subtitle += f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
     title = f"miricigale: {config.run.name}"
@@ -130,6 +123,24 @@ def make_report(context, _):
     write_inputs(page)
     write_origin(page, [page.tables.truth.meta, matched.meta])
     context.save("report/index.html", lambda path: report.write(path))
+
+
+def _patch_products(context, truth, patch):
+    """Mosaics and kernels of a patch by band, as the truth of this name has them."""
+    mosaics = {}
+    kernels = {}
+    for name in study_patches(context.config)[patch].bands:
+        mosaics[name] = context.image(f"{of_patch(f'{truth}/mosaic_{name}', patch)}.fits")
+        path = context.path(f"{of_patch(f'kernel_{name}', patch)}.fits")
+        kernels[name] = MatchingKernel.read(path)
+    return mosaics, kernels
+
+
+def _save_metrics(context, metrics):
+    """Save the numbers as JSON, with null for NaN, which JSON does not know."""
+    plain = json.loads(json.dumps(metrics), parse_constant=lambda _: None)
+    text = json.dumps(plain, indent=1)
+    context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
 
 
 def _field_area(context, truth):
