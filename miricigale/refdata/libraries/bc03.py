@@ -2,10 +2,11 @@
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from miricigale.refdata.libraries.ised import read_ised
+from miricigale.refdata.libraries.ised import Ised, read_ised
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.lookup import file_sha256
 from miricigale.utils.exceptions import data_error
@@ -23,6 +24,18 @@ SECOND_AGE = {2003: 125893.0, 2016: 1.0e5}
 LONGEST = 160.0  # um
 DENSE_FROM = 10.0  # um
 DENSITY = 30.0  # wavelengths for each e-fold
+
+#: How names of the files end.
+_ENDING = re.compile(r"\.ised(_ascii)?(\.gz)?$", re.IGNORECASE)
+
+
+class _Burst(NamedTuple):
+    """A file of a set: a single burst of one metallicity."""
+
+    file: Path
+    content: Ised
+    metallicity: float
+    imf: str
 
 
 def read_bc03(path):
@@ -57,40 +70,39 @@ def read_bc03(path):
         than its name, or the files are not one set (IMF, wavelengths, ages, limits of mass).
     """
     paths = _files(path)
-    parts = []
+    bursts = []
     files = {file.name: file_sha256(file) for file in paths}
     for file in paths:
         part = read_ised(file)
         problem = f"holds a composite population ({part.history}), wanted a single burst"
         check_data(not part.law, file, problem)
-        parts.append((file, part, _metallicity(part, file), _imf(part, file)))
-    _check_set(parts)
-    parts.sort(key=lambda item: item[2])
-    first = parts[0][1]
-    imf = parts[0][3]
+        bursts.append(_Burst(file, part, _metallicity(part, file), _imf(part, file)))
+    _check_set(bursts)
+    bursts.sort(key=lambda burst: burst.metallicity)
+    first = bursts[0].content
+    imf = bursts[0].imf
     wave, _ = _refine(first.wave / 1e4, first.spectra[:1])
     n_age = first.age.size
-    spectra = np.empty((len(parts) * n_age, wave.size), dtype=np.float32)
+    spectra = np.empty((len(bursts) * n_age, wave.size), dtype=np.float32)
     surviving = np.empty(len(spectra))
     remnants = np.empty(len(spectra))
     basis = set()
-    for i, (file, part, _, _) in enumerate(parts):
+    for i, burst in enumerate(bursts):
+        part = burst.content
         rows = slice(i * n_age, (i + 1) * n_age)
         spectra[rows] = _refine(part.wave / 1e4, part.spectra)[1] * (SOLAR_LUMINOSITY * 1e4)
-        surviving[rows], how = _surviving(part, file)
+        surviving[rows], how = _surviving(part, burst.file)
         remnants[rows] = part.quantities["remnants"]
         basis.add(how)
-    metal = [p[2] for p in parts]
+    metallicities = [burst.metallicity for burst in bursts]
     name = _set_name(paths[0].name)
-    low, high = first.mass_limits
-    last = first.wave[-1] / 1e4
-    reach = f"the files reach {last:g} um"
-    if last < LONGEST * (1 - 1e-6):
-        reach = f"continued from {last:g} to {LONGEST:g} um"
     return LibraryTable(
         name="ssp.bc03_user",
         wave=wave,
-        axes={"metallicity": np.repeat(metal, n_age), "age": np.tile(first.age / 1e6, len(parts))},
+        axes={
+            "metallicity": np.repeat(metallicities, n_age),
+            "age": np.tile(first.age / 1e6, len(bursts)),
+        },
         spectra={"luminosity": spectra},
         units={"age": "Myr", "luminosity": "W / um"},
         values={"surviving": surviving, "remnants": remnants},
@@ -102,13 +114,24 @@ def read_bc03(path):
             "models": name,
             "surviving": sorted(basis),
         },
-        summary=(
-            f"{name}: {imf} IMF, {low:g} to {high:g} Msun, Z = {', '.join(f'{z:g}' for z in metal)}",
-            f"{n_age} ages to {first.age[-1] / 1e9:g} Gyr, {first.wave.size} wavelengths",
-            f"{wave.size - first.wave.size} wavelengths inserted beyond {DENSE_FROM:g} um",
-            f"surviving mass: {', '.join(sorted(basis))}",
-            reach,
-        ),
+        summary=_summary(name, imf, first, metallicities, wave.size, sorted(basis)),
+    )
+
+
+def _summary(name, imf, first, metallicities, n_wave, basis):
+    """Lines that say what a set holds; ``first`` is the content of one of its files."""
+    low, high = first.mass_limits
+    last = first.wave[-1] / 1e4
+    reach = f"the files reach {last:g} um"
+    if _ends_early(last):
+        reach = f"continued from {last:g} to {LONGEST:g} um"
+    metals = ", ".join(f"{metallicity:g}" for metallicity in metallicities)
+    return (
+        f"{name}: {imf} IMF, {low:g} to {high:g} Msun, Z = {metals}",
+        f"{first.age.size} ages to {first.age[-1] / 1e9:g} Gyr, {first.wave.size} wavelengths",
+        f"{n_wave - first.wave.size} wavelengths inserted beyond {DENSE_FROM:g} um",
+        f"surviving mass: {', '.join(basis)}",
+        reach,
     )
 
 
@@ -126,13 +149,12 @@ def _files(path):
 
 
 def _is_ised(name):
-    return re.search(r"\.ised(_ascii)?(\.gz)?$", name, re.IGNORECASE) is not None
+    return _ENDING.search(name) is not None
 
 
 def _set_name(name):
     """Name of a file without endings and code of metallicity, which its set shares."""
-    stem = re.sub(r"\.ised(_ascii)?(\.gz)?$", "", name, flags=re.IGNORECASE)
-    return re.sub(r"_m\d{2,3}(?=_|$)", "", stem)
+    return re.sub(r"_m\d{2,3}(?=_|$)", "", _ENDING.sub("", name))
 
 
 def _metallicity(part, file):
@@ -141,19 +163,13 @@ def _metallicity(part, file):
     if match:
         named = (PADOVA_1994 | PADOVA_2000).get(int(match[1]))
     metallicity = part.metallicity
-    wanted = "wanted 'Z=...' in its head or a name like _m62_"
-    check_data(
-        not (named is None and metallicity is None), file, f"states no metallicity: {wanted}"
-    )
-    if (
-        named is not None
-        and metallicity is not None
-        and not np.isclose(named, metallicity, rtol=0.01)
-    ):
+    if metallicity is None:
+        wanted = "wanted 'Z=...' in its head or a name like _m62_"
+        check_data(named is not None, file, f"states no metallicity: {wanted}")
+        return named
+    if named is not None and not np.isclose(named, metallicity, rtol=0.01):
         problem = f"states Z = {metallicity:g}, but its name (m{match[1]}) means Z = {named:g}"
         raise data_error(file, problem)
-    if metallicity is None:
-        return named
     return metallicity
 
 
@@ -174,24 +190,24 @@ def _imf(part, file):
     return named.pop()
 
 
-def _check_set(parts):
+def _check_set(bursts):
     """Refuse files that are not one set, and say which two do not fit."""
-    file, first, _, imf = parts[0]
+    first_file, first, _, imf = bursts[0]
     files = {}
-    for other_file, part, metallicity, other_imf in parts:
+    for file, part, metallicity, imf_of_file in bursts:
         ages = part.age.shape == first.age.shape and np.allclose(part.age, first.age, rtol=1e-4)
         pairs = {
             "wavelengths": np.array_equal(part.wave, first.wave),
-            "IMF": other_imf == imf,
+            "IMF": imf_of_file == imf,
             "limits of mass": part.mass_limits == first.mass_limits,
             "ages": ages,
         }
         differ = ", ".join(name for name, is_same in pairs.items() if not is_same)
-        check_data(not differ, other_file, f"and {file.name} are not one set: other {differ}")
+        check_data(not differ, file, f"and {first_file.name} are not one set: other {differ}")
         if metallicity in files:
             twice = f"the same metallicity as {files[metallicity].name}, {metallicity:g}"
-            raise data_error(other_file, f"is not of one set: it has {twice}")
-        files[metallicity] = other_file
+            raise data_error(file, f"is not of one set: it has {twice}")
+        files[metallicity] = file
 
 
 def _version(part):
@@ -213,30 +229,36 @@ def _surviving(part, file):
         without = np.abs(mass + remnants + gas - 1.0)[old].max()
         problem = "has masses of stars, remnants and gas that do not sum to 1 Msun"
         check_data(min(with_remnants, without) <= 0.01, file, problem)
-        take = with_remnants < without
+        has_remnants = with_remnants < without
     elif _version(part) is not None:
-        take = _version(part) == 2003
+        has_remnants = _version(part) == 2003
     else:
         ages = " or ".join(f"{age:g} yr ({year})" for year, age in SECOND_AGE.items())
         problem = "does not tell whether its mass of stars includes remnants: wanted a mass of gas"
         raise data_error(file, f"{problem}, or a second age of {ages}, got {part.age[1]:g} yr")
-    if take:
+    if has_remnants:
         surviving = mass - remnants
+        basis = "mass in stars less remnants"
     else:
         surviving = mass.copy()
+        basis = "mass in stars, as in the file"
     surviving[part.age == 0] = 1.0
     if surviving.min() < 0 or surviving.max() > 1.05:
         got = f"got up to {surviving.max():g}"
         raise data_error(file, f"must have surviving masses of 0 to 1 Msun, {got}")
-    return surviving, "mass in stars less remnants" if take else "mass in stars, as in the file"
+    return surviving, basis
+
+
+def _ends_early(last):
+    """Whether spectra that end at this wavelength (um) are continued."""
+    return last < LONGEST * (1 - 1e-6)
 
 
 def _refine(wave, spectra):
     """Insert wavelengths beyond 10 um, log-log between neighbors, and go on to 160 um."""
-    ends = wave[-1] < LONGEST * (1 - 1e-6)
     target = max(LONGEST, wave[-1])
     points = wave
-    if ends:
+    if _ends_early(wave[-1]):
         points = np.append(wave, LONGEST)
     pieces = [points[points <= DENSE_FROM]]
     far = points[points > DENSE_FROM]
