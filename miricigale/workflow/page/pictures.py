@@ -115,11 +115,8 @@ def field_figure(images, prior, names):
     )
     for k, ax in enumerate(axes[1:]):
         if is_color:
-            first = 3 * k
-            blue, green, red = (_binned(plane, scale)[0] for plane in planes[first : first + 3])
-            size = _binned(planes[first], scale)[1]
-            title = f"{labels[first]} blue, {labels[first + 1]} green, {labels[first + 2]} red"
-            plot_color(red, green, blue, ax=ax, pixel_scale=size, title=title)
+            three = slice(3 * k, 3 * k + 3)
+            _draw_colors(ax, planes[three], labels[three], scale)
         else:
             plot_image(planes[k], ax=ax, pixel_scale=scale, title=labels[k], colorbar=colorbar)
     for k, ax in enumerate(axes):
@@ -127,10 +124,20 @@ def field_figure(images, prior, names):
         mark_sky(ax, 20, **_directions(images[0]), color=shade)
         ax.title.set_fontsize("medium")
         if zooms:
+            # two rows of two, or one row of four below a wide panel
             places = grid[1, k].subgridspec(len(zooms) // across, across)
             for number, (place, middle) in enumerate(zip(places, zooms, strict=True), start=1):
                 _draw_zoom(ax, figure.add_subplot(place), middle, number, shade)
     return figure
+
+
+def _draw_colors(ax, planes, labels, scale):
+    """Draw three bands as a color image, the shortest wavelength blue."""
+    blue, size = _binned(planes[0], scale)
+    green, _ = _binned(planes[1], scale)
+    red, _ = _binned(planes[2], scale)
+    title = f"{labels[0]} blue, {labels[1]} green, {labels[2]} red"
+    plot_color(red, green, blue, ax=ax, pixel_scale=size, title=title)
 
 
 def _same_part(prior, image, rows, columns):
