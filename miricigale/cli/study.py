@@ -103,16 +103,7 @@ def plan(args):
     from miricigale.utils.outputs import check_output
     from miricigale.utils.parallel import threads
 
-    if args.time is not None:
-        # depths of the file would count in place of times
-        values["exposures.depth"] = []
-    bands = args.bands
-    if bands is None and args.config is None:
-        bands = _bands_of_sets(args.sets)
-    if bands is not None:
-        values |= _keys_of_bands(args, bands, values)
-    if args.position is not None:
-        values["background.ra"], values["background.dec"] = args.position
+    values = _plan_values(args, values)
     config = load_plan(args.config, overrides=_settings(args, values))
     if args.print_config:
         print(config.to_toml(), end="")
@@ -138,6 +129,22 @@ def plan(args):
     print(comparison.meta["answer"])
     print(f"done in {time.monotonic() - begin:.0f} s; page: {folder / 'plan.html'}")
     return 0
+
+
+def _plan_values(args, values):
+    """Return keys of a plan: those given by name, and those of the options of bands, times and position."""
+    values = dict(values)
+    if args.time is not None:
+        # depths of the file would count in place of times
+        values["exposures.depth"] = []
+    bands = args.bands
+    if bands is None and args.config is None:
+        bands = _bands_of_sets(args.sets)
+    if bands is not None:
+        values |= _keys_of_bands(args, bands, values)
+    if args.position is not None:
+        values["background.ra"], values["background.dec"] = args.position
+    return values
 
 
 def _check_plan_options(args):
