@@ -10,14 +10,18 @@ from miricigale.photometry._core.dense import (
     log_determinant,
     solve_factor,
 )
-from miricigale.photometry._core.shapes import FAST, fill_curves
+from miricigale.photometry._core.shapes import FAST, STEP, fill_curves, profile_of
 from miricigale.utils.compilation import njit
 
 #: How square images are made from transforms, by products of small matrices: frequencies kx and ky (rad per pixel)
 #: at ky >= 0, then at ky <= 0, (2 ny nx,), what their squares count in the sum over all pixels; the PSF's
 #: transform, (2, ny, nx); cosines and sines along y, (2, half + 1, ny), and cosines and negative sines along x,
-#: (2, half + 1, nx), at distances from the middle pixel.
-Plan = collections.namedtuple("Plan", "kx ky weight response waves_y waves_x")
+#: (2, half + 1, nx), at distances from the middle pixel; largest part of the PSF's light in each row, (ny,), and
+#: column, (nx,).
+Plan = collections.namedtuple("Plan", "kx ky weight response waves_y waves_x light_y light_x")
+
+#: Part of a source's light below which the frequencies of its image are left out.
+_FAINT = 1e-5
 
 
 def make_plan(size, transform, passed):
@@ -46,6 +50,7 @@ def make_plan(size, transform, passed):
     twice = (rows > 0) & (2 * rows != period)
     passed_waves = np.where(use, transform, 0.0)[:, :nx] / period
     response = np.stack([passed_waves[rows[:ny]], passed_waves[-rows[:ny]] * twice[:ny, None]])
+    light = np.abs(response).max(axis=0) / np.abs(response[0, 0, 0])
     weight = (np.abs(response) ** 2 * (1 + twice[:nx])).ravel()
     response *= (1 + twice[:nx]) / period
     frequency = 2 * np.pi / period
@@ -60,7 +65,61 @@ def make_plan(size, transform, passed):
         response=response.astype(np.complex64),
         waves_y=np.array([np.cos(phase_y), np.sin(phase_y)]).astype(np.float32),
         waves_x=np.array([np.cos(phase_x), -np.sin(phase_x)]).astype(np.float32),
+        light_y=light.max(axis=1).astype(np.float32),
+        light_x=light.max(axis=0).astype(np.float32),
     )
+
+
+@njit()
+def _count(light, frequency, radius, profile):
+    """Count the rows or columns of frequencies up to the last in which a profile has light."""
+    n = len(light)
+    while n > 1:
+        # the profile falls with frequency: at the node below it is larger
+        node = int(np.sqrt(np.sqrt(radius * frequency * (n - 1))) / STEP)
+        if light[n - 1] * abs(profile[min(node, len(profile) - 1)]) > _FAINT:
+            break
+        n -= 1
+    return n
+
+
+@njit()
+def _extent(plan, shapes, table):
+    """Return the numbers (ny, nx) of rows and columns of frequencies in which some shapes, (n, 4), have light."""
+    _, all_y, all_x = plan.response.shape
+    ny = 1
+    nx = 1
+    for s in range(len(shapes)):
+        profile = profile_of(table, shapes[s, 1], False)[0]
+        eta = np.sqrt(shapes[s, 2] ** 2 + shapes[s, 3] ** 2)
+        turn = 0.0
+        if eta > 0.0:
+            turn = np.sinh(eta) * shapes[s, 2] / eta
+        # the least k R_e at one kx, or one ky
+        size = np.exp(shapes[s, 0])
+        radius_y = size / np.sqrt(np.cosh(eta) + turn)
+        radius_x = size / np.sqrt(np.cosh(eta) - turn)
+        ny = max(ny, _count(plan.light_y, plan.ky[all_x * min(1, all_y - 1)], radius_y, profile))
+        nx = max(nx, _count(plan.light_x, plan.kx[min(1, all_x - 1)], radius_x, profile))
+    return ny, nx
+
+
+@njit()
+def _frequencies(plan, ny, nx):
+    """Return kx, ky and weights of the first ny rows and nx columns of a plan, (3, 2 ny nx)."""
+    _, all_y, all_x = plan.response.shape
+    values = np.empty((3, 2 * ny * nx), np.float32)
+    k = 0
+    # by number: expressions of pieces of arrays take longer to compile
+    for sign in range(2):
+        for i in range(ny):
+            first = (sign * all_y + i) * all_x
+            for j in range(nx):
+                values[0, k] = plan.kx[first + j]
+                values[1, k] = plan.ky[first + j]
+                values[2, k] = plan.weight[first + j]
+                k += 1
+    return values
 
 
 @njit()
@@ -80,24 +139,20 @@ def _quarters(plan, curves, x, y, n_moved, size):
     """
     Draw images of transforms, (n, 2, ny, nx), on a square of at most the plan's size, with a center (x, y) on it.
 
-    After the first image come its derivatives to x and to y if ``n_moved`` is 1. The result, (2, 2, half + 1, m,
-    half + 1), has the parts of the m images that are even and odd along x, of each those that are even and odd
-    along y, by the distances from the middle pixel along y and x.
+    They may have fewer frequencies than the plan.
+    After the first image come its derivatives to x and to y if ``n_moved`` is 1. The result, (2, 2 (half + 1) m,
+    half + 1), has the parts of the m images that are even and odd along x; their rows are parts that are even and
+    odd along y, of these the distances from the middle row, and of these the images.
     """
     n, _, ny, nx = curves.shape
     m = n + 2 * n_moved
     half = size // 2
-    step = 0
-    if nx > 1:
-        step = 1
+    all_x = plan.response.shape[2]
     # the shift theorem, from the middle pixel
-    along_x = _turns(plan.kx[step], x - half, nx)
-    step = 0
-    if ny > 1:
-        step = nx
-    along_y = _turns(plan.ky[step], y - half, ny)
+    along_x = _turns(plan.kx[min(1, nx - 1)], x - half, nx)
+    along_y = _turns(plan.ky[all_x * min(1, ny - 1)], y - half, ny)
     # real and imaginary parts of the sums of the two at +-ky, and of their differences times i
-    sums = np.empty((2, 2, ny, m, nx), np.float32)
+    sums = np.empty((4, ny, m * nx), np.float32)
     placed = np.empty((4, nx), np.float32)
     for i in range(ny):
         turn = along_y[i]
@@ -109,9 +164,9 @@ def _quarters(plan, curves, x, y, n_moved, size):
             placed[2, j] = negative.real
             placed[3, j] = negative.imag
         for c in range(n):
-            k = c
+            first = c * nx
             if c > 0:
-                k = c + 2 * n_moved
+                first += 2 * n_moved * nx
             for j in range(nx):
                 at_positive = curves[c, 0, i, j]
                 at_negative = curves[c, 1, i, j]
@@ -119,31 +174,37 @@ def _quarters(plan, curves, x, y, n_moved, size):
                 positive_imag = at_positive * placed[1, j]
                 negative_real = at_negative * placed[2, j]
                 negative_imag = at_negative * placed[3, j]
-                sums[0, 0, i, k, j] = positive_real + negative_real
-                sums[1, 0, i, k, j] = positive_imag + negative_imag
-                sums[0, 1, i, k, j] = negative_imag - positive_imag
-                sums[1, 1, i, k, j] = positive_real - negative_real
+                sums[0, i, first + j] = positive_real + negative_real
+                sums[1, i, first + j] = negative_imag - positive_imag
+                sums[2, i, first + j] = positive_imag + negative_imag
+                sums[3, i, first + j] = positive_real - negative_real
         if n_moved:
             # derivatives to the place: -i k times the transform
-            ky = plan.ky[i * nx]
-            for parity in range(2):
-                for j in range(nx):
-                    kx = plan.kx[j]
-                    sums[0, parity, i, 1, j] = kx * sums[1, parity, i, 0, j]
-                    sums[1, parity, i, 1, j] = -kx * sums[0, parity, i, 0, j]
-            for part in range(2):
-                for j in range(nx):
-                    sums[part, 0, i, 2, j] = -ky * sums[part, 1, i, 0, j]
-                    sums[part, 1, i, 2, j] = ky * sums[part, 0, i, 0, j]
+            ky = plan.ky[i * all_x]
+            for j in range(nx):
+                kx = plan.kx[j]
+                for parity in range(2):
+                    sums[parity, i, nx + j] = kx * sums[2 + parity, i, j]
+                    sums[2 + parity, i, nx + j] = -kx * sums[parity, i, j]
+                for part in (0, 2):
+                    sums[part, i, 2 * nx + j] = -ky * sums[part + 1, i, j]
+                    sums[part + 1, i, 2 * nx + j] = ky * sums[part, i, j]
     # inverse transforms along y, then along x, as products of matrices
-    halves = np.empty((2, 2, half + 1, m * nx), np.float32)
-    quarters = np.empty((2, 2, half + 1, m, half + 1), np.float32)
-    for part in range(2):
-        for parity in range(2):
-            waves = plan.waves_y[parity, : half + 1]
-            np.dot(waves, sums[part, parity].reshape(ny, m * nx), halves[part, parity])
-        rows = halves[part].reshape(-1, nx)
-        np.dot(rows, plan.waves_x[part, : half + 1].T, quarters[part].reshape(-1, half + 1))
+    halves = np.empty((4, half + 1, m * nx), np.float32)
+    rows = halves.reshape(2, 2 * (half + 1) * m, nx)
+    quarters = np.empty((2, 2 * (half + 1) * m, half + 1), np.float32)
+    waves_y = np.empty((half + 1, ny), np.float32)
+    waves_x = np.empty((half + 1, nx), np.float32)
+    for k in range(4):
+        for i in range(half + 1):
+            for j in range(ny):
+                waves_y[i, j] = plan.waves_y[k % 2, i, j]
+        np.dot(waves_y, sums[k], halves[k])
+    for k in range(2):
+        for i in range(half + 1):
+            for j in range(nx):
+                waves_x[i, j] = plan.waves_x[k, i, j]
+        np.dot(rows[k], waves_x.T, quarters[k])
     return quarters
 
 
@@ -184,18 +245,39 @@ def draw_curves(plan, curves, x, y, n_derivatives):
 def _whiten(quarters, k, inverse, y, x, column):
     """Write image k of `_quarters` over the noise into a column: the pixels of a rectangle, from (y, x) on."""
     half = quarters.shape[2] - 1
+    n_odd = quarters.shape[1] // 2
+    m = n_odd // (half + 1)
     width = inverse.shape[1]
     for row in range(2 * half + 1):
-        i = abs(row - half)
+        i = abs(row - half) * m + k
         sign = np.float32(1.0 if row >= half else -1.0)
         noise = inverse[y + row]
         middle = (y + row) * width + x + half
         # by pixel: expressions of short pieces of arrays take longer than their pixels
         for j in range(half + 1):
-            even = quarters[0, 0, i, k, j] + sign * quarters[0, 1, i, k, j]
-            odd = quarters[1, 0, i, k, j] + sign * quarters[1, 1, i, k, j]
+            even = quarters[0, i, j] + sign * quarters[0, n_odd + i, j]
+            odd = quarters[1, i, j] + sign * quarters[1, n_odd + i, j]
             column[middle + j] = (even + odd) * noise[x + half + j]
             column[middle - j] = (even - odd) * noise[x + half - j]
+
+
+@njit(fastmath=FAST)
+def _product(a, b):
+    """Sum of the products of two vectors: expressions of whole arrays take seconds to compile."""
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@njit()
+def _rows(columns, first, n, low, high):
+    """Copy pixels of n columns: expressions of pieces of arrays take longer to compile."""
+    rows = np.empty((n, high - low))
+    for i in range(n):
+        for j in range(high - low):
+            rows[i, j] = columns[first + i, low + j]
+    return rows
 
 
 @njit()
@@ -205,18 +287,22 @@ def _products(plan, table, inverse, squares, parameters, columns):
     k = (len(columns) - 1) // n
     last = n * k
     width = inverse.shape[1]
-    _, ny, nx = plan.response.shape
-    x0 = squares[:, 0].min()
-    y0 = squares[:, 1].min()
+    x0 = squares[0, 0]
+    y0 = squares[0, 1]
+    for s in range(n):
+        x0 = min(x0, squares[s, 0])
+        y0 = min(y0, squares[s, 1])
     # with the shape free (k = 7) the derivatives to its four parameters are drawn too
     n_curves = 5 if k == 7 else 1
-    curves = np.empty((n_curves, 2, ny, nx), np.float32)
     n_moved = min(k - 1, 1)
     products = np.zeros((last + 1, last + 1))
     for s in range(n):
-        shape = parameters[s, 2:]
         first = s * k
-        fill_curves(plan.kx, plan.ky, shape, table, curves.reshape(len(curves), -1))
+        shape = parameters[s, 2:]
+        ny, nx = _extent(plan, parameters[s : s + 1, 2:], table)
+        frequencies = _frequencies(plan, ny, nx)
+        curves = np.empty((n_curves, 2, ny, nx), np.float32)
+        fill_curves(frequencies[0], frequencies[1], shape, table, curves.reshape(n_curves, -1))
         # each source is drawn on a square of its own
         center_x = parameters[s, 0] - squares[s, 0]
         center_y = parameters[s, 1] - squares[s, 1]
@@ -227,17 +313,17 @@ def _products(plan, table, inverse, squares, parameters, columns):
             _whiten(quarters, j, inverse, y, x, columns[first + j])
     if n == 1:
         return np.dot(columns, columns.T)
-    products[last, last] = np.dot(columns[last], columns[last])
+    products[last, last] = _product(columns[last], columns[last])
     for s in range(n):
         # on the rows of the square alone, beyond which there is no light
         low = squares[s, 1] - y0
         high = low + squares[s, 2]
         first = s * k
-        own = columns[first : first + k, low * width : high * width].copy()
-        right = np.dot(own, columns[last, low * width : high * width].copy())
+        own = _rows(columns, first, k, low * width, high * width)
         for i in range(k):
-            products[first + i, last] = right[i]
-            products[last, first + i] = right[i]
+            right = _product(own[i], columns[last, low * width : high * width])
+            products[first + i, last] = right
+            products[last, first + i] = right
         block = np.dot(own, own.T)
         for i in range(k):
             for j in range(k):
@@ -247,9 +333,8 @@ def _products(plan, table, inverse, squares, parameters, columns):
             end = min(high, squares[t, 1] - y0 + squares[t, 2])
             if top >= end:
                 continue
-            rows = slice(top * width, end * width)
-            left = columns[first : first + k, rows].copy()
-            block = np.dot(left, columns[t * k : t * k + k, rows].copy().T)
+            left = _rows(columns, first, k, top * width, end * width)
+            block = np.dot(left, _rows(columns, t * k, k, top * width, end * width).T)
             for i in range(k):
                 for j in range(k):
                     products[first + i, t * k + j] = block[i, j]
@@ -437,19 +522,11 @@ def minimum(plan, table, white, inverse, squares, start, mean, precision, limits
     return chi2, flux, parameters, evidence, covariance, matrix
 
 
-@njit()
-def _product(a, b):
-    """Sum of the products of two vectors: expressions of whole arrays take seconds to compile."""
-    total = 0.0
-    for i in range(len(a)):
-        total += a[i] * b[i]
-    return total
-
-
 @njit(fastmath=FAST)
 def _image_products(quarters, inverse, white):
-    """Sum the squares of the first whitened image of `_quarters`, and its products with the data."""
+    """Sum the squares of the whitened image that `_quarters` hold alone, and its products with the data."""
     half = quarters.shape[2] - 1
+    n_odd = quarters.shape[1] // 2
     power = 0.0
     projection = 0.0
     for row in range(2 * half + 1):
@@ -458,8 +535,8 @@ def _image_products(quarters, inverse, white):
         noise = inverse[row]
         data = white[row]
         for j in range(half + 1):
-            even = quarters[0, 0, i, 0, j] + sign * quarters[0, 1, i, 0, j]
-            odd = quarters[1, 0, i, 0, j] + sign * quarters[1, 1, i, 0, j]
+            even = quarters[0, i, j] + sign * quarters[0, n_odd + i, j]
+            odd = quarters[1, i, j] + sign * quarters[1, n_odd + i, j]
             right = (even + odd) * noise[half + j]
             left = (even - odd) * noise[half - j]
             if j == 0:
@@ -471,13 +548,13 @@ def _image_products(quarters, inverse, white):
 
 
 @njit(fastmath=FAST)
-def _steepness(plan, curve):
-    """Sum the squares of the slopes of an image over all pixels, by its transform."""
+def _steepness(frequencies, curve):
+    """Sum the squares of the slopes of an image over all pixels, by its transform and `_frequencies`."""
     total = 0.0
     for i in range(curve.size):
-        x = plan.kx[i]
-        y = plan.ky[i]
-        total += plan.weight[i] * (x * x + y * y) * curve[i] * curve[i]
+        x = frequencies[0, i]
+        y = frequencies[1, i]
+        total += frequencies[2, i] * (x * x + y * y) * curve[i] * curve[i]
     return total
 
 
@@ -514,48 +591,61 @@ def evidence_of(
     The constraint on the center is that of the best shape, in proportion to the squares of the slopes of the
     images.
     """
-    _, ny, nx = plan.response.shape
-    size = squares[0, 2]
+    # the best one first, whose center is free
+    all_shapes = np.empty((len(shapes) + 1, 4))
+    all_shapes[0] = best[0, 2:]
+    all_shapes[1:] = shapes
+    ny, nx = _extent(plan, all_shapes, table)
+    frequencies = _frequencies(plan, ny, nx)
+    curves = np.empty((1, 2, ny, nx), np.float32)
+    curve = curves.reshape(1, -1)
     x0 = best[0, 0] - squares[0, 0]
     y0 = best[0, 1] - squares[0, 1]
     columns = np.empty((3, white.size))
     neighbor_data = np.zeros(len(neighbors))
-    curves = np.empty((1, 2, ny, nx), np.float32)
-    curve = curves.reshape(1, -1)
     data = 0.0
     for row in white:
         data += _product(row, row)
-    # the best one first, whose center is free
-    fill_curves(plan.kx, plan.ky, best[0, 2:], table, curve)
-    quarters = _quarters(plan, curves, x0, y0, 1, size)
-    for i in range(3):
-        _whiten(quarters, i, inverse, 0, 0, columns[i])
-    products = np.dot(columns, columns.T)
-    if len(neighbors):
-        # neighbors' light that was taken off is the best together with this one's
-        shared = np.dot(columns, neighbors.T)
-        for b in range(len(neighbors)):
-            neighbor_data[b] = flux[0] * shared[0, b]
-        data -= _product(neighbor_data, neighbor_data)
-        for i in range(3):
-            for j in range(3):
-                products[i, j] -= _product(shared[i], shared[j])
-    own_x = products[1, 0]
-    own_y = products[2, 0]
-    power = max(products[0, 0], 1e-300)
-    steepness = _steepness(plan, curve[0])
-    xx = (products[1, 1] - own_x * own_x / power) / steepness
-    xy = (products[1, 2] - own_x * own_y / power) / steepness
-    yy = (products[2, 2] - own_y * own_y / power) / steepness
     center = precision[0]
     log_prior = np.log(center[0, 0] * center[1, 1] - center[0, 1] ** 2)
+    xx = 0.0
+    xy = 0.0
+    yy = 0.0
     likelihoods = np.zeros((len(shapes), 2))
-    for s in range(len(shapes)):
-        fill_curves(plan.kx, plan.ky, shapes[s], table, curve)
-        quarters = _quarters(plan, curves, x0 + drift[s, 0], y0 + drift[s, 1], 0, size)
+    for s in range(-1, len(shapes)):
+        fill_curves(frequencies[0], frequencies[1], all_shapes[s + 1], table, curve)
+        steepness = _steepness(frequencies, curve[0])
+        x = x0
+        y = y0
+        n_moved = 1
+        if s >= 0:
+            x += drift[s, 0]
+            y += drift[s, 1]
+            n_moved = 0
+        quarters = _quarters(plan, curves, x, y, n_moved, squares[0, 2])
+        if s < 0 or len(neighbors):
+            for i in range(1 + 2 * n_moved):
+                _whiten(quarters, i, inverse, 0, 0, columns[i])
+        if s < 0:
+            products = np.dot(columns, columns.T)
+            if len(neighbors):
+                # neighbors' light that was taken off is the best together with this one's
+                shared = np.dot(columns, neighbors.T)
+                for b in range(len(neighbors)):
+                    neighbor_data[b] = flux[0] * shared[0, b]
+                data -= _product(neighbor_data, neighbor_data)
+                for i in range(3):
+                    for j in range(3):
+                        products[i, j] -= _product(shared[i], shared[j])
+            own_x = products[1, 0]
+            own_y = products[2, 0]
+            power = max(products[0, 0], 1e-300)
+            xx = (products[1, 1] - own_x * own_x / power) / steepness
+            xy = (products[1, 2] - own_x * own_y / power) / steepness
+            yy = (products[2, 2] - own_y * own_y / power) / steepness
+            continue
         power, projection = _image_products(quarters, inverse, white)
         if len(neighbors):
-            _whiten(quarters, 0, inverse, 0, 0, columns[0])
             shared_light = np.dot(neighbors, columns[0])
             power -= _product(shared_light, shared_light)
             projection -= _product(shared_light, neighbor_data)
@@ -568,7 +658,7 @@ def evidence_of(
             pull_y = center[0, 1] * off_x + center[1, 1] * off_y
             chi2 = data - light * projection + off_x * pull_x + off_y * pull_y
             # changes of the pixels with the center are in proportion to the light
-            scale = light**2 * _steepness(plan, curve[0])
+            scale = light**2 * steepness
             det = (center[0, 0] + scale * xx) * (center[1, 1] + scale * yy)
             det -= (center[0, 1] + scale * xy) ** 2
             # Laplace's integral over center and light

@@ -12,7 +12,7 @@ from miricigale.utils.compilation import njit
 INDEX_RANGE = (0.4, 6.0)
 
 #: Table of the transform: even in the fourth root of k R_e, from 0, and in ln n, from below the range.
-_STEP = 0.0125
+STEP = 0.0125
 _NODES = 460
 _INDEX_STEP = 0.1
 _FIRST = np.log(INDEX_RANGE[0]) - 2 * _INDEX_STEP
@@ -40,7 +40,7 @@ def profile_table():
     log_r = (np.arange(2048) - 1023.5) * step
     log_k = log_r  # reciprocal grids, centered on 1
     rows = np.ones((len(log_n), _NODES))
-    at = 4 * np.log(np.maximum(_STEP * np.arange(_NODES), np.exp(_POINT / 4)))
+    at = 4 * np.log(np.maximum(STEP * np.arange(_NODES), np.exp(_POINT / 4)))
     for row, n in zip(rows, np.exp(log_n), strict=True):
         # b_n of the profile, by which R_e holds half of the light
         bn = scipy.special.gammaincinv(2 * n, 0.5)
@@ -69,6 +69,22 @@ def profile_of(table, log_n, changes):
         if changes:
             profile[1, i] = c + t * (2.0 * b + 3.0 * t * a)
     return profile
+
+
+@njit(fastmath=FAST)
+def _cubic(profile, place):
+    """Return the node below a place, the distance from it, and coefficients of the cubic through four nodes."""
+    m = np.uint32(max(np.int32(place), np.int32(1)))
+    a = profile[m - np.uint32(1)]
+    b = profile[m]
+    e = profile[m + np.uint32(1)]
+    f = profile[m + np.uint32(2)]
+    half = np.float32(0.5)
+    # Catmull-Rom
+    c1 = half * (e - a)
+    c2 = a - np.float32(2.5) * b + (e + e) - half * f
+    c3 = half * (f - a) + np.float32(1.5) * (b - e)
+    return m, place - np.float32(m), c1, c2, c3
 
 
 @njit(fastmath=FAST)
@@ -105,43 +121,43 @@ def fill_curves(kx, ky, shape, table, out):
     size = np.float32(np.exp(2.0 * shape[0]))
     light = out[0]
     last = np.float32(_NODES - 2.5)
+    scale = np.float32(1.0 / STEP)
+    # numbers of the language are of double precision, and so would be all that they are multiplied with
+    zero = np.float32(0.0)
+    half = np.float32(0.5)
     # a loop without branches, which the compiler turns into vector instructions
     for i in range(kx.size):
         x = kx[i]
         y = ky[i]
         form = ch * (x * x + y * y) + sh * (g1 * (x * x - y * y) + g2 * (x * y + x * y))
         # rounded it may be below zero
-        place = np.sqrt(np.sqrt(np.sqrt(max(form, np.float32(0.0)) * size)))
-        light[i] = min(place * np.float32(1.0 / _STEP), last)
+        place = np.sqrt(np.sqrt(np.sqrt(max(form, zero) * size)))
+        light[i] = min(place * scale, last)
+    if not changes:
+        for i in range(kx.size):
+            m, t, c1, c2, c3 = _cubic(profile[0], light[i])
+            light[i] = profile[0, m] + t * (c1 + t * (c2 + t * c3))
+        return
     for i in range(kx.size):
         place = light[i]
-        m = max(int(place), 1)
-        t = place - np.float32(m)
-        a = profile[0, m - 1]
-        b = profile[0, m]
-        e = profile[0, m + 1]
-        f = profile[0, m + 2]
-        # cubic through four nodes (Catmull-Rom)
-        c1 = np.float32(0.5) * (e - a)
-        c2 = a - np.float32(2.5) * b + np.float32(2.0) * e - np.float32(0.5) * f
-        c3 = np.float32(0.5) * (f - a) + np.float32(1.5) * (b - e)
-        light[i] = b + t * (c1 + t * (c2 + t * c3))
-        if changes:
-            # the derivative to ln(k R_e)
-            slope = 0.25 * place * (c1 + t * (2.0 * c2 + 3.0 * t * c3))
-            x = kx[i]
-            y = ky[i]
-            # derivatives to the two ellipticities, by those of (k R_e)^2
-            k2 = x * x + y * y
-            d = x * x - y * y
-            c = 2.0 * x * y
-            turn = g1 * d + g2 * c
-            half = 0.5 * slope / max(ch * k2 + sh * turn, 1e-30)
-            bent = sh * k2 + bend * turn
-            out[1, i] = slope
-            out[2, i] = profile[1, m] + t * (profile[1, m + 1] - profile[1, m])
-            out[3, i] = half * (g1 * bent + sh * d)
-            out[4, i] = half * (g2 * bent + sh * c)
+        m, t, c1, c2, c3 = _cubic(profile[0], place)
+        light[i] = profile[0, m] + t * (c1 + t * (c2 + t * c3))
+        # the derivative to ln(k R_e)
+        slope = c1 + t * (c2 + c2 + np.float32(3.0) * t * c3)
+        slope *= np.float32(0.25) * place
+        x = kx[i]
+        y = ky[i]
+        # derivatives to the two ellipticities, by those of (k R_e)^2
+        k2 = x * x + y * y
+        d = x * x - y * y
+        c = x * y + x * y
+        turn = g1 * d + g2 * c
+        ratio = half * slope / max(ch * k2 + sh * turn, np.float32(1e-30))
+        bent = sh * k2 + bend * turn
+        out[1, i] = slope
+        out[2, i] = profile[1, m] + t * (profile[1, m + np.uint32(1)] - profile[1, m])
+        out[3, i] = ratio * (g1 * bent + sh * d)
+        out[4, i] = ratio * (g2 * bent + sh * c)
 
 
 def shape_curves(kx, ky, shapes):
