@@ -84,23 +84,20 @@ def _count(light, frequency, radius, profile):
 
 
 @njit()
-def _extent(plan, shapes, table):
-    """Return the numbers (ny, nx) of rows and columns of frequencies in which some shapes, (n, 4), have light."""
+def _extent(plan, shape, table):
+    """Return the numbers (ny, nx) of rows and columns of frequencies in which a shape, (4,), has light."""
     _, all_y, all_x = plan.response.shape
-    ny = 1
-    nx = 1
-    for s in range(len(shapes)):
-        profile = profile_of(table, shapes[s, 1], False)[0]
-        eta = np.sqrt(shapes[s, 2] ** 2 + shapes[s, 3] ** 2)
-        turn = 0.0
-        if eta > 0.0:
-            turn = np.sinh(eta) * shapes[s, 2] / eta
-        # the least k R_e at one kx, or one ky
-        size = np.exp(shapes[s, 0])
-        radius_y = size / np.sqrt(np.cosh(eta) + turn)
-        radius_x = size / np.sqrt(np.cosh(eta) - turn)
-        ny = max(ny, _count(plan.light_y, plan.ky[all_x * min(1, all_y - 1)], radius_y, profile))
-        nx = max(nx, _count(plan.light_x, plan.kx[min(1, all_x - 1)], radius_x, profile))
+    profile = profile_of(table, shape[1], False)[0]
+    eta = np.sqrt(shape[2] ** 2 + shape[3] ** 2)
+    turn = 0.0
+    if eta > 0.0:
+        turn = np.sinh(eta) * shape[2] / eta
+    # the least k R_e at one kx, or one ky
+    size = np.exp(shape[0])
+    radius_y = size / np.sqrt(np.cosh(eta) + turn)
+    radius_x = size / np.sqrt(np.cosh(eta) - turn)
+    ny = _count(plan.light_y, plan.ky[all_x * min(1, all_y - 1)], radius_y, profile)
+    nx = _count(plan.light_x, plan.kx[min(1, all_x - 1)], radius_x, profile)
     return ny, nx
 
 
@@ -109,16 +106,15 @@ def _frequencies(plan, ny, nx):
     """Return kx, ky and weights of the first ny rows and nx columns of a plan, (3, 2 ny nx)."""
     _, all_y, all_x = plan.response.shape
     values = np.empty((3, 2 * ny * nx), np.float32)
-    k = 0
     # by number: expressions of pieces of arrays take longer to compile
     for sign in range(2):
         for i in range(ny):
-            first = (sign * all_y + i) * all_x
+            first = (sign * ny + i) * nx
+            source = (sign * all_y + i) * all_x
             for j in range(nx):
-                values[0, k] = plan.kx[first + j]
-                values[1, k] = plan.ky[first + j]
-                values[2, k] = plan.weight[first + j]
-                k += 1
+                values[0, first + j] = plan.kx[source + j]
+                values[1, first + j] = plan.ky[source + j]
+                values[2, first + j] = plan.weight[source + j]
     return values
 
 
@@ -299,7 +295,7 @@ def _products(plan, table, inverse, squares, parameters, columns):
     for s in range(n):
         first = s * k
         shape = parameters[s, 2:]
-        ny, nx = _extent(plan, parameters[s : s + 1, 2:], table)
+        ny, nx = _extent(plan, shape, table)
         frequencies = _frequencies(plan, ny, nx)
         curves = np.empty((n_curves, 2, ny, nx), np.float32)
         fill_curves(frequencies[0], frequencies[1], shape, table, curves.reshape(n_curves, -1))
@@ -595,10 +591,6 @@ def evidence_of(
     all_shapes = np.empty((len(shapes) + 1, 4))
     all_shapes[0] = best[0, 2:]
     all_shapes[1:] = shapes
-    ny, nx = _extent(plan, all_shapes, table)
-    frequencies = _frequencies(plan, ny, nx)
-    curves = np.empty((1, 2, ny, nx), np.float32)
-    curve = curves.reshape(1, -1)
     x0 = best[0, 0] - squares[0, 0]
     y0 = best[0, 1] - squares[0, 1]
     columns = np.empty((3, white.size))
@@ -613,7 +605,12 @@ def evidence_of(
     yy = 0.0
     likelihoods = np.zeros((len(shapes), 2))
     for s in range(-1, len(shapes)):
-        fill_curves(frequencies[0], frequencies[1], all_shapes[s + 1], table, curve)
+        shape = all_shapes[s + 1]
+        ny, nx = _extent(plan, shape, table)
+        frequencies = _frequencies(plan, ny, nx)
+        curves = np.empty((1, 2, ny, nx), np.float32)
+        curve = curves.reshape(1, -1)
+        fill_curves(frequencies[0], frequencies[1], shape, table, curve)
         steepness = _steepness(frequencies, curve[0])
         x = x0
         y = y0
