@@ -38,6 +38,7 @@ from miricigale.fitting._core.interpolation import (
     Light,
     Part,
     interpolate_columns,
+    interpolate_exponentials,
     interpolate_light,
     make_work,
 )

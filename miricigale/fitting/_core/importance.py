@@ -103,7 +103,7 @@ def _log_ranges(labels, label):
 
 
 @njit(**KERNEL)
-def evaluate_places(space, labels, target, label, y, x, evaluated, work):
+def evaluate_places(space, labels, target, label, y, x, evaluated, flux, work):
     """
     Evaluate the posterior of an object at places.
 
@@ -120,6 +120,8 @@ def evaluate_places(space, labels, target, label, y, x, evaluated, work):
     evaluated : `~numpy.ndarray`, shape (n, 5)
         Gets ln of the posterior in scores over the standard normal distribution of the axes that are not active,
         best scale, its variance, AGN power, and ln of the likelihood.
+    flux : `~numpy.ndarray`, shape (n, nb)
+        Gets fluxes for one solar mass formed; they mean nothing where there is no model.
     work : `Work`
         Scratch.
     """
@@ -143,6 +145,8 @@ def evaluate_places(space, labels, target, label, y, x, evaluated, work):
         evaluated[i, 2] = variance
         evaluated[i, 3] = work.flux[0, len(work.flux[0]) - 1]
         evaluated[i, 4] = like
+        for b in range(flux.shape[1]):
+            flux[i, b] = work.flux[0, b]
 
 
 @njit(**KERNEL)

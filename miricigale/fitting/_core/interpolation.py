@@ -342,3 +342,15 @@ def interpolate_columns(part_table, values, redshift, work, out):
             out[i, :] = np.nan
         else:
             add_up(part_table, math.log1p(redshift[i]), count, work, out[i])
+
+
+@njit(**KERNEL)
+def interpolate_exponentials(part_table, values, redshift, work, out):
+    """Do what `interpolate_columns` does for the exponentials of logarithms."""
+    for i in range(len(out)):
+        count = find_nodes(part_table, values[i], work)
+        if count == 0:
+            out[i, :] = np.nan
+        else:
+            out[i, :] = 0.0
+            add_light(part_table, math.log1p(redshift[i]), count, work, 1.0, out[i])

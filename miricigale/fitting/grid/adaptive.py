@@ -144,6 +144,8 @@ class AdaptiveSampler:
         self.score = np.empty((size, n_axes))
         self.place = np.empty((size, n_axes))
         self.evaluated = np.empty((size, 5))
+        n_bands = work.flux.shape[1] - 2
+        self.flux = np.empty((size, n_bands))
         self.peak = np.zeros(size, np.int64)
         self.group = np.empty(size, np.int64)
         self.density = np.zeros(size)
@@ -390,8 +392,8 @@ class AdaptiveSampler:
         score = score[order]
         self.label[new] = label
         self.score[new] = score
-        of_new = (label, score, self.place[new], self.evaluated[new], self.work)
-        _core.evaluate_places(self.space, self.labels, self.target, *of_new)
+        of_new = (self.place[new], self.evaluated[new], self.flux[new])
+        self._evaluate(label, score, *of_new)
         if self.borders.size:
             self.peak[new] = np.searchsorted(self.borders, self._redshift(self.place[new, 0]))
         self.group[new] = self._groups(label, self.peak[new])
@@ -399,13 +401,18 @@ class AdaptiveSampler:
         self.n += size
         return ends
 
+    def _evaluate(self, label, score, place, evaluated, flux):
+        """Evaluate places; see `_core.evaluate_places`."""
+        of_places = (label, score, place, evaluated, flux, self.work)
+        _core.evaluate_places(self.space, self.labels, self.target, *of_places)
+
     def _reserve(self, n):
         """Make memory for n places."""
         size = len(self.label)
         if n <= size:
             return
         size = max(2 * size, n)
-        for name in ("label", "score", "place", "evaluated", "peak", "group", "density"):
+        for name in ("label", "score", "place", "evaluated", "flux", "peak", "group", "density"):
             values = getattr(self, name)
             larger = np.empty((size, *values.shape[1:]), values.dtype)
             larger[: self.n] = values[: self.n]
@@ -484,13 +491,14 @@ class AdaptiveSampler:
         return self._placed(
             self.place[rows],
             self.evaluated[rows],
+            self.flux[rows],
             weight / weight.sum(),
             self.points[1][rows],
             sample,
             converged=sample.enough,
         )
 
-    def _placed(self, place, evaluated, weight, uniform, sample, *, converged):
+    def _placed(self, place, evaluated, flux, weight, uniform, sample, *, converged):
         """Make `PlacedModels` of evaluated places and their weights; ``sample`` has the evidence."""
         _, scale, variance, power, log_likelihood = evaluated.T
         return PlacedModels(
@@ -499,6 +507,7 @@ class AdaptiveSampler:
             scale=scale,
             variance=variance,
             power=power,
+            flux=flux,
             log_likelihood=log_likelihood,
             uniform=uniform,
             log_evidence=sample.log_mean,
@@ -533,6 +542,7 @@ class AdaptiveSampler:
         score = self.score[picked]
         evaluated = self.evaluated[picked]
         place = self.place[picked]
+        flux = self.flux[picked]
         active = np.zeros(self.labels.first.shape, bool)
         for i, n in enumerate(self.labels.n_active):
             active[i, self.labels.axes[i, :n]] = True
@@ -541,8 +551,7 @@ class AdaptiveSampler:
         def evaluate(rows, new):
             place_new = np.empty(new.shape)
             evaluated_new = np.empty((len(new), 5))
-            of_new = (label[rows], new, place_new, evaluated_new, self.work)
-            _core.evaluate_places(self.space, self.labels, self.target, *of_new)
+            self._evaluate(label[rows], new, place_new, evaluated_new, flux[rows])
             if self.borders.size:
                 # weights are those of the peaks, which places must not leave
                 peak_new = np.searchsorted(self.borders, self._redshift(place_new[:, 0]))
@@ -550,9 +559,11 @@ class AdaptiveSampler:
             return evaluated_new, place_new
 
         move_places(evaluate, group[picked], active[label], score, evaluated, place, self.scramble)
+        # fluxes of the places at which they ended
+        self._evaluate(label, score, place, evaluated, flux)
         uniform = self.points[1][: len(picked)]
         return self._placed(
-            place, evaluated, np.concatenate(weight), uniform, sample, converged=False
+            place, evaluated, flux, np.concatenate(weight), uniform, sample, converged=False
         )
 
 

@@ -340,7 +340,7 @@ class Continuation(Frozen):
         z = node["redshift"]
         if one.redshift:
             z = np.zeros(len(weight), int)
-        flux, _ = self.models.fluxes(values, values["redshift"], values["frac_agn"])
+        flux = models.flux
         drawn_flux = flux * scale[:, None]
         data_flux = flux
         bands = self.engine.mixture

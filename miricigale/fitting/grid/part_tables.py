@@ -143,15 +143,20 @@ def with_columns(part, table):
 
 def part_columns(part, values):
     """Interpolate columns of a part that do not depend on redshift, (n, n_columns)."""
-    return np.exp(log_part_columns(part, values))
+    return _interpolated(_core.interpolate_exponentials, part, values)
 
 
 def log_part_columns(part, values):
     """Interpolate columns of a part as they are in its table: logarithms, (n, n_columns)."""
+    return _interpolated(_core.interpolate_columns, part, values)
+
+
+def _interpolated(kernel, part, values):
+    """Interpolate columns of a part by a kernel, (n, n_columns)."""
     n = len(values)
     out = np.empty((n, part.table.shape[2]))
     work = _core.make_work(values.shape[1], part.table.shape[2])
-    _core.interpolate_columns(part, values, np.zeros(n), work, out)
+    kernel(part, values, np.zeros(n), work, out)
     return out
 
 

@@ -18,6 +18,8 @@ class PlacedModels:
         Weights; they sum to 1.
     scale, variance, power : `~numpy.ndarray`, shape (n,)
         Best scales and their variances, and AGN power for each solar mass formed.
+    flux : `~numpy.ndarray`, shape (n, nb)
+        Fluxes in uJy for one solar mass formed.
     log_likelihood : `~numpy.ndarray`, shape (n,)
         Ln of the likelihoods, but for a constant.
     uniform : `~numpy.ndarray`, shape (n,)
@@ -33,6 +35,7 @@ class PlacedModels:
     scale: np.ndarray
     variance: np.ndarray
     power: np.ndarray
+    flux: np.ndarray
     log_likelihood: np.ndarray
     uniform: np.ndarray
     log_evidence: float
