@@ -27,7 +27,7 @@ class FilterSet(WithTable):
     ----------
     filters : iterable of `Filter` or str
         Filters, or anything else for `as_filter`, also a set of sedpy's; ``"miri.*"`` stands for all names of the
-        library of this form.
+        library of this form, by wavelength.
     unit : `~astropy.units.Unit`, optional
         Unit of the wavelengths of files that name none.
 
@@ -261,5 +261,6 @@ def _members(item, unit):
         names = fnmatch.filter(Filter.names(), item.lower())
         if not names:
             raise unknown_name("filters like", item, Filter.names())
-        return [Filter.from_name(name) for name in names]
+        members = [Filter.from_name(name) for name in names]
+        return sorted(members, key=lambda member: member.pivot)
     return [as_filter(item, unit=unit)]
