@@ -314,3 +314,12 @@ def test_errors_where_the_exposure_is_longer(simulated):
     assert_allclose(first.error, alone.error)
     with pytest.raises(ValueError, match="'noise' must be a factor for each of 4 rows"):
         model.assign(table, noise={BAND: np.ones(3)})
+
+
+def test_limits_of_all_bands_and_fluxes_without_names():
+    model = ErrorModel.from_depths({"F770W": 25.0, "F1500W": 24.0})
+    limits = model.limiting_magnitude()
+    assert_allclose(limits.value, [model.limiting_magnitude(band).value for band in model.filters])
+    assert_allclose(model.limiting_magnitude(["F1500W", "F770W"], snr=5).value, [24.0, 25.0])
+    # fluxes in any order could be taken for those of other bands
+    refuses("that names the bands, such as QTable", model.perturb, np.ones((3, 2)) * u.uJy, seed=1)

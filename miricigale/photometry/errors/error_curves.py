@@ -180,6 +180,8 @@ def flux_table(photometry, filters, model_bands):
     if filters is not None:
         filters = [known_filter(name, model_bands, "band of this error model") for name in filters]
     names = model_bands if filters is None else filters
+    wanted = "a table that names the bands, such as QTable(fluxes, names=bands)"
+    check_that(not isinstance(photometry, u.Quantity), "photometry", wanted, "fluxes without names")
     if names and not set(names) & set(getattr(photometry, "colnames", ())):
         photometry = as_photometry(photometry, names)
     require_columns(photometry, [], "photometry")

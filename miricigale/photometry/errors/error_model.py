@@ -376,7 +376,7 @@ class ErrorModel(WithTable):
         Parameters
         ----------
         filter : str or list of str, optional
-            Band; needed if there are several. Of a list the limit of each.
+            Band, or bands, of which each has its limit; all of the model by default.
         n_sigma : float, optional
             The value.
 
@@ -387,6 +387,8 @@ class ErrorModel(WithTable):
             Errors are held constant below the faintest.
         """
         check_positive(n_sigma, "n_sigma")
+        if filter is None and len(self.curves) > 1:
+            filter = list(self.curves)
         if isinstance(filter, (list, tuple)):
             return u.Quantity([self.limiting_flux(band, n_sigma) for band in filter])
         return limiting_flux(self._curve(filter), n_sigma) * FNU
@@ -399,7 +401,7 @@ class ErrorModel(WithTable):
         Parameters
         ----------
         filter : str or list of str, optional
-            Band; needed if there are several. Of a list the limit of each.
+            Band, or bands, of which each has its limit; all of the model by default.
         n_sigma : float, optional
             Signal-to-noise at the limit (the paper's error of 0.217 mag is one of 5.003).
 
