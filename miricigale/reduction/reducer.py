@@ -78,8 +78,8 @@ class Reducer(Interactive):
         The settling after a reset, which is subtracted from the groups; none if not given.
     ramps : `RampSettings`, optional
         How ramps are fitted.
-    background : `BackgroundSettings` or str, optional
-        How backgrounds are estimated, or the method alone (``"dithers"``).
+    background : `BackgroundSettings`, str or bool, optional
+        How backgrounds are estimated, the method alone (``"dithers"``), or whether they are.
     mosaics : `MosaicSettings`, optional
         How images are combined.
     references : ReferenceFiles, ReferenceCache, "none" or "simulated", optional
@@ -120,8 +120,8 @@ class Reducer(Interactive):
 
     def __post_init__(self):
         check_choice(self.backend, "backend", BACKENDS)
-        if isinstance(self.background, str):
-            object.__setattr__(self, "background", BackgroundSettings(self.background))
+        if isinstance(self.background, (str, bool)):
+            object.__setattr__(self, "background", _background_settings(self.background))
         check_positive(self.jump_threshold, "jump_threshold", optional=True)
         for name in ("skip_first", "skip_last"):
             if getattr(self, name) is not None:
@@ -514,3 +514,12 @@ class Reducer(Interactive):
         if pixel_scale is None:
             return _SCALE
         return positive(pixel_scale, ANGLE, "pixel_scale") * ANGLE
+
+
+def _background_settings(background):
+    """Return the settings of a method by its name, the default ones (True), or those of none (False)."""
+    if background is True:
+        return BackgroundSettings()
+    if background is False:
+        return BackgroundSettings("none")
+    return BackgroundSettings(background)

@@ -1,6 +1,7 @@
 """Spectra as observed: wavelengths and flux densities, of a whole and of its parts."""
 
 import dataclasses
+import numbers
 from dataclasses import field
 
 import astropy.units as u
@@ -205,7 +206,13 @@ class SED(Frozen, WithTable):
         return self + other * -1.0
 
     def __getitem__(self, key):
-        """The part between two observed wavelengths, ``sed[5 * u.um:10 * u.um]``, or where a mask is True."""
+        """
+        Return the part between two observed wavelengths, ``sed[5 * u.um:10 * u.um]``, or where a mask is True.
+
+        A whole number gives the flux density at that point, as of ``sed.fnu``.
+        """
+        if isinstance(key, numbers.Integral) and not isinstance(key, (bool, np.bool_)):
+            return self.fnu[key]
         if isinstance(key, slice):
             check_that(key.step is None, "key", "two wavelengths without a step", key)
             wave = self.wave.value

@@ -180,3 +180,8 @@ def test_a_corner_plot_of_draws_has_any_quantity(fitter, photometry, results, fi
 
 def test_brackets_are_completed(results):
     assert set(results.parameters) <= set(results._ipython_key_completions_())
+
+
+def test_errors_are_columns_by_the_names_of_attributes(results):
+    assert_array_equal(results["redshift_err"], results.redshift_err)
+    assert_array_equal(results[["redshift", "mass_err"]]["mass_err"], results.std("mass"))

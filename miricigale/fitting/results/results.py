@@ -311,9 +311,13 @@ class FitResults(FitRows):
         return table
 
     def _column(self, name):
-        """Return the posterior medians of a parameter, or a column of the table."""
+        """Return the posterior medians, or errors (``redshift_err``), of a parameter, or a column of the table."""
         if self._named(name) in self.parameters:
             return self.median(name)
+        if isinstance(name, str) and name.endswith("_err"):
+            parameter = self._named(name.removesuffix("_err"))
+            if parameter in self.parameters:
+                return self.std(parameter)
         return super()._column(name)
 
     def _value(self, name):
