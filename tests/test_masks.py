@@ -612,6 +612,7 @@ EXEMPT = {
         "sed.XRay.derived.*",
     ],
     "truth values, flags, labels and indices, which have no NaN to stand for no value": [
+        "agn.AGNImages.add_agn.hosts",
         "detector.Latent.saturated",
         "detector.Ramp.*_dq",
         "evaluation.confusion.*",
@@ -630,6 +631,7 @@ EXEMPT = {
         "sed.ModelGrid.flux.*",
     ],
     "arrays between stages of the package: planes, pixels and matrices that it computes itself": [
+        "agn.AGNImages.add_agn.light",
         "instrument.pixel_area_map.out",
         "instrument.v2v3_to_sky.matrix",
         "instrument.write_image.planes",

@@ -111,8 +111,10 @@ def images_of(args, paths, prefix=""):
     from miricigale.photometry import MosaicFile
 
     options = [{} for _ in paths]
-    # a command may call something else 'path'
-    for name in inspect.signature(MosaicFile).parameters.keys() - {"path"}:
+    for name in inspect.signature(MosaicFile).parameters:
+        # a command may call something else 'path'
+        if name == "path":
+            continue
         values = getattr(args, prefix + name, None)
         if not values:
             continue

@@ -36,8 +36,8 @@ def takes_other_keywords(target):
     Examples
     --------
     >>> from miricigale import Exposure
-    >>> Exposure("F770W", ngroups=10) == Exposure("F770W", n_groups=10)
-    True
+    >>> Exposure("F770W", ngroups=10, nints=2)
+    <Exposure miri.f770w: FASTR1, 2 x 10 groups, 55.5 s, FULL>
     """
     if isinstance(target, type):
         settings = _settings_of(target)

@@ -204,7 +204,9 @@ def test_errors_of_several_exposures_are_those_of_each():
     for exposure in (deep, short):
         limit = ErrorModel.from_exposure(exposure, n_dithers=1).limiting_flux(exposure.filter)
         assert both.limiting_flux(exposure.filter) == limit
-    refuses("no band of this error model None", both.limiting_flux, error=KeyError)
+    limits = both.limiting_flux()
+    assert_allclose(limits.value, [both.limiting_flux(band).value for band in both.filters])
+    refuses("no band of this error model 'F1000W'", both.limiting_flux, "F1000W", error=KeyError)
     single = ErrorModel.from_exposure(short)
     # columns are found by any name of the band
     fluxes = QTable({"id": [1], "miri.f1500w": [9.0] * u.uJy})

@@ -202,7 +202,12 @@ def test_scale_and_angle_come_from_the_header(tmp_path):
     assert make_psf(gaussian_image(51, HI), pixel_scale=SCALE).frame == "sky"
     assert psf.pixel_scale.value == pytest.approx(0.11)
     fits.writeto(path, gaussian_image(51, HI), overwrite=True)
-    refuses("'pixel_scale' must be given where the header", read_psf, path, frame="sky")
+    refuses(
+        "'pixel_scale' must be given, such as .*, for the header does not",
+        read_psf,
+        path,
+        frame="sky",
+    )
 
 
 def test_roll_of_the_header_turns_the_psf(tmp_path):

@@ -177,9 +177,8 @@ shown
 # 4. Count AGN
 # ------------
 # Objects with a high AGN fraction are no census. :class:`~miricigale.agn.AGNSurvey` fits the catalog as galaxies
-# and as quasars, fits it again with AGN of known luminosity added to the galaxies, and measures on the sample
-# itself how frequent AGN are. Here it takes total fluxes; ``nuclei=True`` adds points, and ``images`` puts the AGN
-# into the images (:class:`~miricigale.agn.AGNImages`).
+# and as quasars, fits it again with AGN of known luminosity added, and measures on the sample how frequent AGN
+# are. Here it takes total fluxes; ``images`` puts the AGN into images (:class:`~miricigale.agn.AGNImages`).
 
 joined.remove_columns([*points, "sky", "components"])
 joined.write("catalog.ecsv", overwrite=True)

@@ -16,7 +16,7 @@ from miricigale.photometry.fit.fit_loop import fit_image
 from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package, warn_of_none
 from miricigale.photometry.fit.sampled_psfs import SampledPSFs, is_sampled
 from miricigale.photometry.fit.stars import with_stars
-from miricigale.photometry.images.arrays import fit_arrays, image_arrays, pixel_scale
+from miricigale.photometry.images.arrays import check_noise, fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.images.repeated_pixels import own_pixels
@@ -360,6 +360,7 @@ class ForcedPhotometer(Interactive):
             wanted = f"{len(self.kernel)} exposures, one for each kernel"
             raise argument_error("image", wanted, "one image")
         image = own_pixels(as_mosaic(image, "image"))
+        check_noise(image, "image")
         arrays = fit_arrays(image, "image")
         prior, sources = self._sources(image, highres, segmentation, catalog, templates)
         if self.psf_stars is not False and not self.bare:
@@ -502,6 +503,8 @@ class ForcedPhotometer(Interactive):
             if highres.wcs is None:
                 image_arrays(highres, "highres")
             self._check_scale("highres", highres.wcs)
+            if self.template in ("auto", "cutout"):
+                check_noise(highres, "highres")
         if catalog is not None:
             # pixels of a catalog are those of the image it was made of
             place = image if highres is None else highres

@@ -160,11 +160,6 @@ def _checked(image, name):
         spread = 0.0
         if usable.any():
             spread = mad_std(np.asarray(data[usable], float))
-            peak = np.max(np.abs(data[usable]))
-            wanted = "an image with noise that can be measured, or with an uncertainty"
-            got = f"a median absolute deviation of {spread:.2g}, {spread / (peak or 1):.1g} of the peak"
-            # an image drawn without noise is 0 in most pixels, to rounding
-            check_that(peak == 0 or spread > _LEAST_NOISE * peak, name, wanted, got)
         noise = np.broadcast_to(np.float64(spread), data.shape), factor
     else:
         # which takes the size of what is below 0
@@ -185,6 +180,34 @@ def _checked(image, name):
     mask_filled(data, usable, f"'{name}'")
     check_that(usable.any(), name, "an image with usable pixels", "none (masked, NaN or no noise)")
     return (data, factor), noise, usable
+
+
+def check_noise(image, name):
+    """
+    Refuse an image without an uncertainty that was drawn without noise, which is 0 in most pixels, to rounding.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        The image.
+    name : str
+        The argument's name.
+    """
+    if image.uncertainty is not None:
+        return
+    data = np.asarray(image.data, float)
+    usable = np.isfinite(data)
+    if image.mask is not None:
+        usable &= ~np.asarray(image.mask, bool)
+    data = data[usable]
+    if not data.size:
+        # which has a message of its own
+        return
+    spread = mad_std(data)
+    peak = np.max(np.abs(data), initial=0.0)
+    wanted = "an image with noise that can be measured, or with an uncertainty"
+    got = f"a median absolute deviation of {spread:.2g} below a peak of {peak:.2g}"
+    check_that(peak == 0 or spread > _LEAST_NOISE * peak, name, wanted, got)
 
 
 def pixel_scale(wcs):
