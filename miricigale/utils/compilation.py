@@ -20,7 +20,11 @@ from miricigale.utils.caching import cached
 
 log = logging.getLogger(__name__)
 
-#: Options of kernels called from Python that allocate nothing, whose sums may be taken in any order.
+# Code of a function may be in a process twice: its own, and in a kernel that calls it, compiled with that. Which
+# of the two a call runs depends on what was loaded first, and sums that may be taken in any order then differ in
+# the last digit. Functions with ``fastmath`` that kernels call are therefore copied into them (``forceinline``).
+
+#: Options of kernels called from Python alone, which allocate nothing and whose sums may be taken in any order.
 KERNEL = {
     "error_model": "numpy",
     "fastmath": True,

@@ -106,7 +106,7 @@ def agn_products(agn, target, z, agn_pq, agn_weighted):
         agn_pq[k, 1] = q
 
 
-@njit(**KERNEL)
+@njit(**PART)
 def best_of_galaxy(tables, target, limits, pairs, z, g):
     """
     Best model of one galaxy at one redshift, f = 0 included; with limits, a good one.

@@ -130,7 +130,7 @@ def _turns(frequency, shift, n):
     return turns
 
 
-@njit(fastmath=FAST)
+@njit(fastmath=FAST, forceinline=True)
 def _quarters(plan, curves, x, y, n_moved, size):
     """
     Draw images of transforms, (n, 2, ny, nx), on a square of at most the plan's size, with a center (x, y) on it.
@@ -257,7 +257,7 @@ def _whiten(quarters, k, inverse, y, x, column):
             column[middle - j] = (even - odd) * noise[x + half - j]
 
 
-@njit(fastmath=FAST)
+@njit(fastmath=FAST, forceinline=True)
 def _product(a, b):
     """Sum of the products of two vectors: expressions of whole arrays take seconds to compile."""
     total = 0.0
@@ -518,7 +518,7 @@ def minimum(plan, table, white, inverse, squares, start, mean, precision, limits
     return chi2, flux, parameters, evidence, covariance, matrix
 
 
-@njit(fastmath=FAST)
+@njit(fastmath=FAST, forceinline=True)
 def _image_products(quarters, inverse, white):
     """Sum the squares of the whitened image that `_quarters` hold alone, and its products with the data."""
     half = quarters.shape[2] - 1
@@ -543,7 +543,7 @@ def _image_products(quarters, inverse, white):
     return power, projection
 
 
-@njit(fastmath=FAST)
+@njit(fastmath=FAST, forceinline=True)
 def _steepness(frequencies, curve):
     """Sum the squares of the slopes of an image over all pixels, by its transform and `_frequencies`."""
     total = 0.0

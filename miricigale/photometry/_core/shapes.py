@@ -71,7 +71,7 @@ def profile_of(table, log_n, changes):
     return profile
 
 
-@njit(fastmath=FAST)
+@njit(fastmath=FAST, forceinline=True)
 def _cubic(profile, place):
     """Return the node below a place, the distance from it, and coefficients of the cubic through four nodes."""
     m = np.uint32(max(np.int32(place), np.int32(1)))
@@ -87,7 +87,7 @@ def _cubic(profile, place):
     return m, place - np.float32(m), c1, c2, c3
 
 
-@njit(fastmath=FAST)
+@njit(fastmath=FAST, forceinline=True)
 def fill_curves(kx, ky, shape, table, out):
     """
     Write the transform of a centered Sersic profile of unit light, and its derivatives.

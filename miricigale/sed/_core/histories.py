@@ -13,7 +13,7 @@ YOUNG = 10  # Myr
 _BLOCK = 64
 
 
-@njit(fastmath={"reassoc", "contract"})
+@njit(fastmath={"reassoc", "contract"}, forceinline=True)
 def _exponential(n, tau, delayed):
     """Compute ``exp(-t / tau)``, or ``t exp(-t / tau)``, for t = 0 ... n - 1, up to a factor."""
     # a rising exponential is counted from its last step, so that nothing overflows
@@ -32,7 +32,7 @@ def _exponential(n, tau, delayed):
     return out
 
 
-@njit(fastmath={"reassoc", "contract"})
+@njit(fastmath={"reassoc", "contract"}, forceinline=True)
 def _finish(rate, f_burst, age_burst, tau_burst):
     """Add an exponential burst in the last steps that makes a fraction of all stars; sum 1e-6."""
     n = rate.size
@@ -128,7 +128,7 @@ def age_steps(age, n_steps):
     return runs, mixed, rows.indptr, rows.indices, rows.data
 
 
-@njit(fastmath={"reassoc", "contract"})
+@njit(fastmath={"reassoc", "contract"}, forceinline=True)
 def _moments(history, first, last):
     """Sums of mass and of mass times (step - first), for steps counted back from the end."""
     n = history.size
