@@ -66,6 +66,9 @@ class CatalogFlags(Flags):
 def _plain_column(table, name, unit, argument):
     """A column as numbers in ``unit``, NaN where it has none or one that stands for no value."""
     values = plain_floats(table[name], name, argument)
+    wanted = f"a table with one number a row in {name!r}"
+    got = f"a column of shape {values.shape} (column[:, 0] is its first number)"
+    check_that(values.ndim == 1, argument, wanted, got)
     if name != "position_angle":  # an angle on the sky may be -99
         values[without_codes(values)[0]] = np.nan
     values = u.Quantity(values, getattr(table[name], "unit", None)).to(unit or u.one)

@@ -265,10 +265,6 @@ def plain_floats(column, name, argument):
     mask = mask_of(column)
     column = getattr(column, "value", column)
     values = np.ma.getdata(getattr(column, "unmasked", column))
-    if values.ndim != 1:
-        wanted = f"a table with one number a row in {name!r}"
-        got = f"a column of shape {values.shape} (column[:, 0] is its first number)"
-        raise argument_error(argument, wanted, got)
     if values.dtype.kind not in "iufSUO":
         wanted = f"a table with numbers in {name!r}"
         raise argument_error(argument, wanted, f"values of the type {values.dtype}")

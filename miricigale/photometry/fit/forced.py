@@ -360,7 +360,6 @@ class ForcedPhotometer(Interactive):
             wanted = f"{len(self.kernel)} exposures, one for each kernel"
             raise argument_error("image", wanted, "one image")
         image = own_pixels(as_mosaic(image, "image"))
-        check_noise(image, "image")
         arrays = fit_arrays(image, "image")
         prior, sources = self._sources(image, highres, segmentation, catalog, templates)
         if self.psf_stars is not False and not self.bare:

@@ -130,6 +130,7 @@ def image_arrays(image, name, dtype=float):
 def fit_arrays(image, name):
     """Take a `~astropy.nddata.CCDData` apart for a fit of templates; see `image_arrays`."""
     arrays = image_arrays(image, name, np.float32)
+    check_noise(image, name)
     inverse = np.divide(np.float32(1), arrays.sigma, out=arrays.sigma)
     return FitArrays(
         flux=arrays.flux,
