@@ -269,7 +269,7 @@ def separate_trials(sky, chosen, distance):
     Returns
     -------
     trial : int `~numpy.ndarray`, shape (n,)
-        Number of the set from 0 on, each position being in the first that has room; -1 if not chosen.
+        Number of the set, from 0; each position is in the first set that has room. It is -1 if not chosen.
     """
     trial = np.full(len(sky), -1)
     for i in np.flatnonzero(chosen):

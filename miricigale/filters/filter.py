@@ -283,12 +283,6 @@ class Filter(Frozen, WithTable):
 
     @classmethod
     @takes_other_keywords
-    def from_file(cls, path, *, name=None, unit=None):
-        """Return the filter of a file; see `read`."""
-        return cls.read(path, name=name, unit=unit)
-
-    @classmethod
-    @takes_other_keywords
     def read(cls, path, *, name=None, unit=None):
         r"""
         Read a filter from a file.
@@ -356,6 +350,9 @@ class Filter(Frozen, WithTable):
         wanted = "a file of a format with units, such as .ecsv or .fits"
         check_that(table_suffix(path) != ".csv", "path", wanted, str(path))
         write_table(self.to_table(), path, overwrite=overwrite)
+
+    #: Other name of `read`.
+    from_file = read
 
     @classmethod
     def from_synphot(cls, bandpass, *, name=None):

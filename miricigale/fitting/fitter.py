@@ -536,6 +536,7 @@ class BayesFitter(CatalogFits):
 
     __call__ = fit
 
+    @takes_other_keywords
     def sample(
         self,
         photometry,

@@ -335,7 +335,7 @@ class Planner:
         all_bands = list(config.fit.bands) + list(bands)
         settings = GridSettings(interpolate=0, rtol=_RTOL)
         fitter = study_fitter(config.fit, all_bands, axes=fit_plan(config, name), settings=settings)
-        # mock fluxes have the errors that they were drawn with, which nobody can change
+        # mock fluxes scatter by the errors that they were drawn with
         quiet = contextlib.nullcontext()
         if measured is None:
             quiet = without_scatter_warnings()

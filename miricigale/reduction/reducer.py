@@ -352,7 +352,7 @@ class Reducer(Interactive):
         """
         images = [as_exposure(image) for image in exposure_list(images)]
         if wcs is None:
-            wcs = own_grid(images, self._pixel_scale(pixel_scale))
+            wcs = own_grid(images, self.mosaic_scale(pixel_scale))
         else:
             wcs = as_wcs(wcs)
         return self.drizzle(images, wcs)[0].image
@@ -444,7 +444,7 @@ class Reducer(Interactive):
         ValueError
             If there are no ramps, of more than one filter, or one of them twice.
         """
-        pixel_scale = self._pixel_scale(pixel_scale)
+        pixel_scale = self.mosaic_scale(pixel_scale)
         rates = []
         images = []
         backgrounds = []
@@ -504,11 +504,28 @@ class Reducer(Interactive):
         if isinstance(align, str) and align == "visits":
             images, _ = align_images(images, groups=map(visit_of, images))
             align = None
-        pixel_scale = self._pixel_scale(pixel_scale)
+        pixel_scale = self.mosaic_scale(pixel_scale)
         return combine(self, images, backgrounds, rates, wcs, pixel_scale, align, planes)
 
-    def _pixel_scale(self, pixel_scale):
-        """Return the pixel of a mosaic: that of a call, else of the settings, else MIRI's."""
+    def mosaic_scale(self, pixel_scale=None):
+        """
+        Pixel of mosaics without a WCS of their own.
+
+        Parameters
+        ----------
+        pixel_scale : `~astropy.units.Quantity`, optional
+            What a call asks for; the setting by default.
+
+        Returns
+        -------
+        pixel_scale : `~astropy.units.Quantity`
+            In arcsec: what was asked for, else that of the settings, else 0.11, MIRI's.
+
+        Raises
+        ------
+        `~astropy.units.UnitsError`, ValueError
+            If it is no angle above 0.
+        """
         if pixel_scale is None:
             pixel_scale = self.mosaics.pixel_scale
         if pixel_scale is None:

@@ -495,11 +495,11 @@ class SEDModel(Interactive):
 
     def derived(self, **parameters):
         """Derived quantities of one model: dict of name to `~astropy.units.Quantity`."""
-        return self.evaluate(**parameters).derived
+        return tables.spectra(self, self.values(parameters)).derived
 
     def plot(self, ax=None, **parameters):
         """Draw the spectrum of one model, see `evaluate` and `SED.plot`; returns the axes."""
-        return self.evaluate(**parameters).plot(ax=ax)
+        return tables.spectra(self, self.values(parameters)).plot(ax=ax)
 
     def fluxes(self, table=None, filters=None, **parameters):
         """

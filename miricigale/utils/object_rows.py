@@ -82,7 +82,7 @@ class _ByName(dict):
 
     def __call__(self, name, *others):
         if others:
-            msg = f"takes a name alone: results.loc[id].pdf({name!r}) is that of one object"
+            msg = f"{name!r} alone gives the arrays of all objects; results.loc[id] is one object"
             raise TypeError(msg)
         return self[name]
 

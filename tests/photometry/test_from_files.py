@@ -148,11 +148,14 @@ def test_positions_of_a_catalog_are_measured_as_points_without_a_prior(files, tm
     options += ["--weight", files.paths["weight"], "--output", str(output), "--no-progress"]
     assert main(["photometry", files.paths["image"], *options]) == 0
     table = QTable.read(output)
+    assert "highres" not in table.meta
     pulls = (table[BAND].value - files.flux) / np.hypot(
         table[f"{BAND}_err"].value, 0.01 * files.flux
     )
     assert np.abs(pulls).max() < 4
-    assert "points at the positions of a catalog" in output.with_suffix(".html").read_text()
+    page = output.with_suffix(".html").read_text()
+    assert "points at the positions of a catalog" in page
+    assert "for points with the PSF of the image" in page
     # the same as in Python, but for the background that files are fitted with
     image = read_mosaic(files.paths["image"], weight=files.paths["weight"], filter=BAND)
     psf = (fits.getdata(files.paths["psf"]), COARSE * u.arcsec)

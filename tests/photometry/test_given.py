@@ -16,7 +16,12 @@ from helpers.errors import refuses
 from helpers.scenes import tan_wcs
 from miricigale.filters import Filter
 from miricigale.instrument import Exposure, pixel_area_map
-from miricigale.photometry import ErrorModel, ForcedPhotometer, detect_sources
+from miricigale.photometry import (
+    ErrorModel,
+    ForcedPhotometer,
+    SourceTemplates,
+    detect_sources,
+)
 from miricigale.psf import MatchingKernel, gaussian_psf
 
 NOISE = {0.03: 0.002, 0.09: 0.01}
@@ -268,6 +273,11 @@ def test_psfs_without_pixels_are_on_those_of_their_images(images, sky, flux, tmp
     assert np.all(np.abs(both.flux.value - flux) < 5 * both.flux_err.value)
     refuses("'psf' must be a PSF that states its pixels for exposures", photometer.measure,
             [image, image], highres)  # fmt: skip
+    # models are drawn, and several bands measured, on the same pixels
+    templates = SourceTemplates.from_catalog(QTable({"sky": sky, "id": np.arange(16)}))
+    drawn_light = ForcedPhotometer(psf=array).render(image, templates, flux * u.uJy)
+    total = np.sum(drawn_light * pixel_area_map(image.wcs, image.shape) * u.sr).to_value(u.uJy)
+    assert total == pytest.approx(flux.sum(), rel=1e-3)
     refuses("given to measure.. where 'highres_psf'", photometer.measure, image, sky)
 
 
@@ -277,5 +287,11 @@ def test_an_image_without_noise_asks_for_its_uncertainty(images, psfs, sky):
     # a Gaussian, which is not quite 0 anywhere
     image.data = np.exp(-0.5 * ((x - 48.0) ** 2 + (y - 48.0) ** 2) / 4)
     image.uncertainty = None
-    message = "'image' must be an image with noise that can be measured, or with an uncertainty"
-    refuses(message, ForcedPhotometer(psf=psfs["psf"]).measure, image, sky)
+    message = "must be an image with noise that can be measured, or with an uncertainty"
+    refuses(f"'image' {message}", ForcedPhotometer(psf=psfs["psf"]).measure, image, sky)
+    photometer = ForcedPhotometer(**psfs)
+    sharp = images[1].copy()
+    sharp.data = np.where(sharp.data > 0.1, sharp.data, 0.0)
+    sharp.uncertainty = None
+    labels = (sharp.data > 0).astype(int)
+    refuses(f"'highres' {message}", photometer.measure, images[0], sharp, labels)

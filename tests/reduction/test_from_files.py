@@ -112,6 +112,12 @@ def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
     # and with other settings all
     table = reduce_files(files[3:4], out, reducer=Reducer(background=BackgroundSettings(box=16)))
     assert list(table["status"]) == ["reduced", "reduced"]
+    # the pixel of mosaics is that of the reducer, or of the call
+    fine = Reducer(background=BackgroundSettings(box=16), pixel_scale=0.09 * u.arcsec)
+    for options, scale in (({}, 0.09), ({"pixel_scale": 0.1 * u.arcsec}, 0.1)):
+        reduce_files(files[3:4], out, reducer=fine, **options)
+        (mosaic,) = read_images(next(out.glob("mosaic_*.fits")))
+        assert mosaic.image.pixel_scale.to_value(u.arcsec) == pytest.approx(scale, rel=1e-6)
 
 
 def test_backgrounds_of_dithers_are_those_of_the_classes(files, tmp_path):

@@ -2,6 +2,9 @@ import inspect
 import io
 import re
 import shlex
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import astropy.units as u
@@ -152,6 +155,8 @@ def test_help_states_the_defaults_of_what_options_fill():
             for name, parameter in inspect.signature(function).parameters.items():
                 defaults[name] = getattr(parameter.default, "value", parameter.default)
         defaults |= {"redshift_bins": defaults.get("redshift")}
+        # a setting whose default is that of the instrument
+        defaults["pixel_scale"] = Reducer().mosaic_scale().value
         for flags, option in declarations()[command_name]["options"].items():
             stated = re.search(r"\(([\d.]+(?: [\d.]+)*)\)", option["help"])
             if stated and "default" not in option:
@@ -184,6 +189,8 @@ def test_help_names_presets_and_surveys(capsys):
         (["fit", "--catalog", "a.fits"], "CATALOG has no option before it"),
         (["fit", "a.fits", "--unit", "Jy"], "did you mean '--flux-unit'?"),
         (["help", "fit"], "did you mean '--help'?"),
+        (["measure", "a"], "did you mean 'photometry'?"),
+        (["simulate", "a"], "; Scene and Detector simulate exposures in Python, 'run' a whole"),
         (["plan", "--filters", "F770W"], "--filters; did you mean '--bands'? (see"),
         (
             ["fit", "a.fits", "--zmax", "4"],
@@ -369,3 +376,13 @@ def test_options_of_a_reduction_fill_its_settings():
     assert (reducer.background.method, reducer.background.stripes) == ("sep", True)
     assert reducer.background.sky_flat == 3.0
     assert (reducer.skip_first, reducer.jump_threshold, reducer.references) == (2, None, "none")
+
+
+def test_a_reader_that_leaves_ends_a_command_quietly():
+    command = [sys.executable, "-m", "miricigale", "filters"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        # before anything is written
+        process.stdout.close()
+        message = process.stderr.read()
+    assert process.returncode == 128 + signal.SIGPIPE
+    assert message == b""

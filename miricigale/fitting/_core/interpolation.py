@@ -64,7 +64,7 @@ def place_between(nodes, n, x):
         return 0, 0.0
     low = 0
     size = n - 1
-    # as many steps for every place, without a branch that nobody can foresee
+    # the same number of steps for every place, without branches that processors would mispredict
     while size > 1:
         half = size // 2
         low += half * (nodes[low + half] <= x)

@@ -140,7 +140,7 @@ def _mean(point, data, rows, band):
     share = (covariance - total_variance) / variance
     mean = total - share * difference
     mean_variance = total_variance - share * (covariance - total_variance)
-    # errors of models and floors of errors are those of the total
+    # the errors of models and the error floors are those of the total
     added = np.square(data.sigma[rows, band]) - total_variance
     mean_sigma = np.sqrt(mean_variance + np.maximum(added, 0.0))
     return mean, mean_sigma, difference, np.sqrt(variance)

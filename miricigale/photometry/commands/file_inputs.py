@@ -70,6 +70,11 @@ class Inputs:
         )
 
     @property
+    def prior_meta(self):
+        """What the table says of the prior: dict."""
+        return {"highres": str(self.highres.path)}
+
+    @property
     def bands(self):
         """Names of the filters."""
         return [file.header.filter for file in self.images]
@@ -266,7 +271,7 @@ class Measurement:
         table.meta["image"] = paths
         if len(paths) == 1:
             table.meta["image"] = paths[0]
-        table.meta["highres"] = str(inputs.highres.path)
+        table.meta |= inputs.prior_meta
         return table
 
     def products(self, name):

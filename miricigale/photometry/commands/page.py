@@ -63,8 +63,7 @@ def write_page(path, bands, highres, segments, confidence, seed):
     names = ", ".join(band.name for band in bands)
     files = ", ".join(Path(band.image.meta["source"]).name for band in bands)
     title = f"Forced photometry: {names}"
-    # points have no prior: their first image stands in for it
-    has_prior = all(highres is not band.image for band in bands)
+    has_prior = _has_prior(bands, highres)
     sources = "points at the positions of a catalog"
     if has_prior:
         sources = f"on the prior {Path(highres.meta['source']).name}"
@@ -113,6 +112,11 @@ def write_page(path, bands, highres, segments, confidence, seed):
     report.write(path, overwrite=True)
 
 
+def _has_prior(bands, highres):
+    """Whether there is a prior: where sources are points their first image stands in for it."""
+    return all(highres is not band.image for band in bands)
+
+
 def _notices(page, bands, highres):
     images = {}
     for band in bands:
@@ -139,7 +143,7 @@ def _notices(page, bands, highres):
         threshold = 0.1 * pixel_scale(result.residual_image.wcs)
         if result.shift is None and np.any((abs(offset) > threshold) & (abs(offset) > 3 * error)):
             page.notice("offset", offset=_pairs(result.meta), band=band.name)
-    if highres not in images.values():
+    if _has_prior(bands, highres):
         images["prior"] = highres
     for name, image in images.items():
         scale = image.meta.get("noise_scale")
@@ -396,7 +400,7 @@ def _source_rows(result, confidence):
 def _input_table(page, bands, highres):
     page.section("inputs")
     files = [(band.name, band.image, band.kernel, "psf") for band in bands]
-    if all(highres is not band.image for band in bands):
+    if _has_prior(bands, highres):
         files.append(("prior", highres, bands[0].kernel, "highres_psf"))
     facts = {}
     for name, image, kernel, psf in files:
@@ -417,7 +421,10 @@ def _input_table(page, bands, highres):
         values = band.kernel.array
         scale = band.kernel.pixel_scale.value
         facts = {"size": values.shape[0], "scale": scale, "sum": values.sum()}
-        facts["origin"] = band.kernel.meta.get("file", "made from two PSFs")
+        made = "made from two PSFs"
+        if not _has_prior(bands, highres):
+            made = "for points with the PSF of the image"
+        facts["origin"] = band.kernel.meta.get("file", made)
         page.text("kernel", band=band.name, gain=band.kernel.noise_gain, **facts)
 
 

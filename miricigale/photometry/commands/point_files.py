@@ -39,6 +39,11 @@ class PointInputs(Inputs):
             images = [image]
         return super().of(images, images[0], **settings)
 
+    @property
+    def prior_meta(self):
+        """Nothing, as there is no prior: dict."""
+        return {}
+
     def check(self):
         """Refuse, before any image is read, what is missing, or not what it should be."""
         catalog = file_place(self.catalog)[0]

@@ -118,7 +118,7 @@ def measure_prior(images, photometers, highres, segmentation, catalog):
             opened[name] = list(map(as_mosaic, image))
         else:
             opened[name] = own_pixels(as_mosaic(image))
-    photometers = dict(photometers)
+    photometers = {name: p.on_pixels(images[name], highres) for name, p in photometers.items()}
     stars = {}
     for name, photometer in photometers.items():
         if photometer.psf_stars is not False and not photometer.bare:

@@ -16,7 +16,7 @@ from miricigale.photometry.fit.fit_loop import fit_image
 from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package, warn_of_none
 from miricigale.photometry.fit.sampled_psfs import SampledPSFs, is_sampled
 from miricigale.photometry.fit.stars import with_stars
-from miricigale.photometry.images.arrays import check_noise, fit_arrays, image_arrays, pixel_scale
+from miricigale.photometry.images.arrays import fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.images.repeated_pixels import own_pixels
@@ -337,12 +337,6 @@ class ForcedPhotometer(Interactive):
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
-        if isinstance(self.kernel, SampledPSFs):
-            sharp = highres
-            if isinstance(highres, (SkyCoord, Table)):
-                sharp = None
-            photometer = self.replace(kernel=self.kernel.kernel(image, sharp))
-            return photometer.measure(image, highres, segmentation, catalog, templates=templates)
         if templates is not None and not isinstance(templates, SourceTemplates):
             msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
             raise TypeError(msg)
@@ -350,6 +344,9 @@ class ForcedPhotometer(Interactive):
             highres, catalog = None, highres
         if isinstance(segmentation, (SkyCoord, Table)) and catalog is None:
             segmentation, catalog = None, segmentation
+        if isinstance(self.kernel, SampledPSFs):
+            options = {"segmentation": segmentation, "catalog": catalog, "templates": templates}
+            return self.on_pixels(image, highres).measure(image, highres, **options)
         if are_exposures(image):
             from miricigale.photometry.fit.exposure_photometry import measure_exposures
 
@@ -369,6 +366,29 @@ class ForcedPhotometer(Interactive):
             result = photometer.measure(image, *(prior or ()), templates=templates)
             return stars.noted(result)
         return self._measured(image, arrays, sources, prior=prior)
+
+    def on_pixels(self, image, highres=None):
+        """
+        Put PSFs that do not state their pixels on those of images.
+
+        Parameters
+        ----------
+        image, highres : optional
+            As for `measure`.
+
+        Returns
+        -------
+        photometer : `ForcedPhotometer`
+            Itself, if its PSFs state their pixels.
+
+        Raises
+        ------
+        ValueError
+            If a PSF is on the pixels of an image that is not given, or of exposures.
+        """
+        if isinstance(self.kernel, SampledPSFs):
+            return self.replace(kernel=self.kernel.kernel(image, highres))
+        return self
 
     def _measure_or_find(self, image, templates):
         """
@@ -443,6 +463,8 @@ class ForcedPhotometer(Interactive):
         ValueError, TypeError, `~astropy.units.UnitsError`
             If an input does not fit; the message says which.
         """
+        if isinstance(self.kernel, SampledPSFs):
+            return self.on_pixels(image).render(image, templates, flux)
         arrays = image_arrays(as_mosaic(image, "image"), "image")
         flux = to_array(flux, FNU, "flux", ndim=1)
         if len(flux) != len(templates):
@@ -502,8 +524,6 @@ class ForcedPhotometer(Interactive):
             if highres.wcs is None:
                 image_arrays(highres, "highres")
             self._check_scale("highres", highres.wcs)
-            if self.template in ("auto", "cutout"):
-                check_noise(highres, "highres")
         if catalog is not None:
             # pixels of a catalog are those of the image it was made of
             place = image if highres is None else highres

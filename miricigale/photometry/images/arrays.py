@@ -81,7 +81,7 @@ def _areas(wcs, out):
     return area
 
 
-def image_arrays(image, name, dtype=float):
+def image_arrays(image, name, dtype=float, *, fitted=False):
     """
     Take a `~astropy.nddata.CCDData` apart.
 
@@ -94,6 +94,9 @@ def image_arrays(image, name, dtype=float):
         The argument's name, for messages.
     dtype : type, optional
         That of the arrays; single precision for large images.
+    fitted : bool, optional
+        Whether its noise counts, as in fits of templates to it or of profiles that become templates: an image
+        without an uncertainty that was drawn without noise is refused then.
 
     Returns
     -------
@@ -113,7 +116,7 @@ def image_arrays(image, name, dtype=float):
     `~miricigale.utils.exceptions.PhotometryWarning`
         If areas of one number, such as 0 or -99, are taken as without data.
     """
-    (data, factor), (noise, noise_factor), usable = _checked(image, name)
+    (data, factor), (noise, noise_factor), usable = _checked(image, name, fitted)
     area = _areas(image.wcs, np.empty(usable.shape, dtype))
     # in the wanted precision at once, for images can be large
     flux = np.multiply(data, factor, dtype=dtype, casting="same_kind")
@@ -129,8 +132,7 @@ def image_arrays(image, name, dtype=float):
 
 def fit_arrays(image, name):
     """Take a `~astropy.nddata.CCDData` apart for a fit of templates; see `image_arrays`."""
-    arrays = image_arrays(image, name, np.float32)
-    check_noise(image, name)
+    arrays = image_arrays(image, name, np.float32, fitted=True)
     inverse = np.divide(np.float32(1), arrays.sigma, out=arrays.sigma)
     return FitArrays(
         flux=arrays.flux,
@@ -142,7 +144,7 @@ def fit_arrays(image, name):
     )
 
 
-def _checked(image, name):
+def _checked(image, name, fitted):
     """Return data and noise, each with its factor to MJy/sr or to uJy in a pixel, and the usable pixels."""
     if not isinstance(image, CCDData):
         msg = f"'{name}' must be a CCDData, got {type(image).__name__}"
@@ -161,6 +163,12 @@ def _checked(image, name):
         spread = 0.0
         if usable.any():
             spread = mad_std(np.asarray(data[usable], float))
+            # an image drawn without noise is 0 in most pixels, to rounding
+            peak = np.max(np.abs(data[usable]))
+            is_clean = peak > 0 and spread <= _LEAST_NOISE * peak
+            wanted = "an image with noise that can be measured, or with an uncertainty"
+            got = f"a median absolute deviation of {spread:.2g} below a peak of {peak:.2g}"
+            check_that(not (fitted and is_clean), name, wanted, got)
         noise = np.broadcast_to(np.float64(spread), data.shape), factor
     else:
         # which takes the size of what is below 0
@@ -181,34 +189,6 @@ def _checked(image, name):
     mask_filled(data, usable, f"'{name}'")
     check_that(usable.any(), name, "an image with usable pixels", "none (masked, NaN or no noise)")
     return (data, factor), noise, usable
-
-
-def check_noise(image, name):
-    """
-    Refuse an image without an uncertainty that was drawn without noise, which is 0 in most pixels, to rounding.
-
-    Parameters
-    ----------
-    image : `~astropy.nddata.CCDData`
-        The image.
-    name : str
-        The argument's name.
-    """
-    if image.uncertainty is not None:
-        return
-    data = np.asarray(image.data, float)
-    usable = np.isfinite(data)
-    if image.mask is not None:
-        usable &= ~np.asarray(image.mask, bool)
-    data = data[usable]
-    if not data.size:
-        # which has a message of its own
-        return
-    spread = mad_std(data)
-    peak = np.max(np.abs(data), initial=0.0)
-    wanted = "an image with noise that can be measured, or with an uncertainty"
-    got = f"a median absolute deviation of {spread:.2g} below a peak of {peak:.2g}"
-    check_that(peak == 0 or spread > _LEAST_NOISE * peak, name, wanted, got)
 
 
 def pixel_scale(wcs):

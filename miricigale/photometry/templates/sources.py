@@ -185,7 +185,7 @@ class SourceTemplates:
         """
         check_choice(template, "template", ("auto", "cutout"))
         columns = catalog_sources(catalog, epoch_of(highres))
-        fine = image_arrays(highres, "highres", np.float32)
+        fine = image_arrays(highres, "highres", np.float32, fitted=True)
         segments = _segments(segmentation, fine.flux.shape)
         scale = pixel_scale(highres.wcs)
         psf = _psf_array(psf, scale)

@@ -27,7 +27,7 @@ from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.progress import progress
 from miricigale.utils.table_files import write_table
-from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
 from miricigale.utils.values import value_class
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def reduce_files(
     folder,
     *,
     reducer=None,
-    pixel_scale=0.11 * ANGLE,
+    pixel_scale=None,
     integrations=False,
     align=None,
     resume=True,
@@ -67,7 +67,7 @@ def reduce_files(
     reducer : `~miricigale.reduction.Reducer`, optional
         Settings, references among them.
     pixel_scale : `~astropy.units.Quantity`, optional
-        Of the mosaics.
+        Of the mosaics; that of the reducer by default.
     integrations : bool, optional
         Whether ramps of several integrations give a ``<name>_rateints.fits`` too, with the
         slopes of each.
@@ -108,7 +108,7 @@ def reduce_files(
     paths = [Path(path) for path in paths]
     if reducer is None:
         reducer = Reducer()
-    to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
+    pixel_scale = reducer.mosaic_scale(pixel_scale)
     check_that(paths, "paths", "at least one file", "none")
     stems = [_stem(path) for path in paths]
     twice = sorted({stem for stem in stems if stems.count(stem) > 1})
@@ -137,7 +137,7 @@ def reduce_files(
         page = SectionWriter(
             Page("Reduction", subtitle=f"{len(paths)} files"), declared("miricigale.reduction")
         )
-        options = {"pixel_scale": pixel_scale.to_value(ANGLE) * ANGLE, "align": align}
+        options = {"pixel_scale": pixel_scale, "align": align}
         for name in sorted(members):
             rows.append(reduction.combine(name, members[name], options, page))
         table = Table(rows=rows)
