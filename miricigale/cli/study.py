@@ -99,7 +99,7 @@ def plan(args):
         plan_table(quick=args.quick).pprint_all()
         return 0
     _check_plan_options(args)
-    from miricigale.planning import load_plan, write_plan
+    from miricigale.planning import Planner, load_plan, write_plan
     from miricigale.utils.outputs import check_output
     from miricigale.utils.parallel import threads
 
@@ -113,6 +113,8 @@ def plan(args):
         # never replaced, not even with --overwrite
         path = folder / "plan.toml"
         check_output(path, "output", overwrite=True, inputs=[args.config])
+    # known at once, where fits take minutes
+    Planner(config).exposure_table().pprint_all()
     begin = time.monotonic()
     with threads(config.plan.threads or None) as executor:
         comparison = write_plan(

@@ -93,6 +93,11 @@ class BandPlan:
         limit = sensitivity(self.filter, self.time, n_sigma=5, excess=self.noise.excess, **options)
         return limit.to(u.ABmag)
 
+    @property
+    def limit_used(self):
+        """5-sigma AB limit of point sources by the errors that are drawn."""
+        return np.round(self.errors().limiting_magnitude(self.filter), 2)
+
     def numbers(self):
         """
         Time, frames, filling of the well and limits, as a row of a table.

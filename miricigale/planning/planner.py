@@ -92,13 +92,18 @@ class Plan:
         rows = []
         for name, plan in self.bands.items():
             row = plan.numbers() | {
-                "limit_used": np.round(plan.errors().limiting_magnitude(name), 2),
+                "limit_used": plan.limit_used,
                 "saturates": np.round(plan.saturation, 1),
             }
             for problem in ("saturated", "missing"):
                 row[f"n_{problem}"] = int(np.count_nonzero(self.sources[f"{name}_{problem}"]))
             rows.append(row)
         return QTable(rows)
+
+
+def _short_name(name):
+    """Return the name of a set of bands without that of the instrument."""
+    return name.replace("miri.", "").replace(" ", "")
 
 
 class Planner:
@@ -373,6 +378,29 @@ class Planner:
             table[f"{name}_missing"] = ~np.isfinite(photometry[name])
         return table
 
+    def exposure_table(self):
+        """
+        Tabulate the exposures of each set of bands and their depths, before anything is fitted.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            A row for each band of each set: ``plan`` (the set), ``filter``, ``time`` of all dithers, ``dithers``,
+            ``groups``, ``integrations`` and ``limit_used`` (5-sigma AB limit of points, of the errors that
+            are drawn).
+        """
+        rows = []
+        for name in self.config.exposures.sets:
+            bands = self.config.set_bands(name)
+            for plan in self.band_plans(self.share(bands), bands).values():
+                numbers = plan.numbers()
+                row = {"plan": _short_name(name)}
+                for column in ("filter", "time", "dithers", "groups", "integrations"):
+                    row[column] = numbers[column]
+                row["limit_used"] = plan.limit_used
+                rows.append(row)
+        return QTable(rows)
+
     def compare(self, *, measured=None, progress_bar=False):
         """
         Evaluate the existing bands alone and each set of bands of the configuration.
@@ -396,8 +424,7 @@ class Planner:
             plans = [self.evaluate((), name=EXISTING)]
             bar.update()
             for name, share in zip(sets, shares, strict=True):
-                short = name.replace("miri.", "").replace(" ", "")
-                options = {"name": short, "share": share, "measured": measured}
+                options = {"name": _short_name(name), "share": share, "measured": measured}
                 plans.append(self.evaluate(self.config.set_bands(name), **options))
                 bar.update()
         return plans

@@ -53,6 +53,22 @@ def test_the_sample_has_the_mix_of_the_configuration(planner):
     assert 150 < planner.density < 1308 / (np.pi * (95 / 60) ** 2)
 
 
+def test_depths_that_are_told_before_the_fits_are_those_of_the_plans(planner, plans):
+    table = planner.exposure_table()
+    assert list(zip(table["plan"], table["filter"], strict=True)) == [
+        ("all", "miri.f770w"), ("all", "miri.f1500w"), ("f770w", "miri.f770w"),
+    ]  # fmt: skip
+    for plan in plans[1:]:
+        exposures = table[table["plan"] == plan.name]
+        bands = plan.band_table()
+        for name in ("time", "dithers", "limit_used"):
+            assert_array_equal(exposures[name], bands[name])
+    # by the errors that are drawn, a fifth of the flux at the limit
+    errors = planner.band_plans()["miri.f770w"].errors()
+    limit = table["limit_used"][0].to(u.uJy)
+    assert_allclose(errors.sigma(limit, "miri.f770w"), limit / 5, rtol=0.01)
+
+
 def test_noise_is_that_of_the_errors(planner):
     """Pulls of the mock fluxes are those of a normal distribution, in each band and of each size."""
     table = planner.photometry(planner.band_plans().values())
