@@ -140,6 +140,8 @@ def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
     )
     refuses("'angle' must be given to 'MatchingKernel.identity'", ForcedPhotometer, psf="F770W")
     refuses("'psf' must be a PSF on pixels of known size", ForcedPhotometer, psf=3.0)
+    bands = {"F770W": psfs["psf"], "F1000W": psfs["psf"]}
+    refuses("'psf' must be that of one band .*measure_bands.*F770W, F1000W", ForcedPhotometer, psf=bands)
     points = ForcedPhotometer(psf=psfs["psf"])
     refuses("'image' must be a CCDData, an NDData with unit", points.measure, np.ones((9, 9)), sky)
     refuses("'catalog' must be given without a high-resolution", points.measure, images[0])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
@@ -231,6 +232,8 @@ class ForcedPhotometer(Interactive):
     n_threads: int | None = None
 
     def __post_init__(self, psf, highres_psf):
+        _check_one_band(self.kernel, "kernel")
+        _check_one_band(psf, "psf")
         # one kernel, given or made of PSFs
         got = "neither" if psf is None else "both"
         check_that((self.kernel is None) != (psf is None), "kernel, psf", "one of them given", got)
@@ -337,6 +340,7 @@ class ForcedPhotometer(Interactive):
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
+        _check_one_band(image, "image")
         if templates is not None and not isinstance(templates, SourceTemplates):
             msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
             raise TypeError(msg)
@@ -594,3 +598,14 @@ def _as_kernels(kernel):
         if all(isinstance(member, kinds) for member in kernel):
             return ExposureKernels(kernel)
     return as_kernel(kernel)
+
+
+def _check_one_band(value, argument):
+    """Refuse images, PSFs or kernels of several bands."""
+    if isinstance(value, Mapping):
+        wanted = (
+            "that of one band (several at once: measure_bands(images, photometers, templates) of "
+            "miricigale.photometry, with a dict of images, one of ForcedPhotometer(psf=...) and "
+            "SourceTemplates.from_catalog(catalog))"
+        )
+        raise argument_error(argument, wanted, f"a dict of {', '.join(map(str, value))}")
