@@ -124,6 +124,17 @@ def test_addresses_stand_in_the_metadata_alone():
     assert all(address in readme for address in addresses.values())
 
 
+def test_readme_shows_the_calls_of_the_front_page():
+    """The front page runs as a test."""
+    readme = (ROOT / "README.rst").read_text(encoding="utf-8")
+    front_page = (ROOT / "docs/index.rst").read_text(encoding="utf-8")
+    shown = re.search(r"A galaxy with an AGN.*?(?=A table with a column)", readme, re.DOTALL)[0]
+    lines = re.findall(r"^    (\S.*)$", shown, re.MULTILINE)
+    assert len(lines) > 10
+    for line in lines:
+        assert line in front_page, line
+
+
 def test_supported_versions_of_python_are_tested():
     pattern = r"Programming Language :: Python :: (3\.\d+)$"
     classified = re.findall(pattern, SETUP["metadata"]["classifiers"], re.MULTILINE)
