@@ -61,9 +61,9 @@ def _frozen(array, copy):
     return array
 
 
-class _ByName(dict):
+class ArraysByName(dict):
     """
-    Arrays by name, which a call gives too: ``results.pdf("redshift")``.
+    Arrays by name, which a call gives too: ``results.best("redshift")``.
 
     ``other_name`` is a function of a name and those that there are, which returns the one that is meant.
     """
@@ -126,12 +126,16 @@ class ObjectRows(Interactive):
             if item.type in (PerObject, PerObjectDict):
                 yield item.name, getattr(self, item.name)
 
+    def _by_name(self, field, arrays):
+        """Make the dict that a field of arrays by name holds."""
+        return ArraysByName(arrays, self._other_name)
+
     def _mapped(self, function):
         """Fields of arrays by name, after a function on each array."""
         mapped = {}
         for name, value in self._per_object():
             if isinstance(value, dict):
-                value = _ByName(convert_values(function, value), self._other_name)
+                value = self._by_name(name, convert_values(function, value))
             elif value is not None:
                 value = function(value)
             mapped[name] = value

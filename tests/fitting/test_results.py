@@ -116,7 +116,7 @@ def test_tails_that_are_not_kept_have_no_percentiles(results):
     low, half = results.percentile("redshift", [1e-5, 2e-5])[0].value
     axis = results.axes["redshift"]
     first = cell_edges(axis.values, axis.bounds)[:2]
-    weight = results.pdf("redshift")[0, 0]
+    weight = results.pdf["redshift"][0, 0]
     if weight > 2e-5:
         assert half - low == pytest.approx(1e-5 / weight * (first[1] - first[0]), rel=1e-6)
 

@@ -49,7 +49,16 @@ def test_quantities_are_found_by_the_names_of_cigale(results):
     assert_array_equal(results.std("agn.fracAGN"), results.std("frac_agn"))
     assert results.unit("sfh.integrated") == u.Msun
     assert_array_equal(results.cdf("z")[1], results.cdf("redshift")[1])
-    assert_array_equal(results.pdf("z"), results.pdf["redshift"])
+    redshifts, weights = results.pdf("z")
+    assert_array_equal(redshifts, results.axes["redshift"].values)
+    assert_array_equal(weights, results.pdf["redshift"])
+    assert_array_equal(results[0].pdf("age")[0], results.axes["age"].values * u.Gyr)
+    refuses("results.distribution.'mass'.", results.pdf, "mass", error=KeyError)
+    assert_array_equal(results["redshift_median"], results.median("redshift"))
+    assert_array_equal(results.redshift_median, results.median("redshift"))
+    axis = results.axes["redshift"]
+    assert_array_equal(np.asarray(axis[:3]), axis.values[:3])
+    assert f"<GridAxis redshift: {len(axis)} values from " in repr(axis)
     assert_array_equal(results.best("agn.fracAGN"), results.best["frac_agn"])
     assert "z" not in results.pdf
     refuses("no parameter 'redshft'; .*redshift", results.pdf, "redshft", error=KeyError)

@@ -60,6 +60,20 @@ class GridAxis:
     share: np.ndarray | None = None
     bounds: tuple = (-np.inf, np.inf)
 
+    def __repr__(self):
+        first, last = self.values[[0, -1]]
+        unit = f" {self.unit}".rstrip()
+        return f"<GridAxis {self.name}: {self.values.size} values from {first:g} to {last:g}{unit}>"
+
+    def __len__(self):
+        return self.values.size
+
+    def __getitem__(self, key):
+        return self.values[key]
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array(self.values, dtype=dtype, copy=copy)
+
     @property
     def absent_at_zero(self):
         """Whether the first of several values is 0 and means that what the parameter measures is not there."""

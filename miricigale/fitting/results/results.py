@@ -21,14 +21,39 @@ from miricigale.fitting.results.result_tables import flux_table, reduced_chi2, r
 from miricigale.fitting.results.sample_flags import worst_bands
 from miricigale.fitting.results.table_columns import OUTLIER, TEXTS
 from miricigale.utils.file_formats import read_write
-from miricigale.utils.object_rows import PerObject, PerObjectDict, of_id
+from miricigale.utils.object_rows import ArraysByName, PerObject, PerObjectDict, of_id
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.values import value_class
 
 #: Part of the mean below which CIGALE gives no standard deviation.
 CIGALE_LEAST_STD = 0.05
+#: Methods by the ending of a name, which are no columns of the table.
+_STATISTICS = {"err": "std", "median": "median"}
 #: Objects that a notebook shows.
 _SHOWN = 20
+
+
+class _Posteriors(ArraysByName):
+    """Posterior weights by name of parameter; a call has the values of the parameter too."""
+
+    def __init__(self, weights, other_name, axes, quantities):
+        super().__init__(weights, other_name)
+        self.axes = axes
+        self.quantities = quantities
+
+    def __missing__(self, name):
+        if self.other_name(name, self.quantities) in self.quantities:
+            msg = (
+                f"{name!r} is a derived quantity, which has no nodes: results.distribution({name!r}) gives the "
+                "edges of its cells and their weights"
+            )
+            raise KeyError(msg)
+        return super().__missing__(name)
+
+    def __call__(self, name, *others):
+        weights = super().__call__(name, *others)
+        axis = self.axes[self.other_name(name, self)]
+        return axis.values * u.Unit(axis.unit), weights
 
 
 @value_class
@@ -63,7 +88,7 @@ class FitResults(FitRows):
     axes : dict of str to `~miricigale.fitting.posterior.priors.GridAxis`
         Parameters that have several values; of a sampler, cells of their priors.
     pdf : dict of str to `~numpy.ndarray`, shape (n, n_values)
-        Posterior weights of their values.
+        Posterior weights of their values. A call has the values too: ``z, weights = results.pdf("redshift")``.
     pdf_2d : `~numpy.ndarray`, shape (n, nz, nf)
         Joint posterior of redshift and AGN fraction.
     best_index : `~numpy.ndarray` of int, shape (n, 4)
@@ -244,6 +269,11 @@ class FitResults(FitRows):
         """Names of all that has a posterior: parameters, then derived quantities."""
         return tuple(self.axes) + tuple(self.quantities)
 
+    def _by_name(self, field, arrays):
+        if field == "pdf":
+            return _Posteriors(arrays, self._other_name, self.axes, self.quantities)
+        return super()._by_name(field, arrays)
+
     def unit(self, name):
         """Return the unit of a parameter or derived quantity."""
         name = self._named(name)
@@ -314,10 +344,11 @@ class FitResults(FitRows):
         """Return the posterior medians, or errors (``redshift_err``), of a parameter, or a column of the table."""
         if self._named(name) in self.parameters:
             return self.median(name)
-        if isinstance(name, str) and name.endswith("_err"):
-            parameter = self._named(name.removesuffix("_err"))
-            if parameter in self.parameters:
-                return self.std(parameter)
+        if isinstance(name, str):
+            parameter, _, suffix = name.rpartition("_")
+            parameter = self._named(parameter)
+            if parameter in self.parameters and suffix in _STATISTICS:
+                return getattr(self, _STATISTICS[suffix])(parameter)
         return super()._column(name)
 
     def _value(self, name):
@@ -327,8 +358,8 @@ class FitResults(FitRows):
         if name in self.parameters:
             return self.median(name)
         parameter, _, suffix = name.rpartition("_")
-        if parameter in self.parameters and suffix == "err":
-            return self.std(parameter)
+        if parameter in self.parameters and suffix in _STATISTICS:
+            return getattr(self, _STATISTICS[suffix])(parameter)
         if parameter in self.parameters and suffix in TEXTS["parameter"]:
             # a column of the table, such as redshift_p16
             column = self.to_table()[name]
