@@ -179,6 +179,29 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
     return plot_pdf_2d(x_edges, y_edges, weights, ax=ax, **kwargs)
 
 
+def plot_masses(results, ax=None):
+    """Draw stellar masses of several objects over redshift, medians with their central 68 %."""
+    from miricigale.plotting.axes import MEASURED, resolve_axes
+
+    ax = resolve_axes(ax)
+    low, redshift, high = results.percentile("redshift").value.T
+    redshift_err = redshift - low, high - redshift
+    low, mass, high = np.log10(results.percentile("mass").value.T)
+    mass_err = mass - low, high - mass
+    ax.errorbar(
+        redshift,
+        mass,
+        mass_err,
+        redshift_err,
+        fmt=".",
+        color=MEASURED,
+        ecolor="0.8",
+        elinewidth=0.8,
+    )
+    ax.set(xlabel="redshift", ylabel=r"log$_{10}$ stellar mass / M$_\odot$")
+    return ax
+
+
 def plot_corner(results, names=None, *, truths=None, figure=None):
     """
     Draw the posteriors of several parameters of an object, each and in pairs.

@@ -370,14 +370,10 @@ class FitResults(FitRows):
         return self.parameters
 
     def plot(self, ax=None, **kwargs):
-        """Draw a single object (`plot_sed`), or the masses of several over 1 + z; returns the axes."""
+        """Draw a single object (`plot_sed`), or the masses of several over redshift; returns the axes."""
         if self.isscalar:
             return self.plot_sed(ax, **kwargs)
-        from miricigale.plotting.comparison import plot_relation
-
-        mass = self.median("mass")
-        labels = "1 + z", f"stellar mass ({mass.unit}), posterior medians"
-        return plot_relation(1 + self.median("redshift").value, mass.value, ax=ax, labels=labels)
+        return drawing.plot_masses(self, ax)
 
     def percentile(self, name, levels=(16, 50, 84)):
         """
