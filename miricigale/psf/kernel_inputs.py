@@ -86,8 +86,9 @@ def psf_pair(
         if normalize and max(missing.values()) > 0.01:
             text = ", ".join(f"{value:.3f} of '{name}'" for name, value in missing.items())
             text = f"light beyond the PSFs' grids, by their own sums and wings: {text}. The kernel "
-            text += "is normalized to 1: fluxes lack what lies beyond. Give the PSFs' 'enclosed' "
-            warn(text + "(make_psf, read_psf) or 'normalize'", PSFWarning)
+            text += "is normalized to 1: fluxes lack what lies beyond. Give the PSFs' 'enclosed' (make_psf, "
+            text += "read_psf), the 'filter' of ForcedPhotometer (checked_psf) or 'normalize'"
+            warn(text, PSFWarning)
     energy = 1.0
     if not normalize:
         energy = held[1]

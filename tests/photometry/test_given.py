@@ -5,6 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.nddata import CCDData, NDData, StdDevUncertainty
 from astropy.table import QTable
@@ -12,17 +13,19 @@ from matplotlib.figure import Figure
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import CircularGaussianPRF
 
+from helpers.commands import command
 from helpers.errors import refuses
 from helpers.scenes import tan_wcs
 from miricigale.filters import Filter
-from miricigale.instrument import Exposure, pixel_area_map
+from miricigale.instrument import Exposure, north_up_wcs, pixel_area_map
 from miricigale.photometry import (
     ErrorModel,
     ForcedPhotometer,
     SourceTemplates,
     detect_sources,
 )
-from miricigale.psf import MatchingKernel, gaussian_psf
+from miricigale.psf import MatchingKernel, gaussian_psf, miri_psf, psf_image, psf_mosaic
+from miricigale.utils.exceptions import PSFWarning
 
 NOISE = {0.03: 0.002, 0.09: 0.01}
 FWHM = {0.03: 0.12, 0.09: 0.27}
@@ -141,7 +144,9 @@ def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
     refuses("'angle' must be given to 'MatchingKernel.identity'", ForcedPhotometer, psf="F770W")
     refuses("'psf' must be a PSF on pixels of known size", ForcedPhotometer, psf=3.0)
     bands = {"F770W": psfs["psf"], "F1000W": psfs["psf"]}
-    refuses("'psf' must be that of one band .*measure_bands.*F770W, F1000W", ForcedPhotometer, psf=bands)
+    refuses(
+        "'psf' must be that of one band .*measure_bands.*F770W, F1000W", ForcedPhotometer, psf=bands
+    )
     points = ForcedPhotometer(psf=psfs["psf"])
     refuses("'image' must be a CCDData, an NDData with unit", points.measure, np.ones((9, 9)), sky)
     refuses("'catalog' must be given without a high-resolution", points.measure, images[0])
@@ -281,6 +286,44 @@ def test_psfs_without_pixels_are_on_those_of_their_images(images, sky, flux, tmp
     total = np.sum(drawn_light * pixel_area_map(image.wcs, image.shape) * u.sr).to_value(u.uJy)
     assert total == pytest.approx(flux.sum(), rel=1e-3)
     refuses("given to measure.. where 'highres_psf'", photometer.measure, image, sky)
+
+
+def test_a_psf_and_its_filter_have_the_fluxes_of_the_command(tmp_path, capsys):
+    """A stamp of unit sum misses the wings; the model of the filter says how much."""
+    scale = 0.11 * u.arcsec
+    sky = SkyCoord([53.1], [-27.8], unit="deg")
+    model = psf_mosaic(miri_psf("F770W"), scale, 0 * u.deg)
+    light = psf_image(model, pixel_scale=scale, shape=101)
+    stamp = psf_image(model, pixel_scale=scale, shape=25)
+    share = stamp.sum()
+    assert 0.8 < share < 0.9
+    error = np.full(light.shape, 0.01)
+    data = 20 * light + np.random.default_rng(1).normal(0, 0.01, light.shape)
+    wcs = north_up_wcs(sky[0], scale, light.shape)
+    image = CCDData(data, unit="uJy", wcs=wcs, uncertainty=StdDevUncertainty(error))
+    fits.writeto(tmp_path / "psf.fits", stamp / share)
+    for psf in (stamp / share, (stamp / share, scale), tmp_path / "psf.fits"):
+        with pytest.warns(PSFWarning, match="fluxes lack what lies beyond.*the 'filter' of"):
+            bare = ForcedPhotometer(psf=psf).measure(image, sky)
+        with pytest.warns(PSFWarning, match="is taken to hold 0.8"):
+            whole = ForcedPhotometer(psf=psf, filter="F770W").measure(image, sky)
+        assert_allclose(bare.flux.value, 20 * share, rtol=5e-3)
+        assert_allclose(whole.flux.value, 20, rtol=5e-3)
+    # positions may be a file beside the image, and FILTER alone is a band that no other camera has
+    path = tmp_path / "image.fits"
+    image.header["FILTER"] = "F770W"
+    image.write(path, hdu_uncertainty="ERR")
+    QTable({"id": [7], "ra": sky.ra, "dec": sky.dec}).write(tmp_path / "catalog.fits")
+    photometer = ForcedPhotometer(psf=tmp_path / "psf.fits", filter="F770W", background_order=0)
+    with pytest.warns(PSFWarning, match="is taken to hold 0.8"):
+        result = photometer.measure(path, tmp_path / "catalog.fits")
+    assert result.table["id"].tolist() == [7]
+    arguments = [path, "--catalog", tmp_path / "catalog.fits", "--psf", tmp_path / "psf.fits"]
+    with pytest.warns(PSFWarning, match="is taken to hold 0.8"):
+        command(capsys, "photometry", *arguments, "-o", tmp_path / "table.ecsv")
+    assert_allclose(QTable.read(tmp_path / "table.ecsv")["miri.f770w"], result.flux, rtol=1e-6)
+    kernel = MatchingKernel.identity(model)
+    refuses("'filter' must be given with 'psf'", ForcedPhotometer, kernel, filter="F770W")
 
 
 def test_an_image_without_noise_asks_for_its_uncertainty(images, psfs, sky):

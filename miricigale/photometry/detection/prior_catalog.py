@@ -4,16 +4,21 @@ import logging
 import os
 
 import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable, Table
 
 from miricigale.instrument import epoch_of
 from miricigale.photometry.images.arrays import nearest_values, sky_to_pixels
 from miricigale.photometry.images.fits_images import open_map
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, data_error, warn
+from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.positions import as_positions
+from miricigale.utils.table_formats import table_suffix
 from miricigale.utils.tables import as_table, unique_ids
+from miricigale.utils.text_reading import first_bytes
 
 _log = logging.getLogger(__name__)
 
@@ -189,9 +194,6 @@ def read_catalog(catalog, wcs=None, epoch=None):
     `~miricigale.utils.exceptions.DataError`, ValueError
         If a file is missing or damaged, or there are no positions; if ids are not unique.
     """
-    from astropy.coordinates import SkyCoord
-    from astropy.table import QTable
-
     is_file = isinstance(catalog, (str, os.PathLike))
     name = "catalog"
     if is_file:
@@ -210,6 +212,25 @@ def read_catalog(catalog, wcs=None, epoch=None):
             table["id"] = table[theirs]
     table["id"] = unique_ids(table["id"], name)
     return table
+
+
+def is_catalog(value):
+    """
+    Whether something is a catalog and no image: positions, a table, or a file that holds a table.
+
+    A FITS file is one where it holds no image; other files are, except ASDF, which is read as an image.
+    """
+    if isinstance(value, (SkyCoord, Table)) or hasattr(value, "iloc"):
+        return True
+    if not isinstance(value, (str, os.PathLike)):
+        return False
+    path = split_extension(value)[0]
+    if not os.path.isfile(path):
+        return False
+    if not first_bytes(path).startswith(b"SIMPLE"):
+        return table_suffix(path) != ".asdf"
+    with open_fits(path, wanted="an image or a catalog") as hdus:
+        return not any(hdu.is_image and hdu.shape for hdu in hdus)
 
 
 def check_labels(labels, found_labels, name):

@@ -6,16 +6,20 @@ from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
-from astropy.table import QTable, Table
+from astropy.table import QTable
 from photutils.segmentation import SegmentationImage
 
 from miricigale.instrument import epoch_of
-from miricigale.photometry.detection.prior_catalog import detected_prior, read_catalog, read_prior
+from miricigale.photometry.detection.prior_catalog import (
+    detected_prior,
+    is_catalog,
+    read_catalog,
+    read_prior,
+)
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels, are_exposures
 from miricigale.photometry.fit.fit_loop import fit_image
 from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package, warn_of_none
-from miricigale.photometry.fit.sampled_psfs import SampledPSFs, is_sampled
+from miricigale.photometry.fit.sampled_psfs import SampledPSFs, compared_psf, is_sampled
 from miricigale.photometry.fit.stars import with_stars
 from miricigale.photometry.images.arrays import fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.images.flags import ForcedFlags
@@ -125,6 +129,10 @@ class ForcedPhotometer(Interactive):
         give the PSF of the image alone: sources are then points. Arrays and models of photutils that do not state
         their pixels are on those of the image that they belong to, in the direction of its axes, when it is
         measured; ``(array, 0.03 * u.arcsec)`` states them.
+    filter : str, optional
+        Filter of the image, with whose model ``psf`` is compared (`~miricigale.psf.checked_psf`): a PSF of unit
+        sum is then taken to hold the part of the light that the model holds on its pixels, as
+        ``miricigale photometry`` does. Without it, it is taken to hold all.
     template : {"auto", "cutout", "psf", "sersic"}, optional
         What sources look like. ``"auto"`` cuts them from the high-resolution image where a
         segment of enough signal-to-noise belongs to them, otherwise takes a point source.
@@ -218,6 +226,7 @@ class ForcedPhotometer(Interactive):
     _: dataclasses.KW_ONLY
     psf: dataclasses.InitVar[object] = None
     highres_psf: dataclasses.InitVar[object] = None
+    filter: dataclasses.InitVar[str | None] = None
     template: str = "auto"
     wings: bool = True
     background_order: int | None = None
@@ -231,7 +240,7 @@ class ForcedPhotometer(Interactive):
     memory: MemorySettings = dataclasses.field(default_factory=MemorySettings)
     n_threads: int | None = None
 
-    def __post_init__(self, psf, highres_psf):
+    def __post_init__(self, psf, highres_psf, filter):
         _check_one_band(self.kernel, "kernel")
         _check_one_band(psf, "psf")
         # one kernel, given or made of PSFs
@@ -242,15 +251,16 @@ class ForcedPhotometer(Interactive):
         if self.kernel is not None and highres_psf is not None:
             wanted = "given with 'psf', not with 'kernel'"
             raise argument_error("highres_psf", wanted, "a kernel too")
+        check_that(psf is not None or filter is None, "filter", "given with 'psf'", filter)
         template = self.template
         kernel = self.kernel
         check_choice(template, "template", ("auto", "cutout", "psf", "sersic"))
         if kernel is None and (is_sampled(psf) or is_sampled(highres_psf)):
-            kernel = SampledPSFs(psf, highres_psf)
+            kernel = SampledPSFs(psf, highres_psf, filter)
         elif kernel is None and highres_psf is None:
-            kernel = MatchingKernel.identity(psf)
+            kernel = MatchingKernel.identity(compared_psf(psf, filter))
         elif kernel is None:
-            kernel = MatchingKernel.from_psfs(highres_psf, psf)
+            kernel = MatchingKernel.from_psfs(highres_psf, compared_psf(psf, filter))
         if psf is not None and highres_psf is None and template == "auto":
             template = "psf"
         # the kernel that all have in common: the mean, with PSFs in any case
@@ -344,10 +354,13 @@ class ForcedPhotometer(Interactive):
         if templates is not None and not isinstance(templates, SourceTemplates):
             msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
             raise TypeError(msg)
-        if isinstance(highres, (SkyCoord, Table)) and segmentation is None and catalog is None:
-            highres, catalog = None, highres
-        if isinstance(segmentation, (SkyCoord, Table)) and catalog is None:
-            segmentation, catalog = None, segmentation
+        # a catalog may be where the images would be
+        if segmentation is None and catalog is None and is_catalog(highres):
+            catalog = highres
+            highres = None
+        if catalog is None and is_catalog(segmentation):
+            catalog = segmentation
+            segmentation = None
         if isinstance(self.kernel, SampledPSFs):
             options = {"segmentation": segmentation, "catalog": catalog, "templates": templates}
             return self.on_pixels(image, highres).measure(image, highres, **options)

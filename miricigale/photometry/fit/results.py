@@ -481,14 +481,14 @@ class ForcedPhotometryResult(Tabular):
 
         Returns
         -------
-        ax : `~numpy.ndarray` of three `~matplotlib.axes.Axes`
+        ax : `~miricigale.plotting.axes.AxesArray` of three `~matplotlib.axes.Axes`
         """
         from miricigale.plotting.images import plot_model_residual
 
         model = self.model_image.data
         residual = self.residual_image
-        scale = pixel_scale(residual.wcs)
-        return plot_model_residual(residual.data + model, model, ax=ax, pixel_scale=scale, **kwargs)
+        kwargs = {"pixel_scale": pixel_scale(residual.wcs), "unit": str(residual.unit)} | kwargs
+        return plot_model_residual(residual.data + model, model, ax=ax, **kwargs)
 
     def plot_source(self, key, ax=None, *, size=5 * u.arcsec, **kwargs):
         """
@@ -507,7 +507,7 @@ class ForcedPhotometryResult(Tabular):
 
         Returns
         -------
-        ax : `~numpy.ndarray` of three `~matplotlib.axes.Axes`
+        ax : `~miricigale.plotting.axes.AxesArray` of three `~matplotlib.axes.Axes`
 
         Raises
         ------

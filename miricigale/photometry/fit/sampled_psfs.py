@@ -10,8 +10,9 @@ from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry.fit.exposure_kernels import are_exposures
 from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.photometry.images.mosaics import as_mosaic
-from miricigale.psf import InstrumentPSF, MatchingKernel, from_photutils, read_psf
+from miricigale.psf import InstrumentPSF, MatchingKernel, checked_psf, from_photutils, read_psf
 from miricigale.psf.files import states_pixel
+from miricigale.psf.kernel_inputs import named_psf
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import split_extension
 from miricigale.utils.options import check_that
@@ -38,10 +39,13 @@ class SampledPSFs:
         Of the image that is measured.
     highres_psf : `~numpy.ndarray`, model of photutils or other, optional
         Of the high-resolution image.
+    filter : str, optional
+        Filter of the image that is measured, with whose model its PSF is compared.
     """
 
     psf: object
     highres_psf: object = None
+    filter: str | None = None
 
     def __repr__(self):
         return "PSFs on the pixels of the images"
@@ -68,7 +72,7 @@ class SampledPSFs:
             wanted = "a PSF that states its pixels for exposures, such as (psf, 0.11 * u.arcsec)"
             raise argument_error("psf", wanted, type(self.psf).__name__)
         image = as_mosaic(image, "image")
-        psf = _on_pixels(self.psf, image)
+        psf = compared_psf(_on_pixels(self.psf, image), self.filter)
         if self.highres_psf is None:
             return MatchingKernel.identity(psf)
         wanted = "given to measure() where 'highres_psf' does not state its pixels"
@@ -83,6 +87,13 @@ class SampledPSFs:
             pixel_scale=pixel_scale(highres.wcs) * ANGLE,
             grid_angle=grid_angle(highres.wcs, highres.shape),
         )
+
+
+def compared_psf(psf, filter):
+    """Compare a PSF with the model of a filter, which has the light beyond its grid; see `checked_psf`."""
+    if filter is None:
+        return psf
+    return checked_psf(named_psf(psf), filter)
 
 
 def _on_pixels(psf, image):

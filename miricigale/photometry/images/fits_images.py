@@ -9,6 +9,8 @@ import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from miricigale.filters.band_names import find_filter
+from miricigale.instrument import imager_filters
 from miricigale.instrument.header_wcs import compared_pixels, image_wcs
 from miricigale.instrument.image_planes import plane_shape
 from miricigale.instrument.sky_axes import grid_angle as grid_angle
@@ -224,7 +226,13 @@ def filter_name(get):
     # NIRCam's narrow filters are in the pupil wheel, in front of a wide one
     if instrument == "nircam" and re.fullmatch(r"f\d{3}[a-z]\d?", pupil):
         names = [pupil]
-    if not instrument or len(names) != 1:
+    if len(names) != 1:
+        return None
+    if not instrument:
+        # bands of MIRI have names of their own; F200W may be of NIRCam or NIRISS, F814W of ACS or WFC3
+        name = find_filter(names[0])
+        if name in imager_filters():
+            return name
         return None
     return f"{instrument}.{names[0]}"
 
