@@ -333,6 +333,10 @@ def _option_names(parser):
             names.setdefault(action.dest, max(action.option_strings, key=len))
         else:
             names[action.dest] = action.metavar or action.dest
+    # the folder of the products
+    for destination in ("patches", "output"):
+        if destination in names:
+            names.setdefault("folder", names[destination])
     return names
 
 

@@ -312,7 +312,7 @@ def test_the_command_writes_a_page(tmp_path, capsys):
     arguments = ("plan", "--sources", "20", "-o", folder)
     told = command(capsys, *arguments, status=2).err
     assert (
-        "'folder' must be a folder without files of the same names (or --overwrite given)" in told
+        "--output must be a folder without files of the same names (or --overwrite given)" in told
     )
     assert "plan.html, plan.toml, comparison.ecsv, areas.ecsv, bands-1.ecsv" in told
     assert (folder / "plan.html").read_bytes() == page
