@@ -234,7 +234,7 @@ class Ramp(Interactive, NDData):
         """Times of the groups since the reset, s, shape (n_groups,)."""
         return np.arange(1, self.shape[1] + 1) * self.group_time * u.s
 
-    def plot(self, pixel=None, ax=None, **kwargs):
+    def plot(self, pixel=None, ax=None, *, x=None, y=None, **kwargs):
         """
         Draw the counts of a pixel over time.
 
@@ -244,6 +244,8 @@ class Ramp(Interactive, NDData):
             Column and row, (x, y) from 0; the usable pixel that steadily gathers most counts by default.
         ax : `~matplotlib.axes.Axes`, optional
             Where; the current axes by default.
+        x, y : int, optional
+            The pixel, in place of ``pixel``.
         **kwargs
             Passed to `matplotlib.axes.Axes.plot`.
 
@@ -260,6 +262,10 @@ class Ramp(Interactive, NDData):
         from miricigale.plotting.measurements import plot_ramp
 
         ny, nx = self.shape[2:]
+        if x is not None or y is not None:
+            check_that(pixel is None, "pixel", "left out beside x and y", pixel)
+            pixel = (x, y)
+            check_that(None not in pixel, "x, y", "given both", pixel)
         if pixel is None:
             # in every quarter of the integration, so that no hit of a cosmic ray is taken for a source
             groups = np.linspace(0, self.shape[1] - 1, min(5, self.shape[1])).astype(int)

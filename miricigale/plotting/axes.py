@@ -12,6 +12,35 @@ SECOND = "#1d4ed8"
 STYLES = ((MEASURED, "o"), (SECOND, "s"), ("0.4", "^"), ("#15803d", "D"))
 
 
+class AxesArray(np.ndarray):
+    """
+    Axes of a figure with several panels, which has the figure as a single axes has.
+
+    Parameters
+    ----------
+    axes : array_like of `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> from miricigale.plotting.axes import AxesArray, new_figure
+    >>> figure, axes = new_figure(1, 2)
+    >>> AxesArray(axes).figure is figure
+    True
+    """
+
+    def __new__(cls, axes):
+        return np.asarray(axes, dtype=object).view(cls)
+
+    @property
+    def figure(self):
+        """Figure of the panels."""
+        return self.ravel()[0].figure
+
+    def savefig(self, *args, **kwargs):
+        """Save the figure; see `matplotlib.figure.Figure.savefig`."""
+        self.figure.savefig(*args, **kwargs)
+
+
 def panel_columns(n):
     """Panels in a row of a figure of ``n``: three, or two or four where that leaves fewer places empty."""
     if n == 4:

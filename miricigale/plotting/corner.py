@@ -1,5 +1,6 @@
 """Posteriors of several parameters of one object, each and in pairs."""
 
+from miricigale.plotting.axes import AxesArray
 from miricigale.plotting.posteriors import plot_pdf, plot_pdf_2d
 
 
@@ -23,7 +24,7 @@ def plot_corner(labels, marginals, joints, *, truths=None, figure=None):
 
     Returns
     -------
-    axes : `~numpy.ndarray` of `~matplotlib.axes.Axes`, shape (n, n)
+    axes : `~miricigale.plotting.axes.AxesArray` of `~matplotlib.axes.Axes`, shape (n, n)
         Those above the diagonal are not shown.
     """
     import matplotlib.pyplot as plt
@@ -55,7 +56,7 @@ def plot_corner(labels, marginals, joints, *, truths=None, figure=None):
             elif column < row:
                 ax.tick_params(axis="y", labelleft=False)
     _limits(axes, n)
-    return axes
+    return AxesArray(axes)
 
 
 def _joint(ax, cells, truth):

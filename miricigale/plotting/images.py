@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import TRUE, add_borders, resolve_axes, row_mask
+from miricigale.plotting.axes import TRUE, AxesArray, add_borders, resolve_axes, row_mask
 from miricigale.utils.options import check_choice, check_that
 
 #: Color of lines over an image.
@@ -234,7 +234,7 @@ def plot_model_residual(
         plot_image(data, ax=axes, title=title, colorbar=unit, **colors, **options)
         if axes is not ax[0]:
             axes.set_ylabel("")
-    return ax
+    return AxesArray(ax)
 
 
 def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None):

@@ -5,7 +5,7 @@ import itertools
 import astropy.units as u
 import numpy as np
 
-from miricigale.plotting.axes import add_borders, legend, resolve_axes, row_mask
+from miricigale.plotting.axes import AxesArray, add_borders, legend, resolve_axes, row_mask
 
 #: Upper limits: a bar, and an arrow down from it.
 _ARROW = {"fmt": "_", "uplims": True, "color": "tab:blue", "markersize": 10, "zorder": 4}
@@ -183,7 +183,7 @@ def plot_sed_fit(
 
     Returns
     -------
-    axes : pair of `~matplotlib.axes.Axes`, or one if one was given
+    axes : `AxesArray` of two `~matplotlib.axes.Axes`, or one if one was given
     """
     residual_ax = None
     if ax is None:
@@ -227,7 +227,7 @@ def plot_sed_fit(
     with_error = have & (err > 0)
     pull = np.where(with_error, (flux - model) / np.where(with_error, err, 1.0), np.nan)
     _draw_residuals(residual_ax, wave, pull, points, bound)
-    return ax, residual_ax
+    return AxesArray([ax, residual_ax])
 
 
 def _flux_range(flux, model):

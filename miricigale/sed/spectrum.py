@@ -565,7 +565,9 @@ class SED(Frozen, WithTable):
         """This spectrum for specutils (``Spectrum``, or ``Spectrum1D`` before its version 2)."""
         return specutils_spectrum(self)
 
-    def plot(self, ax=None, *, components=False, rest_frame=False, unit=FNU, **kwargs):
+    def plot(
+        self, ax=None, *, components=False, filters=None, rest_frame=False, unit=FNU, **kwargs
+    ):
         """
         Draw the spectrum on logarithmic axes.
 
@@ -576,6 +578,8 @@ class SED(Frozen, WithTable):
         components : bool, optional
             Whether the components are drawn too, with a legend: dashed what no observer sees (light before
             attenuation).
+        filters : `~miricigale.filters.FilterSet` or list of `~miricigale.filters.Filter` or str, optional
+            Bands whose fluxes are drawn too, each as wide as the band.
         rest_frame : bool, optional
             Whether the wavelengths are those at the source; flux densities stay as observed.
         unit : `~astropy.units.Unit` or str, optional
@@ -597,7 +601,7 @@ class SED(Frozen, WithTable):
         """
         from miricigale.sed.spectrum_plot import plot_sed
 
-        return plot_sed(self, ax, components, rest_frame, unit, **kwargs)
+        return plot_sed(self, ax, components, filters, rest_frame, unit, **kwargs)
 
     def __repr__(self):
         return (

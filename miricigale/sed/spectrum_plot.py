@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 
+from miricigale.filters import FilterSet
 from miricigale.plotting.curves import plot_spectrum
 from miricigale.sed.flux_units import flux_density_unit
 from miricigale.utils.options import check_that
@@ -11,7 +12,7 @@ from miricigale.utils.options import check_that
 _FAINTEST = 1e-6
 
 
-def plot_sed(sed, ax, components, rest_frame, unit, **kwargs):
+def plot_sed(sed, ax, components, filters, rest_frame, unit, **kwargs):
     """
     Draw a spectrum; see `miricigale.sed.SED.plot`.
 
@@ -23,6 +24,8 @@ def plot_sed(sed, ax, components, rest_frame, unit, **kwargs):
         Where to; the current axes if None.
     components : bool
         Whether the components are drawn too, with a legend.
+    filters : `~miricigale.filters.FilterSet`, list or None
+        Bands whose fluxes are drawn too.
     rest_frame : bool
         Whether the wavelengths are those at the source.
     unit : `~astropy.units.Unit` or str
@@ -41,11 +44,14 @@ def plot_sed(sed, ax, components, rest_frame, unit, **kwargs):
     axes = {"rest_frame": rest_frame, "label_y": symbol}
     density = u.spectral_density(sed.wave)
     values = sed.fnu.to_value(unit, density)
-    if not components:
-        return plot_spectrum(wave, values, ax=ax, **axes, **kwargs)
-    check_that(sed.components, "components", "False for a spectrum without components", True)
-    kwargs = {"color": "black", "lw": 1.5, "label": "sum"} | kwargs
+    if components:
+        check_that(sed.components, "components", "False for a spectrum without components", True)
+        kwargs = {"color": "black", "lw": 1.5, "label": "sum"} | kwargs
     ax = plot_spectrum(wave, values, ax=ax, **axes, **kwargs)
+    if filters is not None:
+        _plot_bands(sed, FilterSet(filters), ax, rest_frame, unit)
+    if not components:
+        return ax
     low, high = ax.get_ylim()
     for name, part in sed.components.items():
         if np.any(part.fnu > 0):
@@ -57,3 +63,18 @@ def plot_sed(sed, ax, components, rest_frame, unit, **kwargs):
     ax.set_ylim(max(low, _FAINTEST * high), high)
     ax.legend(fontsize="small")
     return ax
+
+
+def _plot_bands(sed, filters, ax, rest_frame, unit):
+    """Draw the fluxes of a spectrum in bands, over the widths of these."""
+    pivot = u.Quantity([filter_.pivot for filter_ in filters])
+    half_width = u.Quantity([filter_.width for filter_ in filters]) / 2
+    flux = filters.synthetic_fluxes(sed).to_value(unit, u.spectral_density(pivot))
+    if rest_frame:
+        pivot = pivot / (1 + sed.redshift)
+        half_width = half_width / (1 + sed.redshift)
+    wave_unit = sed.wave.unit
+    ax.errorbar(
+        pivot.to_value(wave_unit), flux, xerr=half_width.to_value(wave_unit), fmt="o", ms=4, color="tab:red",
+        label="in the bands", zorder=3,
+    )  # fmt: skip
