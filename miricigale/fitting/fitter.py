@@ -540,7 +540,7 @@ class BayesFitter(CatalogFits):
     def sample(
         self,
         photometry,
-        n_draws,
+        n_draws=1000,
         *,
         seed,
         unit=None,
@@ -559,7 +559,7 @@ class BayesFitter(CatalogFits):
         ----------
         photometry, unit, redshift, redshift_prior, executor, progress_bar : optional
             As for `fit`.
-        n_draws : int
+        n_draws : int, optional
             Draws for each object, independent and of equal weight.
         seed : int
             Every object has its own stream, by its photometry (on nodes alone by its id): neither order nor

@@ -9,6 +9,8 @@ from miricigale.utils.package_tables import declared
 
 #: Key of the sentence that shows the usual call.
 _CALL = "_"
+#: Key of the argument that a text is where the first argument is given by keyword.
+_TEXT = "_text"
 
 
 def takes_other_keywords(target):
@@ -65,6 +67,12 @@ def _renaming(function, label, settings):
         if not keywords.keys() <= parameters.keys():
             keywords = _our_keywords(keywords, label, names, settings)
         twice = sorted(keywords.keys() & set(names[:n_args]))
+        if _is_text_alone(args[n_owners:], twice, names):
+            # such as the name of a filter whose wavelengths are given by keyword
+            text_name = _other_names(label).get(_TEXT)
+            if text_name is not None and text_name not in keywords:
+                keywords = keywords | {text_name: args[-1]}
+                return function(*args[:n_owners], **keywords)
         if twice:
             raise TypeError(_given_twice(twice[0], label))
         return function(*args, **keywords)
@@ -72,9 +80,19 @@ def _renaming(function, label, settings):
     return call
 
 
+def _is_text_alone(values, twice, names):
+    """Whether a text is all that is given by place, and the argument of this place is given by keyword too."""
+    return twice == names[:1] and len(values) == 1 and isinstance(values[0], str)
+
+
+def _other_names(label):
+    """Our keywords of a label by those that are usual elsewhere."""
+    return declared("miricigale.utils", "other_keywords.toml").get(label, {})
+
+
 def _our_keywords(keywords, label, names, settings):
     """Keywords of a call by our names."""
-    other_names = declared("miricigale.utils", "other_keywords.toml").get(label, {})
+    other_names = _other_names(label)
     ours = {}
     values = {}
     for keyword, value in keywords.items():
@@ -150,5 +168,5 @@ def _unknown_keyword(keyword, label, names, settings):
     if close:
         return f"{message}; did you mean {' or '.join(map(repr, close))}?"
     if _CALL in sentences:
-        return _with_call(message, label)
-    return f"{message}; it has {', '.join(names)}"
+        message = _with_call(message, label)
+    return f"{message}; it has {', '.join(every_name)}"

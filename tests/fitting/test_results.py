@@ -177,5 +177,5 @@ def test_rows_ids_and_columns(results, tmp_path):
 def test_the_picture_of_several_objects_is_masses_over_redshifts(results):
     ax = results.plot(ax=Figure().subplots())
     x, y = ax.lines[0].get_data()
-    assert_allclose(x, 1 + results["redshift"].value)
-    assert_allclose(y, results["mass"].to_value(u.Msun))
+    assert_allclose(x, results["redshift"].value)
+    assert_allclose(y, np.log10(results["mass"].to_value(u.Msun)))

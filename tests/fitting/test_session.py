@@ -58,6 +58,9 @@ def test_quantities_are_found_by_the_names_of_cigale(results):
     assert_array_equal(results.redshift_median, results.median("redshift"))
     axis = results.axes["redshift"]
     assert_array_equal(np.asarray(axis[:3]), axis.values[:3])
+    swapped = results.percentile([16, 84], "redshift")
+    assert_array_equal(swapped, results.percentile("redshift", [16, 84]))
+    refuses("probability.'redshift', 2.", results.probability, len, error=TypeError)
     assert f"<GridAxis redshift: {len(axis)} values from " in repr(axis)
     assert_array_equal(results.best("agn.fracAGN"), results.best["frac_agn"])
     assert "z" not in results.pdf
@@ -113,7 +116,16 @@ def test_a_corner_plot_has_each_parameter_and_each_pair(results, figure):
     )
     joint = one.joint_pdf("redshift", "frac_agn")
     assert_allclose(density * z_width * f_width[:, None], joint.T, atol=1e-12)
-    refuses("no parameter with joint", results.plot_corner, key, ["z", "mass"], error=KeyError)
+    assert axes.figure is figure
+    drawn = "fitter.sample.photometry, seed=1. draws"
+    refuses(
+        f"no joint posterior with mass; {drawn}",
+        results.plot_corner,
+        key,
+        ["z", "mass"],
+        error=KeyError,
+    )
+    refuses("no parameter 'masss'", results.plot_corner, key, ["z", "masss"], error=KeyError)
     refuses("no joint posterior of", results.plot_corner, key, ["z", "age"], error=KeyError)
     refuses("plot_corner is of a single object", results.plot_corner, error=TypeError)
 

@@ -179,6 +179,10 @@ def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
     return plot_pdf_2d(x_edges, y_edges, weights, ax=ax, **kwargs)
 
 
+#: Where joint posteriors are that a fit does not keep.
+DRAWN_PAIRS = "fitter.sample(photometry, seed=1) draws of all, and has plot_corner(id, names)"
+
+
 def plot_masses(results, ax=None):
     """Draw stellar masses of several objects over redshift, medians with their central 68 %."""
     from miricigale.plotting.axes import MEASURED, resolve_axes
@@ -218,7 +222,7 @@ def plot_corner(results, names=None, *, truths=None, figure=None):
 
     Returns
     -------
-    axes : `~numpy.ndarray` of `~matplotlib.axes.Axes`, shape (n, n)
+    axes : `~miricigale.plotting.axes.AxesArray` of `~matplotlib.axes.Axes`, shape (n, n)
 
     Raises
     ------
@@ -233,7 +237,10 @@ def plot_corner(results, names=None, *, truths=None, figure=None):
     names = [result._named(name) for name in names]
     edges = []
     for name in names:
-        check_names([name], "parameter with joint posteriors", result.axes)
+        if name not in result.axes:
+            check_names([name], "parameter", result.parameters)
+            msg = f"a grid keeps no joint posterior with {name}; {DRAWN_PAIRS}"
+            raise KeyError(msg)
         axis = result.axes[name]
         edges.append(cell_edges(axis.values, axis.bounds))
     marginals = [(cells, result.pdf[name]) for name, cells in zip(names, edges, strict=True)]

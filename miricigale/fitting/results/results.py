@@ -399,6 +399,9 @@ class FitResults(FitRows):
         ValueError
             If a level is outside.
         """
+        if isinstance(levels, str) and not isinstance(name, str):
+            # in the order of numpy.percentile
+            name, levels = levels, name
         single = np.ndim(levels) == 0
         levels = check_levels(levels)
         name = self._named(name)
@@ -480,6 +483,9 @@ class FitResults(FitRows):
         ValueError
             If no limit is given, or they are not in order.
         """
+        if not isinstance(name, str):
+            msg = f"probability('redshift', 2) is that of redshifts above 2; got {type(name).__name__} as the name"
+            raise TypeError(msg)
         unit = self.unit(name)
         wanted = "given, or 'high'"
         check_that(low is not None or high is not None, "low", wanted, "None")
@@ -554,7 +560,8 @@ class FitResults(FitRows):
             return np.swapaxes(tables[y, x], -1, -2)
         check_names((x, y), "parameter", self.parameters)
         have = ", ".join(f"{a} and {b}" for a, b in tables) or "none"
-        msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit)"
+        msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit); "
+        msg += drawing.DRAWN_PAIRS
         raise KeyError(msg)
 
     # -------------------------------------------------------------- tables and drawings

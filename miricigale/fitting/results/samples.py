@@ -560,7 +560,7 @@ model : `~miricigale.sed.SEDModel`, optional
 
         Returns
         -------
-        axes : `~numpy.ndarray` of `~matplotlib.axes.Axes`, shape (n, n)
+        axes : `~miricigale.plotting.axes.AxesArray` of `~matplotlib.axes.Axes`, shape (n, n)
             Parameters on nodes and labels of libraries have the cells of the grid. Of others and of derived
             quantities the outermost 1 % of the draws are beyond the panels.
         """
