@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import os
 import warnings
 from functools import cached_property
 
@@ -13,15 +14,21 @@ from miricigale.fitting.data.nuclei import CORRELATION, IS_LIMIT, NUCLEUS
 from miricigale.injection.field import check_psfs, field_psfs
 from miricigale.injection.light import light_on_file
 from miricigale.injection.trials import APART
+from miricigale.photometry import MosaicFile
 from miricigale.photometry.commands.file_inputs import Inputs, Pixels
 from miricigale.utils.column_units import quantity_table
+from miricigale.utils.content_hash import content_sha256, file_sha256
 from miricigale.utils.exceptions import CatalogWarning, PhotometryWarning
+from miricigale.utils.files import file_place
+from miricigale.utils.named_values import field_names
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column, match_sky
 from miricigale.utils.units import ANGLE, FNU, to_array
 
 log = logging.getLogger(__name__)
 
+#: Fields of a `~miricigale.photometry.MosaicFile` that name files.
+_PATHS = ("path", "error", "variance", "inverse_variance", "weight", "psf")
 #: Column of the number of images on which the light of an AGN was measured.
 N_IMAGES = "n_images"
 
@@ -70,6 +77,20 @@ class AGNImages:
     def prior_band(self):
         """Filter of the prior."""
         return self.inputs.highres.header.filter
+
+    @cached_property
+    def content(self):
+        """Checksum of all files and options, by which a measurement that was kept is known to be theirs."""
+        inputs = self.inputs
+        parts = [_content(path) for path in inputs.kernels]
+        parts += [_content(inputs.segmentation), _content(inputs.catalog)]
+        for file in (*inputs.images, inputs.highres):
+            for name in field_names(MosaicFile):
+                value = getattr(file, name)
+                parts.append((name, _content(value) if name in _PATHS else repr(value)))
+        parts += [inputs.confidence, inputs.psf_stars, inputs.seed]
+        parts += sorted((name, repr(value)) for name, value in inputs.options.items())
+        return content_sha256(parts)
 
     @cached_property
     def _photometers(self):
@@ -182,6 +203,14 @@ class AGNImages:
             for band in self.bands:
                 pairs.put_band(table, photometry, band)
         return table
+
+
+def _content(source):
+    """Checksum of a file, or of the table that takes its place, and the extension that is meant; None of none."""
+    if not isinstance(source, (str, os.PathLike)):
+        return content_sha256(source)
+    name, *part = file_place(source)
+    return file_sha256(name), *part
 
 
 @dataclasses.dataclass(frozen=True)

@@ -48,7 +48,9 @@ def write_page(result, path, name):
     n_in_images = int(np.count_nonzero(result.injected["n_images"]))
     if n_in_images:
         where = f"{n_in_images} of them were put into images and measured in the bands of these"
-    page.section("selection", n=len(result.injected), where=where, **facts)
+    stated = {"error": f"{100 * meta['completeness_error']:g}", "n_most": meta["n_most"]}
+    stated["worst"] = f"{100 * _largest_error(result.numbers):.1f}"
+    page.section("selection", n=len(result.injected), where=where, **stated, **facts)
     page.figure("figure", _completeness(result.numbers))
     page.section("prior")
     page.figure("figure", _prior(result.prior))
@@ -90,6 +92,14 @@ def _bars(table, name):
     low = np.asarray(Table(table)[f"{name}_low"])
     high = np.asarray(Table(table)[f"{name}_high"])
     return value, np.maximum([value - low, high - value], 0.0)
+
+
+def _largest_error(numbers):
+    """Error of the completeness of the bin in which it is known least; 0 without injected AGN."""
+    _, bars = _bars(numbers, "completeness")
+    if not np.any(np.isfinite(bars)):
+        return 0.0
+    return np.nanmax(bars)
 
 
 def _by_redshift(table):

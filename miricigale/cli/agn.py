@@ -4,8 +4,9 @@ from miricigale.cli.catalogs import fit_options, fit_workers, images_of, photome
 from miricigale.cli.options import declarations, destination, filled, refuse
 from miricigale.utils.named_values import attributes, without_none
 
-#: CPU-seconds of a fit of an object as a galaxy, and as each other class.
+#: CPU-seconds of a fit of an object as a galaxy, and as each other class, without and with fluxes of nuclei.
 _SECONDS = 0.1
+_SECONDS_NUCLEI = 0.125
 #: Options of the prior and its sources.
 _OF_PRIOR = ("segmentation", "catalog", "psf_stars")
 
@@ -65,13 +66,19 @@ def _images(args):
 
 def _plan(args, survey):
     """What a run would fit, and the processor time that it takes, as text."""
+    from miricigale.agn.injections import most_injections
     from miricigale.fitting.catalogs.catalog_rows import open_catalog
     from miricigale.fitting.catalogs.class_names import chosen_classes
 
     rows = open_catalog(**filled(args, open_catalog))
     names = chosen_classes(**filled(args, chosen_classes))
     n_classes = 1 + len(names)
-    n_fits = (rows.n_rows + survey.n_injections) * n_classes
-    minutes = n_fits * _SECONDS / 60
-    objects = f"{rows.n_rows} objects and {survey.n_injections} injected AGN"
-    return f"{objects} in {n_classes} classes: {n_fits} fits, about {minutes:.0f} CPU-minutes"
+    n_most = most_injections(survey.n_injections, rows.n_rows)
+    n_fits = (rows.n_rows + n_most) * n_classes
+    seconds = _SECONDS
+    if args.nuclei:
+        seconds = _SECONDS_NUCLEI
+    minutes = n_fits * seconds / 60
+    alone = rows.n_rows * n_classes * seconds / 60
+    objects = f"{rows.n_rows} objects and at most {n_most} injected AGN in {n_classes} classes"
+    return f"{objects}: {n_fits} fits, about {minutes:.0f} CPU-minutes, {alone:.0f} without AGN"

@@ -1,5 +1,7 @@
 """AGN put into images: what is measured of them is what was put in."""
 
+import shutil
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -124,6 +126,19 @@ def test_what_the_catalog_lacks_is_taken_from_the_images(field, hosts):
     assert_allclose((measured[BAND][3] - whole[BAND][3]).value, 1.0)
     assert measured[BAND][2] == table[BAND][2]
     assert measured[N_IMAGES].tolist() == [1, 1, 0, 1]
+
+
+def test_content_is_that_of_files_and_options(field, tmp_path):
+    content = AGNImages(**field).content
+    assert AGNImages(**field, n_threads=2).content == content
+    assert AGNImages(**field, components=1).content != content
+    other = tmp_path / "image.fits"
+    shutil.copy(field["image"].path, other)
+    copied = field | {"image": field["image"].replace(path=other)}
+    assert AGNImages(**copied).content == content
+    with fits.open(other, mode="update") as hdus:
+        hdus["SCI"].data[3, 4] += 1.0
+    assert AGNImages(**copied).content != content
 
 
 def test_sets_of_positions_are_apart():

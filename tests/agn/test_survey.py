@@ -8,8 +8,10 @@ from astropy.table import QTable
 from helpers.commands import command
 from helpers.errors import refuses
 from miricigale import BayesFitter, ErrorModel, FitResults, SEDModel
-from miricigale.agn import AGNSurvey, NoiseCurve, add_light, agn_light
-from miricigale.agn.survey import _write_injected
+from miricigale.agn import AGNSurvey, NoiseCurve, add_light, agn_light, injections
+from miricigale.agn.injection_draws import FIRST, InjectionDraws, batch_sizes
+from miricigale.agn.injections import write_batch
+from miricigale.evaluation import Estimate
 from miricigale.fitting import AGNBins, GridSettings
 from miricigale.utils.parallel import threads
 
@@ -32,6 +34,8 @@ AXES = {
 #: Deep enough for no doubt.
 DEPTH = 29.0
 N, N_AGN = 24, 8
+#: Files of results, among them tables of batches.
+KEPT = (".ecsv", ".fits")
 OPTIONS = {
     "calibration": None,
     "calibrate": False,
@@ -217,7 +221,11 @@ def test_bright_agn_are_complete_and_others_are_pure(result):
     survey, _ = result
     bright = survey.numbers[-1]
     assert bright["n_injected"] == 4
-    assert bright["completeness"] >= 0.75
+    # the data are good: those with a fraction above the limit are selected, and no others
+    fraction = np.asarray(survey.injected["frac_agn"])
+    clear = np.abs(fraction - 0.4) > 0.07
+    assert clear.sum() >= 5
+    assert np.array_equal(survey.injected["selected"][clear], fraction[clear] > 0.4)
     assert bright["above"] == 1.0
     some = survey.numbers["n_selected"] > 0
     np.testing.assert_allclose(survey.numbers["purity"][some], 1.0, atol=0.02)
@@ -239,7 +247,7 @@ def test_workers_and_a_second_call_change_no_byte(result, run):
     assert len(names) == 5
     before = {name: (first / name).read_bytes() for name in names}
     assert before == {name: (second / name).read_bytes() for name in names}
-    states = {path: path.stat().st_mtime_ns for path in first.glob("*/part-*.fits")}
+    states = {path: path.stat().st_mtime_ns for path in first.rglob("part-*.fits")}
     run("first")
     assert before == {name: (first / name).read_bytes() for name in names}
     assert states == {path: path.stat().st_mtime_ns for path in states}
@@ -266,7 +274,7 @@ def test_injected_agn_are_in_the_nuclei_that_were_measured(model, truth, photome
     )
     options = OPTIONS | {"models": lambda _: (model, AXES), "nuclei": True}
     result = survey.run(catalog, tmp_path / "agn", **options)
-    injected = QTable.read(tmp_path / "agn" / "injected.fits")
+    injected = QTable.read(tmp_path / "agn" / "injected" / "batch-01.fits")
     rows = np.searchsorted(table["id"], result.injected["host"])
     for band in bands:
         added = injected[band].value - table[band].value[rows]
@@ -274,7 +282,7 @@ def test_injected_agn_are_in_the_nuclei_that_were_measured(model, truth, photome
         error = np.hypot(injected[f"{band}_err"].value, injected[f"{band}_nucleus_err"].value)
         assert np.all(np.abs(added - in_nucleus) < 4.0 * error)
         assert np.all(in_nucleus > 0)
-    fit = FitResults.read(next((tmp_path / "agn" / "injected").glob("part-*.fits")))
+    fit = FitResults.read(next((tmp_path / "agn" / "injected").glob("*/part-*.fits")))
     assert fit.meta["fit"]["nuclei"] == bands
     # AGN of known fraction are measured: their points are 0 in the galaxies
     good = result.injected["frac_agn"] < 0.85
@@ -288,8 +296,11 @@ class StubImages:
 
     bands = (BANDS[3],)
     prior_band = "nircam.f444w"
+    content = "of the field"
+    n_calls = 0
 
     def add_agn(self, photometry, lit, hosts, light):
+        self.n_calls += 1
         table = lit.copy()
         band = BANDS[3]
         table[band] = photometry[band] + 2.0 * light[band]
@@ -307,7 +318,7 @@ def test_injected_agn_are_measured_on_images(run, model, tmp_path):
     images = StubImages()
     options = OPTIONS | {"models": lambda _: (model, AXES)}
     result = survey.run(catalog, tmp_path / "agn", images=images, **options)
-    injected = QTable.read(tmp_path / "agn" / "injected.fits")
+    injected = QTable.read(tmp_path / "agn" / "injected" / "batch-01.fits")
     table = QTable.read(catalog)
     rows = np.searchsorted(table["id"], images.hosts)
     added = injected[BANDS[3]] - table[BANDS[3]][rows]
@@ -331,18 +342,110 @@ def test_injected_agn_are_measured_on_images(run, model, tmp_path):
     )
 
 
+def test_images_are_measured_once(run, model, tmp_path):
+    """A stopped call, resumed with other workers, writes the bytes of one in a piece."""
+    catalog = run("first")[1].parent / "catalog.ecsv"
+    survey = AGNSurvey(
+        20 * u.arcmin**2, redshift=(0.5, 1.5), log_luminosity=(43.5, 44.5), n_injections=6, seed=2
+    )
+    options = OPTIONS | {"models": lambda _: (model, AXES)}
+    survey.run(catalog, tmp_path / "whole", images=StubImages(), **options)
+    images = StubImages()
+    stopped = tmp_path / "stopped"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(injections, "write_batch", stop)
+        with pytest.raises(KeyboardInterrupt):
+            survey.run(catalog, stopped, images=images, **options)
+    assert images.n_calls == 1
+    with threads(2) as executor:
+        survey.run(catalog, stopped, images=images, executor=executor, **options)
+    assert images.n_calls == 1
+    names = [path.relative_to(stopped) for path in stopped.rglob("*") if path.suffix in KEPT]
+    assert len(names) == 9
+    for name in names:
+        assert (tmp_path / "whole" / name).read_bytes() == (stopped / name).read_bytes(), name
+    # other images are measured
+    images.content = "of another field"
+    survey.run(catalog, stopped, images=images, **options)
+    assert images.n_calls == 2
+
+
+def stop(*args, **kwargs):
+    """In place of the fit of a batch."""
+    raise KeyboardInterrupt
+
+
+def test_bins_share_what_is_left():
+    none = np.zeros(3, int)
+    sizes = batch_sizes(none, none, none, error=0.02, n_left=10**6)
+    assert sizes.tolist() == [FIRST] * 3
+    assert batch_sizes(none, none, none, error=0.02, n_left=8).tolist() == [3, 3, 2]
+    # where nothing could be injected, nothing more is; where none or all are selected, it is enough
+    drawn = np.array([FIRST, FIRST, FIRST])
+    injected = np.array([0, FIRST, FIRST])
+    selected = np.array([0, 0, FIRST])
+    assert not batch_sizes(drawn, injected, selected, error=0.02, n_left=10**6).any()
+    sizes = batch_sizes(drawn, drawn, drawn // 2, error=0.0, n_left=10**6)
+    assert sizes.tolist() == [FIRST] * 3
+
+
+@pytest.mark.parametrize("share", [0.02, 0.05, 0.3, 0.9])
+def test_completeness_is_known_with_the_wanted_error(share):
+    """Stopping by what was selected must bias no share by 1 %, and leave its interval right."""
+    rng = np.random.default_rng(1)
+    errors = []
+    n_inside = 0
+    for _ in range(300):
+        n = np.zeros(1, int)
+        selected = np.zeros(1, int)
+        sizes = batch_sizes(n, n, selected, error=0.02, n_left=10**6)
+        while sizes.any():
+            n += sizes
+            selected += rng.binomial(sizes, share)
+            sizes = batch_sizes(n, n, selected, error=0.02, n_left=10**6)
+        measured = Estimate.of_fraction(selected[0], n[0])
+        errors.append(measured.value - share)
+        n_inside += measured.low <= share <= measured.high
+    assert abs(np.mean(errors)) < 0.008
+    assert np.std(errors) < 0.022
+    # 68 % of 300, with a scatter of 8
+    assert n_inside > 175
+
+
+def test_hosts_take_turns_and_luminosities_fill_the_bins():
+    hosts = [np.array([3, 5, 8]), np.array([], int), np.array([1, 2])]
+    draws = InjectionDraws(hosts, (43.0, 44.0), 7)
+    assert draws.cells == [(0, 0), (0, 1), (2, 0), (2, 1)]
+    first = np.zeros(4, int)
+    cell, row, luminosity = draws.draw(first, np.full(4, 60))
+    for k, (i, _) in enumerate(draws.cells):
+        number = np.bincount(row[cell == k], minlength=9)[hosts[i]]
+        assert np.all(number == 60 // hosts[i].size)
+    # a uniform distribution: no share of it is off by more than two AGN
+    place = np.sort(luminosity[cell == 0] - 43.0)
+    assert np.max(np.abs(place - (np.arange(60) + 0.5) / 60)) < 2.5 / 60
+    assert np.all((luminosity[cell == 1] >= 44.0) & (luminosity[cell == 1] < 45.0))
+    # batches are parts of the same sequence
+    parts = [draws.draw(first, np.full(4, 25)), draws.draw(first + 25, np.full(4, 35))]
+    for k in range(4):
+        joined = np.concatenate([part[2][part[0] == k] for part in parts])
+        assert np.array_equal(joined, luminosity[cell == k])
+        joined = np.concatenate([part[1][part[0] == k] for part in parts])
+        assert np.array_equal(joined, row[cell == k])
+
+
 def test_other_injections_replace_nothing(photometry, tmp_path):
-    path = tmp_path / "injected.fits"
+    path = tmp_path / "batch-01.fits"
     photometry = photometry.copy()
     photometry.meta = {}
-    _write_injected(photometry, path, resume=True)
+    write_batch(photometry, path, resume=True)
     before = path.read_bytes()
-    (tmp_path / "injected").mkdir()
-    _write_injected(photometry, path, resume=True)
-    match = "injected holds fits of other injected AGN"
-    refuses(match, _write_injected, photometry[:3], path, resume=True)
+    (tmp_path / "batch-01").mkdir()
+    write_batch(photometry, path, resume=True)
+    match = "batch-01 holds fits of other injected AGN"
+    refuses(match, write_batch, photometry[:3], path, resume=True)
     assert path.read_bytes() == before
-    _write_injected(photometry[:3], path, resume=False)
+    write_batch(photometry[:3], path, resume=False)
     assert path.read_bytes() != before
 
 
@@ -355,6 +458,7 @@ def test_refusals(run, tmp_path):
     refuses("'redshift' must be 2 or more ascending", AGNSurvey, area, redshift="ab")
     refuses("log10 of luminosities", AGNSurvey, area, log_luminosity=(1e44, 1e45))
     refuses("'n_injections' must be", AGNSurvey, area, n_injections=-1)
+    refuses("'completeness_error' must be from 0", AGNSurvey, area, completeness_error=-0.1)
     survey = AGNSurvey(area)
     refuses("'interpolate' must be above 0", survey.run, "no.fits", tmp_path, interpolate=0)
 
@@ -364,7 +468,7 @@ def test_command_states_its_plan_and_names_its_options(photometry, tmp_path, cap
     photometry.write(catalog)
     arguments = ["agn", catalog, "--area", 20, "--injections", 76, "-o", tmp_path / "agn"]
     said = command(capsys, *arguments, "--classes", "quasars", "--plan").out
-    assert "24 objects and 76 injected AGN in 2 classes: 200 fits" in said
+    assert "24 objects and at most 76 injected AGN in 2 classes: 200 fits" in said
     assert not (tmp_path / "agn").exists()
     assert "--limit must be from 0.1" in command(capsys, *arguments, "--limit", 0, status=2).err
     said = command(capsys, *arguments, "--components", 2, status=2).err
