@@ -26,8 +26,9 @@ class NoiseCurve:
     Parameters
     ----------
     flux, error : `~numpy.ndarray`, shape (n,)
-        Ascending fluxes and their errors in uJy, which do not fall. They are joined by straight lines and constant
-        beyond the ends.
+        Ascending fluxes and their errors in uJy, which do not fall. They are joined by straight lines, and are
+        constant before the first. Beyond the last the variance grows with flux as photon noise does, as much as on
+        average in the upper half of the curve.
     """
 
     flux: np.ndarray
@@ -62,10 +63,21 @@ class NoiseCurve:
         # more light has no less noise
         return cls(np.array(flux), np.maximum.accumulate(error))
 
+    def at(self, flux):
+        """Errors in uJy at fluxes in uJy, shape (n,)."""
+        flux = floats(flux)
+        error = np.interp(flux, self.flux, self.error)
+        middle = len(self.flux) // 2
+        width = self.flux[-1] - self.flux[middle]
+        if not width > 0:
+            return error
+        slope = (self.error[-1] ** 2 - self.error[middle] ** 2) / width
+        further = np.maximum(flux - self.flux[-1], 0.0)
+        return np.sqrt(error**2 + slope * further)
+
     def ratio(self, flux, light):
         """Error of fluxes, shape (n,), with more light over that without."""
-        before = np.interp(flux, self.flux, self.error)
-        return np.interp(flux + light, self.flux, self.error) / before
+        return self.at(flux + light) / self.at(flux)
 
 
 def nucleus_noise_curves(nuclei):

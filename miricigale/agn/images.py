@@ -10,18 +10,21 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from miricigale.agn.photon_noise import photon_noise
 from miricigale.fitting.data.nuclei import CORRELATION, IS_LIMIT, NUCLEUS
 from miricigale.injection.field import check_psfs, field_psfs
 from miricigale.injection.light import light_on_file
 from miricigale.injection.trials import APART
 from miricigale.photometry import MosaicFile
 from miricigale.photometry.commands.file_inputs import Inputs, Pixels
+from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.content_hash import content_sha256, file_sha256
 from miricigale.utils.exceptions import CatalogWarning, PhotometryWarning
 from miricigale.utils.files import file_place
 from miricigale.utils.named_values import field_names
 from miricigale.utils.options import check_that
+from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column, match_sky
 from miricigale.utils.units import ANGLE, FNU, to_array
 
@@ -55,8 +58,7 @@ class AGNImages:
 
     Notes
     -----
-    Light is added without noise, and the noise is that of the image: the photon noise of AGN brighter than the sky
-    is missing.
+    The photon noise of the light is drawn where an image states what it is (`photon_noise`).
     """
 
     def __init__(self, image, highres, *, n_threads=None, **options):
@@ -93,6 +95,18 @@ class AGNImages:
         return content_sha256(parts)
 
     @cached_property
+    def photon_noise(self):
+        """Photon noise of light in the images: `~miricigale.agn.photon_noise.PhotonNoise` by band."""
+        noises = {}
+        for band, file in zip(self.bands, self.inputs.images, strict=True):
+            with warnings.catch_warnings():
+                # those of the image are given where it is measured
+                warnings.simplefilter("ignore", PhotometryWarning)
+                noises[band] = photon_noise(file, own_pixels(file.read()))
+            log.info("photon noise of AGN in %s: %s", band, noises[band].text)
+        return noises
+
+    @cached_property
     def _photometers(self):
         photometers = self.inputs.photometers(self.n_threads)
         for photometer in photometers.values():
@@ -110,20 +124,25 @@ class AGNImages:
                 self._photometers[band], self.inputs.highres.header, result
             )
             fwhm.append(result.psf_fwhm.to_value(ANGLE))
-        return _Base(measurement.table, psfs, prior_psf, max(fwhm) * ANGLE)
+        correlation = {}
+        for band, result in measurement.results.items():
+            correlation[band] = result.noise_correlation
+        return _Base(measurement.table, psfs, prior_psf, max(fwhm) * ANGLE, correlation)
 
-    def _measure(self, sources, light):
-        """Measure the images, with points of the light of each band: a `Measurement`."""
+    def _measure(self, sources, light, key=()):
+        """Measure the images, with points of the light of each band: a `Measurement`; ``key`` is that of noise."""
         inputs = self.inputs
         prior_light = None
         images = {}
         for band, file in zip(inputs.bands, inputs.images, strict=True):
             own_light = None
+            added_variance = None
             if sources is not None:
                 own_light = light_on_file(
                     file, sources, light[band], self._base.psfs[band], self.n_threads
                 )
-            images[band] = file.read(own_light)
+                own_light, added_variance = self._with_photons(band, own_light, key)
+            images[band] = file.read(own_light, added_variance)
         if sources is not None:
             prior_light = light_on_file(
                 inputs.highres,
@@ -136,7 +155,19 @@ class AGNImages:
         segments, catalog = inputs.find_sources(pixels, inputs.catalog)
         return inputs.measure(pixels, self._photometers, segments, catalog)
 
-    def add_agn(self, photometry, lit, hosts, light):
+    def _with_photons(self, band, light, key):
+        """Light (MJy/sr) with its photon noise, and the variance of this where errors have it (else None)."""
+        noise = self.photon_noise[band]
+        if noise.factor is None:
+            return light, None
+        rng = stream(*key, band)
+        drawn = noise.draw(light, self._base.correlation[band], rng)
+        added_variance = None
+        if noise.in_errors:
+            added_variance = noise.variance(light)
+        return light + drawn, added_variance
+
+    def add_agn(self, photometry, lit, hosts, light, *, seed=1):
         """
         Put what is measured of AGN on the images into photometry.
 
@@ -152,6 +183,8 @@ class AGNImages:
             Ids of the hosts, which are those of the photometry of the images.
         light : dict of str to `~astropy.units.Quantity`, shape (n,)
             Light of the AGN in the bands of the images and of the prior.
+        seed : int, optional
+            Seed of the photon noise of the light, which goes by the ids of ``lit``.
 
         Returns
         -------
@@ -192,7 +225,8 @@ class AGNImages:
                 # what the images are warned of was said of those without AGN
                 warnings.simplefilter("ignore", CatalogWarning)
                 warnings.simplefilter("ignore", PhotometryWarning)
-                measured = self._measure(points, light_of_rows).table
+                key = (seed, "agn", "photons", str(lit["id"][rows[0]]))
+                measured = self._measure(points, light_of_rows, key).table
             after, _ = match_sky(measured["sky"], sky[rows], radius=base.fwhm / 2)
             n_lost = int(np.count_nonzero(after < 0))
             if n_lost:
@@ -215,12 +249,17 @@ def _content(source):
 
 @dataclasses.dataclass(frozen=True)
 class _Base:
-    """Photometry of a field, PSFs of its images by band and of the prior, and the largest width of them."""
+    """
+    Photometry of a field, PSFs of its images by band and of the prior, and the largest width of them.
+
+    ``correlation`` is the covariance of the noise of pixels by band.
+    """
 
     table: QTable
     psfs: dict
     prior_psf: object
     fwhm: u.Quantity
+    correlation: dict
 
 
 @dataclasses.dataclass(frozen=True)

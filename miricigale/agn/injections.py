@@ -133,6 +133,12 @@ class Injections:
         columns = {name: injected[name] for name in texts}
         return described_columns(columns, texts)
 
+    def photon_noise(self):
+        """What is known of the photon noise of AGN in images: text by band, of none without images."""
+        if self.images is None:
+            return {}
+        return {band: noise.text for band, noise in self.images.photon_noise.items()}
+
     def _batch(self, number, first, sizes):
         """Inject a batch: the bin of each AGN that could be injected, and the table of these."""
         cell, rows, log_luminosity = self.draws.draw(first, sizes)
@@ -252,11 +258,11 @@ class Injections:
     def _on_images(self, number, table, lit, hosts, light):
         """What `AGNImages.add_agn` measures of a batch, which is kept in a file."""
         path = self.folder / f"{batch_name(number)}-images.fits"
-        inputs = [table, lit, np.asarray(hosts), light, self.images.content, package_version()]
-        key = content_sha256(inputs)
+        inputs = [table, lit, np.asarray(hosts), light, self.images.content]
+        key = content_sha256([*inputs, self.survey.seed, package_version()])
         resume = self.options.get("resume", True)
         if not resume or not path.exists() or fits.getheader(path, 1).get(_KEY) != key:
-            measured = self.images.add_agn(table, lit, hosts, light)
+            measured = self.images.add_agn(table, lit, hosts, light, seed=self.survey.seed)
             measured.meta = {_KEY: key}
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(path, overwrite=True) as partial:

@@ -51,6 +51,9 @@ def write_page(result, path, name):
     stated = {"error": f"{100 * meta['completeness_error']:g}", "n_most": meta["n_most"]}
     stated["worst"] = f"{100 * _largest_error(result.numbers):.1f}"
     page.section("selection", n=len(result.injected), where=where, **stated, **facts)
+    if meta["photon_noise"]:
+        noises = [{"band": band, "noise": text} for band, text in meta["photon_noise"].items()]
+        page.table("photons", noises)
     page.figure("figure", _completeness(result.numbers))
     page.section("prior")
     page.figure("figure", _prior(result.prior))

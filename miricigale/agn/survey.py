@@ -199,7 +199,7 @@ class AGNSurvey:
         sample = FittedSample.of_fits(fits, self.bins, self.limit)
         check_that(sample.used.any(), "path", "a catalog of which objects can be fitted", "none")
         injections = Injections(self, path, fits, sample, output, images, options)
-        result = self._result(sample, injections.table(), injections.n_most)
+        result = self._result(sample, injections)
         output.mkdir(parents=True, exist_ok=True)
         result.write(output, overwrite=True)
         from miricigale.agn.page import write_page
@@ -209,7 +209,8 @@ class AGNSurvey:
 
     # ---------------------------------------------------------------------- result
 
-    def _result(self, sample, injected, n_most):
+    def _result(self, sample, injections):
+        injected = injections.table()
         bins = self.bins
         prior = bins.prior(sample.axis)
         table = sample.tables["galaxy"][sample.used]
@@ -259,7 +260,8 @@ class AGNSurvey:
         meta = {"area_deg2": float(self.area), "limit": self.limit, "seed": self.seed}
         meta |= {"n_all": len(sample), "n_used": int(sample.used.sum())}
         meta |= {"classes": list(sample.tables)}
-        meta |= {"n_most": n_most, "completeness_error": self.completeness_error}
+        meta |= {"n_most": injections.n_most, "completeness_error": self.completeness_error}
+        meta |= {"photon_noise": injections.photon_noise()}
         return AGNResult(
             numbers=numbers.by_luminosity(),
             totals=numbers.totals(),

@@ -11,6 +11,7 @@ from miricigale import BayesFitter, ErrorModel, FitResults, SEDModel
 from miricigale.agn import AGNSurvey, NoiseCurve, add_light, agn_light, injections
 from miricigale.agn.injection_draws import FIRST, InjectionDraws, batch_sizes
 from miricigale.agn.injections import write_batch
+from miricigale.agn.photon_noise import PhotonNoise
 from miricigale.evaluation import Estimate
 from miricigale.fitting import AGNBins, GridSettings
 from miricigale.utils.parallel import threads
@@ -118,6 +119,18 @@ def test_light_brings_the_noise_of_sources_as_bright():
     # the noise of the flux itself was not drawn
     assert flux.mean() == pytest.approx(5.0, abs=0.03)
     assert flux.std() == pytest.approx(np.sqrt(0.5**2 - 0.1**2), rel=0.05)
+
+
+def test_errors_grow_beyond_the_brightest_source_as_photon_noise_does():
+    """The variance of n electrons is n: a catalog of up to 100 says what 5000 have."""
+    rng = np.random.default_rng(4)
+    flux = rng.uniform(1.0, 100.0, 2000)
+    curve = NoiseCurve.of_band(flux, np.sqrt(20.0 + flux))
+    far = np.array([300.0, 5000.0])
+    np.testing.assert_allclose(curve.at(far), np.sqrt(20.0 + far), rtol=0.01)
+    # errors without photon noise stay what they are
+    flat = NoiseCurve.of_band(flux, np.full(2000, 3.0))
+    np.testing.assert_allclose(flat.at(far), 3.0)
 
 
 def test_nuclei_get_all_of_the_light_with_correlated_noise():
@@ -297,9 +310,10 @@ class StubImages:
     bands = (BANDS[3],)
     prior_band = "nircam.f444w"
     content = "of the field"
+    photon_noise = {BANDS[3]: PhotonNoise.unknown("the header is silent")}
     n_calls = 0
 
-    def add_agn(self, photometry, lit, hosts, light):
+    def add_agn(self, photometry, lit, hosts, light, *, seed):
         self.n_calls += 1
         table = lit.copy()
         band = BANDS[3]
@@ -331,6 +345,7 @@ def test_injected_agn_are_measured_on_images(run, model, tmp_path):
     assert result.injected["n_images"].tolist() == [0, 1, 0, 1, 0, 1]
     page = (tmp_path / "agn" / "page.html").read_text()
     assert "3 of them were put into images" in page
+    assert "not drawn: the header is silent" in page
     images.bands = ("miri.f560w",)
     refuses(
         "'images' must be of bands that are fitted",

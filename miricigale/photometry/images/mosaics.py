@@ -51,6 +51,8 @@ from miricigale.utils.units import SURFACE_BRIGHTNESS, scalar
 
 _log = logging.getLogger(__name__)
 
+#: Keywords of electrons for each count.
+_GAINS = ("GAIN", "EGAIN", "CCDGAIN")
 #: A scale of the noise further from 1 than this factor is warned of.
 _ODD_SCALE = 10.0
 
@@ -286,7 +288,50 @@ class MosaicFile:
             raise argument_error("pa_aper", wanted, angle)
         return angle
 
-    def read(self, added=None):
+    def read_photon_facts(self):
+        """
+        Read what the file states of photon noise.
+
+        Returns
+        -------
+        facts : dict
+            ``variance``, that of the extension VAR_POISSON in (MJy/sr)^2, or None; ``factor``, MJy/sr of the
+            pixels' unit; this ``unit``, or None; ``keywords``: EXPTIME, and GAIN by any of its usual names.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            As `read` does.
+        """
+        header = self.header
+        with open_image(self.path, "an image") as (hdus, _):
+            factor = self._factor()[0]
+            variance = None
+            hdu = companion(hdus, header.index, "VAR_POISSON")
+            if hdu is not None and plane_shape(hdu) == plane_shape(hdus[header.index]):
+                stated_unit = "" if self.unit is not None else header.unit
+                values = self._in_unit(hdu, "variance", stated_unit, self.path)
+                variance = values * np.square(factor)
+            own = hdus[header.index].header
+            keywords = {"EXPTIME": header.keywords["EXPTIME"], "GAIN": None}
+            for name in _GAINS:
+                if keywords["GAIN"] is None:
+                    keywords["GAIN"] = own.get(name, hdus[0].header.get(name))
+        unit = parsed_unit(header.unit)
+        return {"variance": variance, "factor": factor, "unit": unit, "keywords": keywords}
+
+    def _factor(self):
+        """Factor from the pixels' unit to MJy/sr, of each pixel where fluxes are in pixels; and what states it."""
+        from miricigale.instrument import pixel_area_map
+
+        header = self.header
+        factor, how = calibration(self.path, header.unit, self.zero_point, header.keywords)
+        if factor.unit.is_equivalent(u.MJy):
+            area = pixel_area_map(header.wcs, header.shape)
+            return factor.to_value(u.MJy) / area, how
+        return factor.to_value(SURFACE_BRIGHTNESS), how
+
+    def read(self, added=None, added_variance=None):
         """
         Read the image.
 
@@ -294,6 +339,8 @@ class MosaicFile:
         ----------
         added : `~numpy.ndarray`, shape (ny, nx), optional
             Surface brightness in MJy/sr that is added to the pixels before anything is measured on them.
+        added_variance : `~numpy.ndarray`, shape (ny, nx), optional
+            Variance in (MJy/sr)^2 by which the errors of the pixels grow, if there are any.
 
         Returns
         -------
@@ -324,19 +371,13 @@ class MosaicFile:
             If there is no map of the noise, its scale departs from 1 by more than 10 times, or areas
             of one number are masked, or a mask excludes most pixels with data.
         """
-        from miricigale.instrument import pixel_area_map
-
         # pixels as they are, and the factor to MJy/sr
         header = self.header
         meta = {**header.meta, "source": str(self.path)}
         with open_image(self.path, "an image") as (hdus, _):
             data = _native(plane_data(hdus[header.index], self.section))
-            factor, how = calibration(self.path, header.unit, self.zero_point, header.keywords)
-            if factor.unit.is_equivalent(u.MJy):
-                area = pixel_area_map(header.wcs, header.shape)
-                factor = (factor.to_value(u.MJy) / area).astype(data.dtype)
-            else:
-                factor = data.dtype.type(factor.to_value(SURFACE_BRIGHTNESS))
+            factor, how = self._factor()
+            factor = np.asarray(factor, data.dtype)
             usable = np.isfinite(data)
             usable &= self._marked_good(hdus, header.index, meta, usable & (data != 0))
             kind, values, source = self._noise_map(hdus, header, usable)
@@ -400,6 +441,8 @@ class MosaicFile:
         meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
         meta["n_masked"] = int(np.count_nonzero(~usable))
         uncertainty = None
+        if sigma is not None and added_variance is not None:
+            sigma = np.sqrt(np.square(sigma) + added_variance).astype(data.dtype)
         if sigma is not None:
             uncertainty = StdDevUncertainty(sigma)
         return Image(
