@@ -21,6 +21,7 @@ from miricigale.agn.fitted_sample import FittedSample
 from miricigale.agn.images import N_IMAGES
 from miricigale.agn.injection_draws import InjectionDraws, batch_sizes
 from miricigale.evaluation import Estimate
+from miricigale.fitting import GridSettings
 from miricigale.fitting.catalogs.catalog_calibration import measured_calibration
 from miricigale.fitting.catalogs.catalog_rows import read_catalog_nuclei
 from miricigale.fitting.catalogs.classes import fit_classes
@@ -80,6 +81,12 @@ class Injections:
         self.draws = InjectionDraws(
             self._hosts(sample), survey.bins.log_luminosity, int(survey.seed)
         )
+
+    @property
+    def n_models(self):
+        """Effective number of models between the nodes for each AGN."""
+        of_catalog = self.options.get("interpolate", GridSettings.interpolate)
+        return min(of_catalog, self.survey.injected_models)
 
     def _hosts(self, sample):
         """Rows of the galaxies without an AGN, for each bin of redshift."""
@@ -169,6 +176,7 @@ class Injections:
         if measured is not None:
             options["calibration"] = measured
         options["calibrate"] = False
+        options["interpolate"] = self.n_models
         folder = self.folder / batch_name(number)
         return fit_classes(catalog, folder, agn_bins=self.survey.bins, **options)
 

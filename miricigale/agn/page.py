@@ -49,6 +49,7 @@ def write_page(result, path, name):
     if n_in_images:
         where = f"{n_in_images} of them were put into images and measured in the bands of these"
     stated = {"error": f"{100 * meta['completeness_error']:g}", "n_most": meta["n_most"]}
+    stated["n_models"] = meta["injected_models"]
     stated["worst"] = f"{100 * _largest_error(result.numbers):.1f}"
     page.section("selection", n=len(result.injected), where=where, **stated, **facts)
     if meta["photon_noise"]:

@@ -115,6 +115,9 @@ class AGNSurvey:
         catalog has objects, but 200 at least.
     completeness_error : float, optional
         Error of the completeness of a bin with which no more AGN are added to it; 0: as many as may be.
+    injected_models : int, optional
+        Largest effective number of models between the nodes for each injected AGN (``interpolate`` of the fits).
+        Fewer than for the catalog suffice to say whether it is selected.
     n_draws : int, optional
         Draws of the numbers.
     seed : int, optional
@@ -143,6 +146,7 @@ class AGNSurvey:
         limit=CLASS_LIMITS[1],
         n_injections=None,
         completeness_error=0.02,
+        injected_models=100,
         n_draws=2000,
         seed=1,
     ):
@@ -161,6 +165,7 @@ class AGNSurvey:
         good = is_number(completeness_error) and 0 <= completeness_error < 1
         check_that(good, "completeness_error", "from 0 to below 1", completeness_error)
         self.completeness_error = float(completeness_error)
+        self.injected_models = check_count(injected_models, "injected_models")
         self.n_draws = check_count(n_draws, "n_draws")
         self.seed = check_seed(seed)
 
@@ -261,6 +266,7 @@ class AGNSurvey:
         meta |= {"n_all": len(sample), "n_used": int(sample.used.sum())}
         meta |= {"classes": list(sample.tables)}
         meta |= {"n_most": injections.n_most, "completeness_error": self.completeness_error}
+        meta |= {"injected_models": injections.n_models}
         meta |= {"photon_noise": injections.photon_noise()}
         return AGNResult(
             numbers=numbers.by_luminosity(),

@@ -7,6 +7,8 @@ from miricigale.utils.named_values import attributes, without_none
 #: CPU-seconds of a fit of an object as a galaxy, and as each other class, without and with fluxes of nuclei.
 _SECONDS = 0.1
 _SECONDS_NUCLEI = 0.125
+#: Time of the fit of an injected AGN, with fewer models between the nodes, over that of an object of the catalog.
+_PART_INJECTED = 0.5
 #: Options of the prior and its sources.
 _OF_PRIOR = ("segmentation", "catalog", "psf_stars")
 
@@ -67,6 +69,7 @@ def _images(args):
 def _plan(args, survey):
     """What a run would fit, and the processor time that it takes, as text."""
     from miricigale.agn.injections import most_injections
+    from miricigale.fitting import GridSettings
     from miricigale.fitting.catalogs.catalog_rows import open_catalog
     from miricigale.fitting.catalogs.class_names import chosen_classes
 
@@ -75,10 +78,16 @@ def _plan(args, survey):
     n_classes = 1 + len(names)
     n_most = most_injections(survey.n_injections, rows.n_rows)
     n_fits = (rows.n_rows + n_most) * n_classes
+    part = 1.0
+    n_models = GridSettings.interpolate
+    if args.interpolate is not None:
+        n_models = args.interpolate
+    if survey.injected_models < n_models:
+        part = _PART_INJECTED
     seconds = _SECONDS
     if args.nuclei:
         seconds = _SECONDS_NUCLEI
-    minutes = n_fits * seconds / 60
     alone = rows.n_rows * n_classes * seconds / 60
+    minutes = alone + n_most * n_classes * seconds * part / 60
     objects = f"{rows.n_rows} objects and at most {n_most} injected AGN in {n_classes} classes"
     return f"{objects}: {n_fits} fits, about {minutes:.0f} CPU-minutes, {alone:.0f} without AGN"

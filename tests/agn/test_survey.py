@@ -1,5 +1,7 @@
 """AGN added to photometry, and counted again."""
 
+import json
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -357,6 +359,19 @@ def test_injected_agn_are_measured_on_images(run, model, tmp_path):
     )
 
 
+def test_injected_agn_have_fewer_models(run, model, tmp_path):
+    catalog = run("first")[1].parent / "catalog.ecsv"
+    survey = AGNSurvey(20 * u.arcmin**2, redshift=(0.5, 1.5), n_injections=4, injected_models=40)
+    result = survey.run(catalog, tmp_path, **OPTIONS, models=lambda _: (model, AXES))
+    models = {}
+    for folder in ("fits", "injected/batch-01"):
+        manifest = json.loads((tmp_path / folder / "manifest.json").read_text())
+        models[folder] = manifest["job"]["settings"]["interpolate"]
+    assert models == {"fits": 60, "injected/batch-01": 40}
+    assert result.meta["injected_models"] == 40
+    assert "40 models between the nodes" in (tmp_path / "page.html").read_text()
+
+
 def test_images_are_measured_once(run, model, tmp_path):
     """A stopped call, resumed with other workers, writes the bytes of one in a piece."""
     catalog = run("first")[1].parent / "catalog.ecsv"
@@ -473,6 +488,7 @@ def test_refusals(run, tmp_path):
     refuses("'redshift' must be 2 or more ascending", AGNSurvey, area, redshift="ab")
     refuses("log10 of luminosities", AGNSurvey, area, log_luminosity=(1e44, 1e45))
     refuses("'n_injections' must be", AGNSurvey, area, n_injections=-1)
+    refuses("'injected_models' must be", AGNSurvey, area, injected_models=0)
     refuses("'completeness_error' must be from 0", AGNSurvey, area, completeness_error=-0.1)
     survey = AGNSurvey(area)
     refuses("'interpolate' must be above 0", survey.run, "no.fits", tmp_path, interpolate=0)
