@@ -10,6 +10,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pytest
 
+from miricigale.fitting.grid import model_tables
+
 DOCS = Path(__file__).parents[1] / "docs"
 BUILT = {"_build", "changes", "how_to", "tutorials", "api", "sg_execution_times.rst"}
 PAGES = [
@@ -17,7 +19,25 @@ PAGES = [
     for path in sorted(DOCS.rglob("*.rst"))
     if not BUILT.intersection(path.relative_to(DOCS).parts)
 ]
-SCRIPTS = sorted((DOCS / "examples").rglob("*.py"))
+EXAMPLES = DOCS / "examples"
+SCRIPTS = sorted(EXAMPLES.rglob("*.py"))
+#: Numbers of scripts that take long, and smaller ones, with which the test makes the same calls.
+SMALLER = {
+    "how_to/fit/galaxy_quasar_star": {"n = 20": "n = 6"},
+    "how_to/fit/large_catalog": {"n = 60": "n = 16", '"chunk_rows": 15': '"chunk_rows": 4'},
+    "how_to/fit/mock_analysis": {"[bright][:36]": "[bright][:12]"},
+    "how_to/fit/model_errors": {"n = 120": "n = 40"},
+    "how_to/fit/photometric_redshifts": {"[:220]": "[:130]"},
+    "how_to/measure/image_offsets": {"size=50 ": "size=36 "},
+    "how_to/measure/large_mosaic": {"size=30 ": "size=18 ", "patch_size=300": "patch_size=180"},
+    "how_to/run/agn_classes": {"n = 150": "n = 50"},
+    "tutorials/agn_from_images": {
+        "width = 45 ": "width = 27 ",
+        "n_injections=24": "n_injections=8",
+    },
+    "tutorials/by_hand": {"n_groups=60, n_integrations=2": "n_groups=20, n_integrations=1"},
+    "tutorials/large_catalogs": {"n = 240": "n = 80", "chunk_rows=60": "chunk_rows=20"},
+}
 SUBPACKAGES = ("filters", "sed", "scene", "detector", "reduction", "photometry", "fitting")
 
 
@@ -47,11 +67,21 @@ def code_of(text):
 @pytest.mark.pictures
 @pytest.mark.parametrize("path", SCRIPTS, ids=name_of)
 def test_example_runs_and_draws(path, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+    """With the calls of the page, where these take long of fewer sources, and of models at fewer redshifts."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
     monkeypatch.setattr(plt, "show", lambda: None)
+    monkeypatch.setattr(model_tables, "REDSHIFT_STEP", 0.05)
+    text = path.read_text(encoding="utf-8")
+    for number, smaller in SMALLER.get(str(path.relative_to(EXAMPLES).with_suffix("")), {}).items():
+        assert number in text
+        text = text.replace(number, smaller)
+    script = tmp_path / path.name
+    script.write_text(text, encoding="utf-8")
     before = set(plt.get_fignums())
     try:
-        runpy.run_path(str(path), run_name="__main__")
+        runpy.run_path(str(script), run_name="__main__")
         drawn = set(plt.get_fignums()) - before
     finally:
         plt.close("all")
@@ -87,6 +117,10 @@ def test_text_of_tables_stays_out_of_the_margins_of_columns(path):
         if re.fullmatch(r" *-+( +-+)+", line) or re.fullmatch(r" *-+( +-+)+", following):
             continue
         assert [line for k in margins if line[k : k + 1].strip()] == []
+
+
+def test_scripts_with_smaller_numbers_are_those_of_the_gallery():
+    assert SMALLER.keys() <= {name_of(path).removeprefix("examples/") for path in SCRIPTS}
 
 
 def test_scripts_of_the_gallery_have_different_names():

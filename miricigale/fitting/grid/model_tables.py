@@ -38,7 +38,7 @@ _NEGLIGIBLE_FORMED = 0.01
 #: Redshifts at which axes are refined.
 _N_LINE_REDSHIFTS = 5
 #: Largest step of the tables in ln(1 + z): lines, breaks and features of dust cross the edges of bands.
-_REDSHIFT_STEP = 0.01
+REDSHIFT_STEP = 0.01
 #: Bursts differ by less than this along an axis that has no effect on them.
 _NO_EFFECT = 1e-6
 #: Largest number of tables kept for further fitters of a process (some 50 MB each), the last used at the end.
@@ -252,7 +252,7 @@ class ModelTables:
         axes = {
             name: [axis.kind, np.asarray(axis.values, float)] for name, axis in self.axes.items()
         }
-        content = [self.constants, axes, list(self.place), self.redshift]
+        content = [self.constants, axes, list(self.place), self.redshift, REDSHIFT_STEP]
         return grid_key(self.model, {}, self.filters), content_sha256(content)
 
     def _evaluated(self):
@@ -263,7 +263,7 @@ class ModelTables:
         n_bands = len(self.filters)
         n_sums = len(chain.functionals)
 
-        light = self.light_at(finer_redshifts(self.redshift, _REDSHIFT_STEP))
+        light = self.light_at(finer_redshifts(self.redshift, REDSHIFT_STEP))
         stars, star_columns, axes, powers = self._stars(light, lines)
         burst = empty_part(n_bands + 2)
         burst_columns = empty_part(star_columns.table.shape[2])
