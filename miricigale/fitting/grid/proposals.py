@@ -12,7 +12,7 @@ MIN_WEIGHT = 1e-3
 #: Effective number of points for each part that is fitted.
 _POINTS_EACH = 50
 #: Largest number of parts of a group.
-_MAX_PARTS = 3
+_MAX_PARTS = 5
 #: Rounds of the fit.
 _FIT_ROUNDS = 4
 #: Share of wide parts in all labels.
@@ -27,6 +27,8 @@ _LOCAL_SHARE = 0.5
 _MIN_LOCAL_WEIGHT = 0.03
 #: Number of places that a narrow part is fitted to.
 _N_NEAR = 120
+#: Weight over the mean of a group, below which places have no part in narrow ones if enough others are left.
+_LEAST_LOCAL = 0.01
 
 
 @value_class
@@ -158,6 +160,8 @@ def _groups(labels, n_peaks, places, n_local):
     index = places.label * n_peaks + places.peak
     n_groups = n_labels * n_peaks
     flat = np.bincount(index, places.flat, minlength=n_groups).reshape(n_labels, n_peaks)
+    square = np.bincount(index, np.square(places.flat), minlength=n_groups)
+    effective = (np.square(flat.ravel()) / np.maximum(square, 1e-300)).tolist()
     share = np.zeros(flat.shape)
     if n_local:
         share = np.bincount(index, places.weight, minlength=n_groups).reshape(flat.shape)
@@ -179,8 +183,7 @@ def _groups(labels, n_peaks, places, n_local):
             rows = order[ends[k] : ends[k + 1]]
             n_fitted = 0
             if is_fitted[k]:
-                effective = _effective_number(places.flat[rows])
-                n_fitted = int(min(max(effective / _POINTS_EACH, 1), _MAX_PARTS))
+                n_fitted = int(min(max(effective[k] / _POINTS_EACH, 1), _MAX_PARTS))
             n_narrow = 0
             if has_local[k]:
                 n_narrow = n_local
@@ -242,6 +245,11 @@ def _add_local_parts(labels, parts, group, places):
     n_axes = places.score.shape[1]
     rows = group.rows
     weight = places.weight[rows]
+    # places without weight say nothing of where the posterior is
+    has_weight = weight > _LEAST_LOCAL * weight.mean()
+    if np.count_nonzero(has_weight) >= 2 * _N_NEAR:
+        rows = rows[has_weight]
+        weight = weight[has_weight]
     log = places.log_target[rows]
     target = np.exp(np.maximum(log - log.max(), -700.0))
     scratch = (
