@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
@@ -9,13 +10,14 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import chdtri, ndtri
-from scipy.stats import multivariate_normal, multivariate_t, qmc
+from scipy.stats import multivariate_normal, multivariate_t, norm, qmc, t
 
 from helpers.grids import photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, _core
 from miricigale.fitting.grid.peaks import redshift_peaks
-from miricigale.fitting.grid.place_sets import fitted_groups
+from miricigale.fitting.grid.place_sets import Collection, fitted_groups
 from miricigale.fitting.grid.points import quasi_random
+from miricigale.fitting.grid.proposals import FittedParts
 from miricigale.fitting.posterior.quantities import (
     DERIVED_LEVELS,
     draws_summary,
@@ -280,6 +282,35 @@ def test_densities_are_those_of_t_distributions(mixture):
     assert_allclose(mean, [-4.2, 0.2, 1.0], atol=0.05)
     apart = y - mean
     assert_allclose((apart * weight[:, None]).T @ apart / weight.sum(), cov, atol=0.08)
+
+
+def test_mixtures_add_up_in_each_label():
+    """Of two mixtures each is good in one label: weights of labels come out, of more places than of one."""
+    rng = np.random.default_rng(5)
+    n = 2048
+    evidence = np.array([0.7, 0.3])
+    sampler = SimpleNamespace(n=0, n_groups=2, peaks=np.ones(1), label=np.zeros(2 * n, int))
+    parts = FittedParts(None, np.array([0, 1]))
+    collection = Collection(parts, np.ones(2), sampler)
+    group = np.repeat([0, 1], n // 2)
+    alone = []
+    for k, middles in enumerate(([0.2, 2.0], [-2.5, 0.1])):
+        if k:
+            collection.begin(parts, n)
+        middle = np.array(middles)[group]
+        y = rng.standard_t(_core.FREEDOM, n) + middle
+        # half of the places are drawn in each label
+        density = 0.5 * t(_core.FREEDOM).pdf(y - middle)
+        weight = evidence[group] * norm.pdf(y) / density
+        alone.append(weight.sum() ** 2 / np.sum(weight**2))
+        top = weight.max()
+        together, log_unit = collection.weigh(weight / top, np.log(top), group)
+        if k == 0:
+            assert_allclose(together * np.exp(log_unit), weight / n, rtol=1e-12)
+    together = together * np.exp(log_unit)
+    sums = np.bincount(np.tile(group, 2), together)
+    assert_allclose(sums, evidence, rtol=0.03)
+    assert together.sum() ** 2 / np.sum(together**2) > 1.5 * max(alone)
 
 
 def test_local_parts_go_where_weights_are_large():

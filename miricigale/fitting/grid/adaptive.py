@@ -24,9 +24,9 @@ from miricigale.fitting.grid.proposals import MIN_WEIGHT, Places, fit_mixture
 #: Number of places in a round.
 ROUND_SIZE = 512
 #: Largest number of places in a round of those that results rest on.
-_MAX_ROUND_SIZE = 1024
+_MAX_ROUND_SIZE = 2048
 #: Largest number of places for each of the effective number that is wanted.
-_MAX_PLACES_EACH = 80
+_MAX_PLACES_EACH = 60
 #: Smallest value of the largest number of places of an object.
 _MIN_MAX_PLACES = 1 << 14
 #: Number of places that there is memory for to begin with; most objects need no more.
@@ -37,12 +37,12 @@ _ADAPTING_ROUNDS = 6
 _PURSUING_ROUNDS = 9
 #: Effective number, over that wanted in all, at which these rounds end.
 _FIRST_GOAL = 0.3
-#: Number of places after which a mixture is judged; it doubles each time.
+#: Number of places after which a mixture is judged.
 _N_TRIAL = 2048
 #: Effective number wanted over that reached, up to which a judged mixture is kept.
 _MAX_SHORTAGE = 1.5
-#: A mixture is given up only if this many times the places of its trial may follow.
-_TRIAL_GROWTH = 2
+#: A mixture is given up only if this many times the places of all so far may follow.
+_TRIAL_GROWTH = 0.5
 #: Effective number of a peak of redshift or a label that counts, as a part of that wanted in all.
 _EFFECTIVE_PART = 0.05
 #: Smallest such number.
@@ -64,9 +64,11 @@ _MIN_PEAK_SHARE = 0.05
 #: Weight of a peak that counts.
 _PEAK = 0.005
 #: Effective number of points that the weights of a peak are flattened to for a fit, for each round so far.
-_FLAT_EACH = 50
+_FLAT_EACH = 75
 #: Largest such number at first; it doubles each time.
 _MAX_FLAT = 150
+#: Such a weight over the mean, below which it is 0.
+_LEAST_FLAT = 0.003
 #: Number of narrow parts that are added to each label and peak where weights are large.
 _N_LOCAL = 16
 #: Part of the effective number that is wanted, above which places keep their weights and are not moved.
@@ -179,7 +181,7 @@ class AdaptiveSampler:
         if adapted is None:
             return None
         self.collection = Collection(*adapted, self)
-        return self._models_of(self._reach(_N_TRIAL))
+        return self._models_of(self._reach())
 
     def extend(self, factor):
         """
@@ -201,34 +203,30 @@ class AdaptiveSampler:
         self.collection.is_enough = False
         first_wanted = self.wanted
         self.wanted = int(factor * first_wanted)
-        # as many as it takes if the effective number keeps its part of them
-        sample = self._reach(int(factor * (self.n - self.collection.first)))
+        sample = self._reach()
         if sample is not None:
             sample = replace(sample, enough=sample.effective >= first_wanted)
         return self._models_of(sample)
 
-    def _reach(self, size):
+    def _reach(self):
         """
-        Add places until there are enough: the best `WeightedPlaces`; None if none is possible.
+        Add places until there are enough: `WeightedPlaces`; None if none is possible.
 
-        What is known of the shape of the posterior is fitted by more parts if ``size`` places show that it would
-        take many more.
+        What is known of the shape of the posterior is fitted by more parts if places show that it would take many
+        more. A few large weights, which places from the new parts bring down, are reason enough.
         """
-        best = None
+        collection = self.collection
         while self.max_places - self.n >= ROUND_SIZE:
-            sample = self._collect(self.collection, size)
+            sample = self._collect(collection)
             if sample is None:
                 return None
-            if best is None or sample.enough or sample.effective > best.effective:
-                best = sample
             if sample.enough:
-                self.collection.is_enough = True
+                collection.is_enough = True
                 break
-            size *= 2
             self.n_fitted *= 2
             parts = self._fit(self._places(self.n_fitted), n_local=_N_LOCAL)
-            self.collection = Collection(parts, sample.wanted, self)
-        return best
+            collection.begin(parts, self.n)
+        return collection.sample
 
     def _models_of(self, sample):
         """Make `PlacedModels` of `WeightedPlaces`; None of none."""
@@ -273,32 +271,25 @@ class AdaptiveSampler:
             parts = self._fit(places)
         return self._fit(places, n_local=_N_LOCAL), share
 
-    def _collect(self, collection, n_trial):
+    def _collect(self, collection):
         """
         Add places that the parts do not depend on: `WeightedPlaces`, or None if none is possible.
 
-        They are added until there are enough. If ``n_trial`` of them show that it would take many more, this ends
-        as long as twice their number may follow.
+        They are added until there are enough. If the first ones show that it would take many more, this ends as
+        long as half the number of all so far may follow.
         """
-        parts = collection.parts
         first = collection.first
-        total = collection.total
+        begin = self.n
         missing = collection.missing
         while self.max_places - self.n >= ROUND_SIZE:
             size = int(np.clip(missing.sum(), ROUND_SIZE, _MAX_ROUND_SIZE)) & ~127
             size = min(size, self.max_places - self.n)
-            guarded = parts.possible(self._guarded(missing))
-            ends = self._add_round(parts.shared(guarded), size)
-            collection.density = density = _with_columns(collection.density, len(self.label))
-            self._add_density(parts.kernel, ends, density, parts.group % len(self.peaks))
-            total += size * guarded
-            rows = slice(first, self.n)
-            share = (total / total.sum()).reshape(-1, len(self.peaks))
-            _core.mix_peaks(share, self.label[rows], density, first, self.density[rows])
-            sample = self._weigh(rows)
+            sample = self._add_to(collection, missing, size)
             if sample is None:
                 return None
+            rows = sample.rows
             n = self.n - first
+            n_own = self.n - begin
             sample = replace(sample, enough=sample.enough and n >= _MIN_RESULT_PLACES)
             n_each = np.bincount(self.group[rows], minlength=self.n_groups)
             missing = np.maximum(sample.wanted - n_each, 0.02 * sample.wanted)
@@ -306,13 +297,34 @@ class AdaptiveSampler:
             collection.sample = sample
             many_more = self.wanted > _MAX_SHORTAGE * sample.effective
             may_follow = self.max_places - self.n > _TRIAL_GROWTH * n
-            if sample.enough or (many_more and n >= n_trial and may_follow):
+            if sample.enough or (many_more and n_own >= _N_TRIAL and may_follow):
                 break
             effective_in_all = sample.effective * (self.max_places - first) / n
             is_hopeless = effective_in_all < _HOPELESS * self.wanted
-            if n >= min(n_trial, _HOPELESS_TRIAL) and is_hopeless and not may_follow:
+            if n >= _HOPELESS_TRIAL and is_hopeless and not may_follow:
                 break
         return collection.sample
+
+    def _add_to(self, collection, missing, size):
+        """Add places to a collection, most where most are missing: `WeightedPlaces`, None if none is possible."""
+        parts = collection.parts
+        guarded = parts.possible(self._guarded(missing))
+        ends = self._add_round(parts.shared(guarded), size)
+        collection.add(size * guarded, len(self.label))
+        self._add_density(parts.kernel, ends, collection.density, collection.column)
+        own = slice(collection.first_own, self.n)
+        of_peaks = (self.label[own], collection.density, own.start)
+        _core.mix_peaks(collection.shares, *of_peaks, self.density[own])
+        weight = np.empty(own.stop - own.start)
+        top, _ = _core.weigh_places(self.evaluated[own], self.density[own], weight)
+        if not top > 0.5 * _core.NEVER:
+            weight[:] = 0.0
+        weight, log_unit = collection.weigh(weight, top, self.group[own])
+        total = weight.sum()
+        if not total > 0.0:
+            return None
+        rows = slice(collection.first, self.n)
+        return WeightedPlaces(rows, weight, log_unit + np.log(total), *self._wanted(weight, rows))
 
     @property
     def n_groups(self):
@@ -469,6 +481,8 @@ class AdaptiveSampler:
             rows = np.flatnonzero(group == j)
             flat_weight = np.empty(rows.size)
             power, _ = _core.flatten(log[rows], min(float(n_flat), 0.5 * rows.size), flat_weight)
+            # most places have next to no weight, and parts take as long to fit to them as to others
+            flat_weight[flat_weight < _LEAST_FLAT * flat_weight.mean()] = 0.0
             flat[rows] = flat_weight / flat_weight.sum()
             if self.pursue and power == 1.0 and min(n_flat, 0.5 * rows.size) >= _MAX_FLAT:
                 self.pursued[j] = False
@@ -477,9 +491,10 @@ class AdaptiveSampler:
     def _models(self, sample):
         """Make `PlacedModels` of weighted places, without those of least weight."""
         weight = sample.weight
-        order = np.argsort(weight, kind="stable")
-        upto = np.cumsum(weight[order])
-        indices = np.sort(order[upto > _LEFT_OUT * upto[-1]])
+        ascending = np.sort(weight)
+        upto = np.cumsum(ascending)
+        least = ascending[np.searchsorted(upto, _LEFT_OUT * upto[-1], "right")]
+        indices = np.flatnonzero(weight >= least)
         rows = sample.rows.start + indices
         # neighbors in redshift, label by label
         indices = indices[np.lexsort((self.place[rows, 0], self.label[rows]))]
@@ -565,13 +580,3 @@ class AdaptiveSampler:
         return self._placed(
             place, evaluated, flux, np.concatenate(weight), uniform, sample, converged=False
         )
-
-
-def _with_columns(table, n):
-    """Return a table with n columns, of which those that it does not have are 0."""
-    n_rows, n_columns = table.shape
-    if n_columns >= n:
-        return table
-    larger = np.zeros((n_rows, n))
-    larger[:, :n_columns] = table
-    return larger
