@@ -213,18 +213,9 @@ def fit_groups(
     >>> print(f"{fit.rate[2, 3]:.2f} DN/s, jump in group {fit.jumps['group'][0]}")
     5.00 DN/s, jump in group 12
     """
-    data, hidden = without_mask(data)
-    data = np.asarray(data)
-    is_rounded = data.dtype.kind in "iu"
-    if hidden is not None:
-        data = np.where(hidden, np.nan, data)
-    check_that(data.ndim == 4, "data", "of four dimensions", f"shape {data.shape}")
-    _n_int, n_group, ny, nx = data.shape
-    if last_group is None:
-        last_group = n_group
-    if not 0 <= first_group <= last_group - 2 <= n_group - 2:
-        wanted = f"a range of at least two of the {n_group} groups"
-        raise argument_error("first_group, last_group", wanted, f"{first_group}, {last_group}")
+    data, is_rounded = _counts(data)
+    ny, nx = data.shape[2:]
+    last_group = _last_group(first_group, last_group, data.shape[1])
     for name, value in (("group_time", group_time), ("poisson_factor", poisson_factor)):
         check_that(np.isfinite(value) and value > 0, name, "positive", value)
     n_frames = check_count(n_frames, "n_frames")
@@ -236,37 +227,12 @@ def fit_groups(
     else:
         usable = np.ascontiguousarray(usable, bool)
     check_that(usable.shape == (ny, nx), "usable", f"of shape {(ny, nx)}", usable.shape)
-
-    gain = _map(maps.gain, "gain", usable, above=0.0, infinite=True)
-    read_noise = _map(maps.read_noise, "read_noise", usable, floor=0.0)
-    slow_noise = _map(maps.slow_noise, "slow_noise", usable, floor=0.0)
-    bias = _map(maps.bias, "bias", usable)
-    saturation = _map(maps.saturation, "saturation", usable, infinite=True)
-    coef = np.stack([_map(plane, "linearity", usable) for plane in maps.linearity])
-    drift = _drift(drift, data.shape)
-    if bias.size == 1:
-        # one sum for all pixels
-        drift = bias[0, 0] + drift
-        bias = np.zeros((1, 1))
-    reset = _groups(maps.reset, "reset", data.shape)
-    dark = _groups(maps.dark, "dark", data.shape, n_least=last_group)
-    if group_dq is None:
-        group_dq = np.zeros((1, 0, 1, 1), np.uint8)
-    elif np.shape(group_dq) != data.shape or np.asarray(group_dq).dtype != np.uint8:
-        got = f"{np.asarray(group_dq).dtype}, shape {np.shape(group_dq)}"
-        raise argument_error("group_dq", f"uint8, of shape {data.shape}", got)
-    group_dq = _read_only(group_dq)
-
-    data = _read_only(data)
-    variance = read_variance(read_noise, n_frames, rounded=is_rounded)
+    noise = _noise(maps, usable, n_frames, poisson_factor, rounded=is_rounded)
+    ramp = (data, *_response(maps, usable, drift, data.shape, last_group, n_frames))
+    group_dq = _group_dq(group_dq, data.shape)
+    fit = (first_group, last_group, noise, 1 / group_time, jump)
     out = tuple(np.full((ny, nx), np.nan, np.float32) for _ in range(3))
     out += tuple(np.zeros((ny, nx), kind) for kind in (np.int16, np.int16, np.int64))
-    rise = (n_frames - 1) / (2 * n_frames)
-    ramp = (data, (drift, bias, reset), (coef, saturation, dark, rise))
-    # a trace of read noise keeps the closed forms finite
-    shared = shared_photons(n_frames)
-    noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise), shared)
-    fit = (first_group, last_group, noise, 1 / group_time, jump)
 
     def fit_part(part):
         ys, xs, start, cuts = part
@@ -282,16 +248,73 @@ def fit_groups(
     with threads(n_threads) as executor:
         options = {"executor": executor, "progress_bar": progress_bar, "desc": "slopes"}
         events = np.concatenate(parallel_map(fit_rows, chunks(ny, _ROWS), **options))
-        n_diff = last_group - first_group - 1
         showers = np.zeros((4, 0), np.int64)
         if np.isfinite(shower):
             showers = find_showers(
                 data, events, usable, shower, first_group=first_group, last_group=last_group
             )
-        parts = list(_cut_again(events, neighbor, usable, n_diff, showers))
+        parts = list(_cut_again(events, neighbor, usable, last_group - first_group - 1, showers))
         parallel_map(fit_part, parts, executor=executor)
 
     return fit_result(*out, events, first_group)
+
+
+def _counts(data):
+    """Return groups with NaN where they are masked, and whether the counts were whole numbers."""
+    data, hidden = without_mask(data)
+    data = np.asarray(data)
+    is_rounded = data.dtype.kind in "iu"
+    if hidden is not None:
+        data = np.where(hidden, np.nan, data)
+    check_that(data.ndim == 4, "data", "of four dimensions", f"shape {data.shape}")
+    return _read_only(data), is_rounded
+
+
+def _last_group(first_group, last_group, n_group):
+    """Return the end of the range of groups that take part, two or more of ``n_group``."""
+    if last_group is None:
+        last_group = n_group
+    if not 0 <= first_group <= last_group - 2 <= n_group - 2:
+        wanted = f"a range of at least two of the {n_group} groups"
+        raise argument_error("first_group, last_group", wanted, f"{first_group}, {last_group}")
+    return last_group
+
+
+def _noise(maps, usable, n_frames, poisson_factor, *, rounded):
+    """Return the noise for the kernel: read variance, Poisson factor per DN, slow variance, shared photons."""
+    gain = _map(maps.gain, "gain", usable, above=0.0, infinite=True)
+    read_noise = _map(maps.read_noise, "read_noise", usable, floor=0.0)
+    slow_noise = _map(maps.slow_noise, "slow_noise", usable, floor=0.0)
+    # a trace of read noise keeps the closed forms finite
+    variance = np.maximum(read_variance(read_noise, n_frames, rounded=rounded), 1e-6)
+    return variance, poisson_factor / gain, np.square(slow_noise), shared_photons(n_frames)
+
+
+def _response(maps, usable, drift, shape, last_group, n_frames):
+    """Return offsets (drift, bias, reset) and response (linearity, saturation, dark, rise) for the kernel."""
+    bias = _map(maps.bias, "bias", usable)
+    saturation = _map(maps.saturation, "saturation", usable, infinite=True)
+    coef = np.stack([_map(plane, "linearity", usable) for plane in maps.linearity])
+    drift = _drift(drift, shape)
+    if bias.size == 1:
+        # one sum for all pixels
+        drift = bias[0, 0] + drift
+        bias = np.zeros((1, 1))
+    reset = _groups(maps.reset, "reset", shape)
+    dark = _groups(maps.dark, "dark", shape, n_least=last_group)
+    # the last frame of a group is half a group of frames above its mean
+    rise = (n_frames - 1) / (2 * n_frames)
+    return (drift, bias, reset), (coef, saturation, dark, rise)
+
+
+def _group_dq(group_dq, shape):
+    """Return flags of groups, an empty array for none."""
+    if group_dq is None:
+        group_dq = np.zeros((1, 0, 1, 1), np.uint8)
+    elif np.shape(group_dq) != shape or np.asarray(group_dq).dtype != np.uint8:
+        got = f"{np.asarray(group_dq).dtype}, shape {np.shape(group_dq)}"
+        raise argument_error("group_dq", f"uint8, of shape {shape}", got)
+    return _read_only(group_dq)
 
 
 def _read_only(array):
