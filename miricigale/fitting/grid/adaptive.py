@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from miricigale.fitting import _core
-from miricigale.fitting.grid.labels import labels_of_ranges
+from miricigale.fitting.grid.labels import active_axes, labels_of_ranges
 from miricigale.fitting.grid.moves import move_places, systematic
 from miricigale.fitting.grid.place_sets import Collection, WeightedPlaces, fitted_groups
 from miricigale.fitting.grid.placed_models import PlacedModels, places_to_values, thinned
@@ -558,9 +558,7 @@ class AdaptiveSampler:
         evaluated = self.evaluated[picked]
         place = self.place[picked]
         flux = self.flux[picked]
-        active = np.zeros(self.labels.first.shape, bool)
-        for i, n in enumerate(self.labels.n_active):
-            active[i, self.labels.axes[i, :n]] = True
+        active = active_axes(self.labels)[label]
         peaks = self.peak[picked]
 
         def evaluate(rows, new):
@@ -573,7 +571,7 @@ class AdaptiveSampler:
                 evaluated_new[peak_new != peaks[rows], 0] = _core.NEVER
             return evaluated_new, place_new
 
-        move_places(evaluate, group[picked], active[label], score, evaluated, place, self.scramble)
+        move_places(evaluate, group[picked], active, score, evaluated, place, self.scramble)
         # fluxes of the places at which they ended
         self._evaluate(label, score, place, evaluated, flux)
         uniform = self.points[1][: len(picked)]

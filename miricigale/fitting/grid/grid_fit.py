@@ -439,12 +439,11 @@ class GridFit:
 
     def _at_redshifts(self, data, log_prior, pairs):
         """Fit objects on nodes at their own redshifts."""
+        if len(data) == 0:
+            return self._on_nodes(data, log_prior, pairs)
         parts = []
-        for rows in list(chunks(len(data), 1)) or [slice(0, 0)]:
-            if len(data[rows]):
-                parts.append(self._at_redshift(data[rows], log_prior[rows], pairs))
-            else:
-                parts.append(self._on_nodes(data[rows], log_prior[rows], pairs))
+        for rows in chunks(len(data), 1):
+            parts.append(self._at_redshift(data[rows], log_prior[rows], pairs))
         return FitResults.concatenate(parts)
 
     def _at_redshift(self, data, log_prior, pairs):

@@ -13,8 +13,8 @@ from miricigale.filters import FilterSet
 from miricigale.fitting import _core
 from miricigale.fitting.grid.model_tables import ModelTables
 from miricigale.fitting.grid.part_tables import (
-    LEAST,
     empty_part,
+    log_columns,
     log_part_columns,
     logarithms,
     make_part,
@@ -132,7 +132,7 @@ class InterpolatedModels:
         scaling_names = list(names.galaxy) + ["reference"]
         scaling = [column_values(column) for column in grid.galaxy_properties.itercols()]
         scaling.append(np.asarray(grid.dust_luminosity, float))
-        scaling = np.log(np.maximum(np.array(scaling).T, LEAST))
+        scaling = log_columns(np.array(scaling).T)
         shape = np.array([column_values(column) for column in grid.galaxy_shape.itercols()], float)
         shape = shape.reshape(len(names.shape), grid.n_galaxies).T
         agn = empty_part(n_bands)
@@ -143,7 +143,7 @@ class InterpolatedModels:
             table = logarithms(flux, np.zeros((grid.n_agn, 0)), grid.redshift)
             agn = _part_of_grid(table, model_agn, values_agn, grid.redshift, place)
             columns = np.array([column_values(column) for column in grid.agn_properties.itercols()])
-            agn_columns = with_columns(agn, np.log(np.maximum(columns.T, LEAST)))
+            agn_columns = with_columns(agn, log_columns(columns.T))
         light = _core.Light(
             stars=stars,
             burst=empty_part(n_bands + 2),

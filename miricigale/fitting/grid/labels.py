@@ -97,9 +97,7 @@ class LabelTable:
         share_below[0] = 1.0
         log_share[0] = 0.0
         share_below[0, 0] = 0.0
-        still = np.ones(first.shape, bool)
-        for i, n in enumerate(labels.n_active):
-            still[i, labels.axes[i, :n]] = False
+        still = ~active_axes(labels)
         still[:, 0] = True
         kernel = _labels(first, count, still, share_below, log_share)
         return LabelTable(kernel, self.of_range, self.range_of)
@@ -138,10 +136,8 @@ class LabelTable:
             share_below[all_axes, cell + 1] - share_below[all_axes, cell]
         )
         score = ndtri(np.clip((place - start) / range_share, 1e-6, 1.0 - 1e-6))
-        active = np.zeros(labels.first.shape, bool)
-        for i, k in enumerate(labels.n_active):
-            active[i, labels.axes[i, :k]] = True
-        return label, np.where(active[label], score, ndtri(np.clip(uniform, 1e-6, 1.0 - 1e-6)))
+        active = active_axes(labels)[label]
+        return label, np.where(active, score, ndtri(np.clip(uniform, 1e-6, 1.0 - 1e-6)))
 
 
 @cached(maxsize=8)
@@ -187,6 +183,14 @@ def labels_of_ranges(labels):
         for each in codes:
             members.append(np.flatnonzero(code == each))
     return members
+
+
+def active_axes(labels):
+    """Tell which axes have an effect in each label, shape (n_labels, n_axes)."""
+    active = np.zeros(labels.first.shape, bool)
+    for i, n in enumerate(labels.n_active):
+        active[i, labels.axes[i, :n]] = True
+    return active
 
 
 def _labels(first, count, still, share_below, log_share):

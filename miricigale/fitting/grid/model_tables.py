@@ -8,11 +8,12 @@ import numpy as np
 
 from miricigale.fitting import _core
 from miricigale.fitting.grid.part_tables import (
-    LEAST,
     MAX_MODELS,
     PartAxes,
+    combinations,
     empty_part,
     finer_redshifts,
+    log_columns,
     logarithms,
     make_part,
     part_columns,
@@ -169,20 +170,14 @@ class ModelTables:
 
     def _starlight_logs(self, light, rows):
         """Return ln of fluxes, of what AGN fractions may refer to, and of the dust's power over its saturation."""
-        logs, _ = self._evaluated_starlight(light, rows)
-        return logs
-
-    def _evaluated_starlight(self, light, rows):
-        """Evaluate starlight without a burst: the tables of `_starlight_tables`."""
-        flux, columns, ratio = self._starlight(light, rows)
-        return self._starlight_tables(flux, columns, ratio, light.redshift)
+        return self._starlight_tables(*self._starlight(light, rows), light.redshift)[0]
 
     def _starlight_tables(self, flux, columns, ratio, redshift):
         """Compute the logarithms that fluxes follow from, and those of columns, the last the dust's power."""
         reference = columns[:, self._reference_column]
         logs = logarithms(flux, np.column_stack([reference, ratio]), redshift)
         columns = np.column_stack([columns[:, :-1], ratio])
-        return logs, np.log(np.maximum(columns, LEAST))
+        return logs, log_columns(columns)
 
     @property
     def _reference_column(self):
@@ -217,14 +212,18 @@ class ModelTables:
         flux = light.agn(rows).flux
         return logarithms(flux, np.zeros((len(rows), 0)), light.redshift)
 
-    def _part(self, name):
-        evaluate = {
-            "starlight": self._starlight_logs,
-            "dust": self._dust_logs,
-            "agn": self._agn_logs,
-        }
+    def _refined_part(self, name, evaluate, light, lines):
+        """
+        Make the table of a part on axes that are refined where the interpolation needs it.
+
+        Returned are the `_core.Part`, values of its axes, powers of their scales, and all combinations of values.
+        """
         axes = {n: values for n, values in self.names[name].items() if n != self.mixing}
-        return PartAxes(axes, evaluate[name], self._refuses)
+        axes, powers = PartAxes(axes, evaluate, self._refuses).refined(lines)
+        rows = combinations(axes)
+        logs = evaluate(light, rows)
+        part = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
+        return part, axes, powers, rows
 
     def tables(self):
         """
@@ -264,7 +263,8 @@ class ModelTables:
         n_sums = len(chain.functionals)
 
         light = self.light_at(finer_redshifts(self.redshift, REDSHIFT_STEP))
-        stars, star_columns, axes, powers = self._stars(light, lines)
+        stars, axes, powers, _ = self._refined_part("starlight", self._starlight_logs, light, lines)
+        star_columns = self._star_columns(axes, powers, lines)
         burst = empty_part(n_bands + 2)
         burst_columns = empty_part(star_columns.table.shape[2])
         if self.mixing:
@@ -272,11 +272,13 @@ class ModelTables:
         dust = empty_part(n_bands + 1)
         dust_columns = empty_part(n_sums)
         if self.model.component("dust") is not None:
-            dust, dust_columns = self._dust(light, lines)
+            dust, _, _, rows = self._refined_part("dust", self._dust_logs, light, lines)
+            dust_columns = with_columns(dust, log_columns(lines.dust(rows).columns))
         agn = empty_part(n_bands)
         agn_columns = empty_part(0)
         if any(axis.kind == "frac_agn" for axis in self.axes.values()):
-            agn, agn_columns = self._agn(light, lines)
+            agn, _, _, rows = self._refined_part("agn", self._agn_logs, light, lines)
+            agn_columns = with_columns(agn, log_columns(lines.agn(rows).columns))
         place = self.place
         universe = self.model.cosmology.age(light.redshift).to_value(u.Gyr)
         # of a type with the ages of grids: kernels are compiled once
@@ -303,14 +305,6 @@ class ModelTables:
         )
         return parts, galaxies, agn_columns
 
-    def _stars(self, light, lines):
-        part = self._part("starlight")
-        axes, powers = part.refined(lines)
-        rows = part.rows(axes)
-        logs, _ = self._evaluated_starlight(light, rows)
-        stars = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
-        return stars, self._star_columns(axes, powers, lines), axes, powers
-
     def _star_columns(self, axes, powers, lines):
         """
         Make the table of the columns of starlight.
@@ -330,8 +324,8 @@ class ModelTables:
 
         part = PartAxes(axes, formed, self._refuses, 2 * MAX_MODELS, _COLUMN_TOLERANCE, powers)
         axes, powers = part.refined(light)
-        rows = part.rows(axes)
-        _, columns = self._evaluated_starlight(light, rows)
+        starlight = self._starlight(light, combinations(axes))
+        _, columns = self._starlight_tables(*starlight, light.redshift)
         return make_part(tuple(axes), axes, powers, columns[:, None], [0.0], self.place)
 
     def _burst(self, light, axes, powers):
@@ -339,9 +333,7 @@ class ModelTables:
         top = self.model.parameters[self.mixing].bounds[1]
         effective = self._axes_of_burst(axes, top)
         fixed = {name: float(values[-1]) for name, values in axes.items() if name not in effective}
-        rows = [fixed | row for row in PartAxes(effective, None, None).rows(effective)]
-        if not effective:
-            rows = [fixed]
+        rows = [fixed | row for row in combinations(effective)]
 
         # light mixes linearly: with_share = (1 - top) without_burst + top burst
         def burst_alone(with_share, without_burst):
@@ -369,24 +361,6 @@ class ModelTables:
             if change > _NO_EFFECT * np.abs(flux).max():
                 effective[name] = values
         return effective
-
-    def _dust(self, light, lines):
-        part = self._part("dust")
-        axes, powers = part.refined(lines)
-        rows = part.rows(axes)
-        logs = self._dust_logs(light, rows)
-        dust = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
-        columns = lines.dust(rows).columns
-        return dust, with_columns(dust, np.log(np.maximum(columns, LEAST)))
-
-    def _agn(self, light, lines):
-        part = self._part("agn")
-        axes, powers = part.refined(lines)
-        rows = part.rows(axes)
-        logs = self._agn_logs(light, rows)
-        agn = make_part(tuple(axes), axes, powers, logs, light.redshift, self.place)
-        columns = lines.agn(rows).columns
-        return agn, with_columns(agn, np.log(np.maximum(columns, LEAST)))
 
 
 def _nearly_equal(values, expected):

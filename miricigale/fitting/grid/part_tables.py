@@ -35,8 +35,19 @@ def logarithms(flux, columns, redshift):
     np.maximum(flux, np.maximum(_DARK * top, LEAST), out=log_flux)
     np.log(log_flux, out=log_flux)
     log_flux += 2.0 * np.log(np.maximum(redshift, 1e-6))[None, :, None]
-    table[..., n_bands:] = np.log(np.maximum(columns, LEAST))[:, None]
+    table[..., n_bands:] = log_columns(columns)[:, None]
     return table
+
+
+def log_columns(columns):
+    """Return ln of columns, of numbers that are not positive that of the least."""
+    return np.log(np.maximum(columns, LEAST))
+
+
+def combinations(axes):
+    """List all combinations of values of axes, the last one fastest: list of dicts."""
+    rows = itertools.product(*axes.values())
+    return [dict(zip(axes, map(float, row), strict=True)) for row in rows]
 
 
 def to_scale(value, power):
@@ -160,10 +171,6 @@ def _interpolated(kernel, part, values):
     return out
 
 
-def _n_combinations(axes):
-    return int(np.prod([len(values) for values in axes.values()]))
-
-
 @value_class
 class PartAxes:
     """
@@ -192,13 +199,6 @@ class PartAxes:
     tolerance: float = TOLERANCE
     powers: dict | None = None
 
-    def rows(self, axes):
-        """List all combinations of values of axes, the last one fastest: list of dicts."""
-        return [
-            dict(zip(axes, map(float, row), strict=True))
-            for row in itertools.product(*axes.values())
-        ]
-
     def refined(self, light):
         """
         Halve cells of axes where that helps most for its size; return values of axes and powers of their scales.
@@ -207,7 +207,8 @@ class PartAxes:
         may have.
         """
         axes = {name: _RefinedAxis(self, name, light) for name in self.axes}
-        max_models = max(self.max_models, _n_combinations(self.axes))
+        n_combinations = np.prod([len(values) for values in self.axes.values()])
+        max_models = max(self.max_models, n_combinations)
         open_axes = set(axes)
         while open_axes:
             name = max(sorted(open_axes), key=lambda name: axes[name].urgency)
