@@ -14,6 +14,8 @@ from miricigale.utils.parallel import chunks
 
 #: Sources whose details and pictures are in one file.
 CHUNK = 32
+#: Cells of the spectra.
+N_WAVE = 240
 
 
 def source_pages(save, folder, names, title, facts, order, shown, entry, sheet=None):
@@ -109,6 +111,25 @@ def parameter_entries(units):
         text = str(unit).replace("solMass", "M☉").replace("solLum", "L☉")
         entries.append({"name": name, "unit": text})
     return entries
+
+
+def moments_of(result, units):
+    """Return mean and standard deviation of the parameters of a result in their units: list of pairs."""
+    moments = []
+    for name, unit in units.items():
+        mean = rounded(result.mean(name).to_value(unit))
+        moments.append([mean, rounded(result.std(name).to_value(unit))])
+    return moments
+
+
+def thousandths_of_log(values):
+    """Return log10 of values in thousandths, None where they are not positive."""
+    return [round(1000 * np.log10(x)) if x > 0 else None for x in values]
+
+
+def spectrum_edges(pivots):
+    """Return edges of `N_WAVE` cells about bands, evenly spaced in the logarithm of wavelength."""
+    return np.geomspace(0.7 * min(pivots), 1.4 * max(pivots), N_WAVE + 1)
 
 
 def cell_weights(pdf):

@@ -9,11 +9,14 @@ from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.pages.browser import (
     cell_weights,
     list_column,
+    moments_of,
     parameter_entries,
     rounded,
     saver,
     shown_unit,
     source_pages,
+    spectrum_edges,
+    thousandths_of_log,
 )
 from miricigale.plotting.axes import MEASURED
 from miricigale.sed.cells import cell_means
@@ -25,8 +28,6 @@ MAX_OBJECTS = 5000
 MAX_MODELS = 1000
 #: Parameters whose posteriors are drawn.
 _DRAWN = ("redshift", "frac_agn")
-#: Cells of the spectra, evenly spaced in the logarithm of wavelength.
-_N_WAVE = 240
 #: Reduced chi2 of a poor fit.
 _POOR_CHI2 = 10.0
 
@@ -83,7 +84,7 @@ class _Objects:
         self.names = sorted(fits.fitted_filters, key=pivots.get)
         self.bands = places(self.names, fits.filters)
         self.waves = [pivots[name] for name in self.names]
-        self.edges = np.geomspace(0.7 * min(self.waves), 1.4 * max(self.waves), _N_WAVE + 1)
+        self.edges = spectrum_edges(self.waves)
         self.units = {name: shown_unit(fits.unit(name)) for name in fits.parameters}
         self.drawn = [name for name in _DRAWN if name in fits.pdf]
 
@@ -174,16 +175,11 @@ class _Objects:
 
     def _fit(self, result, row):
         """Return moments, posteriors and the spectrum of the best model of an object."""
-        moments = []
-        for name, unit in self.units.items():
-            mean = rounded(result.mean(name).to_value(unit))
-            moments.append([mean, rounded(result.std(name).to_value(unit))])
         pdf = {name: cell_weights(result.pdf[name]) for name in self.drawn}
-        fit = {"moments": moments, "pdf": pdf}
+        fit = {"moments": moments_of(result, self.units), "pdf": pdf}
         if result.model is not None and row < MAX_MODELS:
             best = result.best_sed()
             wave = best.wave.to_value(WAVE)
             means = cell_means(wave, best.fnu.to_value(FNU), np.clip(self.edges, wave[0], wave[-1]))
-            # thousandths of log10
-            fit["spectrum"] = [round(1000 * np.log10(x)) if x > 0 else None for x in means]
+            fit["spectrum"] = thousandths_of_log(means)
         return fit

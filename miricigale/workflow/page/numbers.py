@@ -29,7 +29,7 @@ from miricigale.workflow.stages.conditions import (
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
 from miricigale.workflow.stages.fits import true_ranks
 from miricigale.workflow.stages.inputs import FitPieces
-from miricigale.workflow.stages.sample import NOT_COUNTED, SampleFlags
+from miricigale.workflow.stages.sample import NOT_COUNTED, SampleFlags, is_sample
 
 #: Fewest sources of which a median with its error or scatter is shown.
 FEWEST = 5
@@ -93,7 +93,7 @@ class StudyTables:
     @property
     def sample(self):
         """Rows of the truth that were fitted."""
-        return self.truth[np.asarray(self.matched["selection"]) == 0]
+        return self.truth[is_sample(self.matched)]
 
     @property
     def inside(self):
@@ -290,10 +290,9 @@ def study_metrics(config, tables, area):
     """
     bands = config.exposures.filters
     field = tables.field
-    selection = np.asarray(tables.matched["selection"])
     left_out = {}
     for flag in SampleFlags:
-        rows = (selection & flag) > 0
+        rows = has_flag(tables.matched, "selection", flag)
         if flag != SampleFlags.OUTSIDE_FIELD:
             # what else a source outside of the field may be is no matter
             rows &= tables.inside
@@ -304,7 +303,7 @@ def study_metrics(config, tables, area):
         "n_catalog": len(tables.truth),
         "n_field": int(field.sum()),
         "n_matched": int((field & np.asarray(tables.matched["matched"])).sum()),
-        "n_sample": int((selection == 0).sum()),
+        "n_sample": len(tables.sample),
         "n_left_out": left_out,
         "area": float(area.to_value(u.arcmin**2)),
         "as_paper": as_paper(config),
@@ -345,7 +344,7 @@ def truth_metrics(truth, tables, numbers, bands, seed):
     `whole_sample`, and ``seed`` is that of the ranks (`true_ranks`).
     """
     sample = tables.sample
-    matched = tables.matched[np.asarray(tables.matched["selection"]) == 0]
+    matched = tables.matched[is_sample(tables.matched)]
     fits = {}
     for unit, table in tables.fits.items():
         outliers = numbers[truth.name, unit, "z_outliers"]

@@ -8,13 +8,17 @@ from miricigale import fitting, photometry, sed
 from miricigale.evaluation import OUTLIER, AssociationFlags
 from miricigale.filters import Filter
 from miricigale.pages.browser import (
+    N_WAVE,
     cell_weights,
     image_note,
     list_column,
+    moments_of,
     parameter_entries,
     rounded,
     shown_unit,
     source_pages,
+    spectrum_edges,
+    thousandths_of_log,
 )
 from miricigale.plotting.cutouts import Cutouts
 from miricigale.sed.cells import cell_means
@@ -24,16 +28,14 @@ from miricigale.utils.units import FNU, WAVE, ab_magnitude
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.labels import SET_COLORS, SET_LABELS, band_label
 from miricigale.workflow.page.numbers import StudyTables
-from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
+from miricigale.workflow.stages.conditions import ConditionFlags, any_condition, has_flag
 from miricigale.workflow.stages.exposures import KERNEL
 from miricigale.workflow.stages.grids import of_patch, shown_patch, study_patches
 from miricigale.workflow.stages.images import measured_mosaic
 from miricigale.workflow.stages.inputs import existing_bands, sed_resources, sources_memory
-from miricigale.workflow.stages.sample import SampleFlags
+from miricigale.workflow.stages.sample import SampleFlags, is_sample
 from miricigale.workflow.truths import truth_names
 
-#: Cells of the spectra, evenly spaced in the logarithm of wavelength.
-N_WAVE = 240
 #: Parameters whose posteriors are drawn.
 DRAWN = ("redshift", "frac_agn")
 #: What the table of sources has of each: AGN are selected by the median.
@@ -128,8 +130,8 @@ class _Sources(StudyTables):
         existing = (band for band in existing_bands(config) if band not in self.miri)
         self.bands = (*existing, *self.miri)
         self.pivots = np.array([Filter.from_name(band).pivot.value for band in self.bands])
-        self.edges = np.geomspace(0.7 * self.pivots.min(), 1.4 * self.pivots.max(), N_WAVE + 1)
-        self.sampled = np.asarray(self.matched["selection"]) == 0
+        self.edges = spectrum_edges(self.pivots)
+        self.sampled = is_sample(self.matched)
         # with and without MIRI: the sets in the table and the figure of the spectrum
         self.compared = [unit for unit in ("all", "none") if unit in self.results]
         if not self.compared:
@@ -200,10 +202,9 @@ class _Sources(StudyTables):
             digits[f"sn_{band}"] = 3
         for key in ("n_detected", "selection", "association"):
             columns[key] = matched[key]
-        selection = np.asarray(matched["selection"])
-        in_field = (selection & int(SampleFlags.OUTSIDE_FIELD)) == 0
-        columns |= {"in_field": in_field, "sample": selection == 0}
-        columns["left"] = in_field & (selection != 0)
+        in_field = ~has_flag(matched, "selection", SampleFlags.OUTSIDE_FIELD)
+        columns |= {"in_field": in_field, "sample": self.sampled}
+        columns["left"] = in_field & ~self.sampled
         z = floats(truth["redshift"])
         for unit in self.compared:
             with np.errstate(invalid="ignore"):
@@ -315,19 +316,14 @@ class _Sources(StudyTables):
         result = self.results[unit].loc[key]
         if not result.fitted:
             return None
-        moments = []
-        for name, parameter_unit in self.units.items():
-            mean = rounded(result.mean(name).to_value(parameter_unit))
-            moments.append([mean, rounded(result.std(name).to_value(parameter_unit))])
         fit = {
             "chi2": rounded(result.chi2),
             "n_bands": int(result.n_bands),
-            "moments": moments,
+            "moments": moments_of(result, self.units),
             "pdf": {name: cell_weights(result.pdf[name]) for name in DRAWN},
         }
         if unit in self.compared:
             best = result.best_sed(self.model)
             means = cell_means(best.wave.to_value(WAVE), best.fnu.to_value(FNU), self.edges)
-            # thousandths of log10
-            fit["spectrum"] = [round(1000 * np.log10(x)) if x > 0 else None for x in means]
+            fit["spectrum"] = thousandths_of_log(means)
         return fit

@@ -13,6 +13,7 @@ from miricigale.workflow.derived import rows_of
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample, true_ranks
 from miricigale.workflow.stages.inputs import fit_plan, plain_axes, sed_resources
+from miricigale.workflow.stages.sample import is_sample
 from miricigale.workflow.truths import study_truths, unit_names
 
 #: Most sources of each truth that are fitted with a freed torus.
@@ -89,7 +90,7 @@ def fit_experiment(context, unit):
     plan = context.plan
     truth_name, name = unit.split("/")
     truth, matched, mock = fit_sample(context, truth_name)
-    sample = truth[np.asarray(matched["selection"]) == 0]
+    sample = truth[is_sample(matched)]
     if "n" in plan and len(mock) > plan["n"]:
         rows = np.linspace(0, len(mock) - 1, plan["n"]).round().astype(int)
         mock = mock[rows]

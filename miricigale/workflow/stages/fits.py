@@ -31,6 +31,7 @@ from miricigale.workflow.stages.sample import (
     add_selection,
     cut_flags,
     in_field,
+    is_sample,
     matched_errors,
     mean_coverage,
 )
@@ -176,7 +177,7 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     """
     limits = existing_bands(config)
     bands = list(limits)
-    sample = np.asarray(matched["selection"]) == 0
+    sample = is_sample(matched)
     effect = "zero_point_existing"
     light = Perturbation({effect: zero_point}, seed).fluxes(
         effect, truth[["id"] + list(bands)], bands
@@ -233,7 +234,7 @@ def fit_photometry(context, unit):
     context.save_result(f"{place}.fits", results)
     table = results.to_table()
     conditions = any_condition(matched, context.config.exposures.filters)
-    table["condition"] = conditions[np.asarray(matched["selection"]) == 0]
+    table["condition"] = conditions[is_sample(matched)]
     table["condition"].info.description = ConditionFlags.describe()
     context.save_table(f"{place}.ecsv", table)
 

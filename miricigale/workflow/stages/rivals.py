@@ -11,7 +11,7 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.labels import texts_of
-from miricigale.workflow.stages.conditions import ConditionFlags
+from miricigale.workflow.stages.conditions import ConditionFlags, has_flag
 from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, KERNEL, band_names, exposure_plan
 from miricigale.workflow.stages.measure import measure_band
 from miricigale.workflow.stages.sample import SampleFlags, in_field
@@ -92,11 +92,10 @@ def rival_table(truth, matched, name, *, method, inside):
     shapes = np.where(index < 2, "n < 2", "n >= 2")
     table["shape"] = np.where(np.asarray(truth["profile"]) == "point", "point", shapes)
     table["half_light_radius"] = truth["half_light_radius"].to(u.arcsec)
-    condition = np.asarray(matched[f"{name}_condition"])
-    table["crowded"] = (condition & ConditionFlags.CROWDED) > 0
-    table["edge"] = (condition & ConditionFlags.EDGE) > 0
-    modeled = (np.asarray(matched["selection"]) & SampleFlags.NO_MODEL) == 0
-    table["field"] = inside & modeled
+    condition = f"{name}_condition"
+    table["crowded"] = has_flag(matched, condition, ConditionFlags.CROWDED)
+    table["edge"] = has_flag(matched, condition, ConditionFlags.EDGE)
+    table["field"] = inside & ~has_flag(matched, "selection", SampleFlags.NO_MODEL)
     table[method] = matched[name]
     table[error_column(method)] = formal
     return table

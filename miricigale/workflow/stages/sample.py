@@ -41,6 +41,11 @@ NOT_COUNTED = sum(SampleFlags[key.upper()] for key in ("star", "no_model") + CUT
 _COMPARE = {"<=": le, ">=": ge, "<": lt, ">": gt, "=": eq}
 
 
+def is_sample(matched):
+    """Tell which sources of a matched table no flag keeps from the fit, shape (n,)."""
+    return np.asarray(matched["selection"]) == 0
+
+
 def values_at(sky, wcs, plane):
     """Return values of a plane with a WCS at the pixels of positions, shape (n,); 0 outside of it."""
     return nearest_values(plane, np.stack(wcs.world_to_pixel(sky), axis=-1))[0]

@@ -9,6 +9,7 @@ from miricigale.fitting.results.pulls import without_warnings
 from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
 from miricigale.workflow.engine.stage import stage
+from miricigale.workflow.stages.conditions import has_flag
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, mock_photometry, set_plan
 from miricigale.workflow.stages.inputs import existing_bands, sed_resources
 from miricigale.workflow.stages.sample import NOT_COUNTED, SampleFlags, detected_bands
@@ -43,7 +44,7 @@ def fit_skies(context, unit):
     config = context.config
     n_skies = config.fit.skies
     truth, matched = context.tables(FIELD, ("truth", "matched")).values()
-    field = (np.asarray(matched["selection"]) & (SampleFlags.OUTSIDE_FIELD | NOT_COUNTED)) == 0
+    field = ~has_flag(matched, "selection", SampleFlags.OUTSIDE_FIELD | NOT_COUNTED)
     truth = truth[field]
     matched = matched[field]
     model = sed.SEDModel.yang2021()

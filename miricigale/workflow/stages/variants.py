@@ -12,6 +12,7 @@ from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import changed_config
 from miricigale.workflow.engine.stage import stage
 from miricigale.workflow.labels import texts_of
+from miricigale.workflow.stages.conditions import has_flag
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,
@@ -120,9 +121,8 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
         (``_err``) are of draws of the sources, the same for all images: what these share does not count
         in changes.
     """
-    selection = np.asarray(matched["selection"])
-    inside = (selection & SampleFlags.OUTSIDE_FIELD) == 0
-    field = (selection & (SampleFlags.OUTSIDE_FIELD | NOT_COUNTED)) == 0
+    inside = ~has_flag(matched, "selection", SampleFlags.OUTSIDE_FIELD)
+    field = inside & ~has_flag(matched, "selection", NOT_COUNTED)
     rows = []
     for band, limit in calculator.items():
         true = matched[f"{band}_true"].value
