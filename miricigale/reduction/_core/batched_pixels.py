@@ -26,9 +26,11 @@ from miricigale.utils.compilation import njit
 LANES = 32
 
 # rows of what is known of the pixels in the lanes
-_S, _INV_GAIN, _SLOW, _SUM, _SLOPE, _TOTAL, _SQUARES, _V, _USED, _WORST, _T2, _SIGN, _D = range(13)
-_SHARED = 20
-_N_VALUES = 21
+_S, _INV_GAIN, _SLOW, _SHARED, _SUM, _SLOPE, _TOTAL, _SQUARES, _V, _USED, _WORST, _T2, _SIGN, _D = (
+    range(14)
+)
+# those in which sums over the differences run: lambda, 1 - lambda, two inverses of variances, and three sums
+_LAM, _EPS, _INV_D, _INV_V, _SWD, _F, _ACC, _N_VALUES = range(14, 22)
 
 # columns of what becomes of them
 _Y, _X, _JUMPS, _FLAGS = range(4)
@@ -87,6 +89,7 @@ def fit_lanes(lanes):
     s = values[_S]
     inv_gain = values[_INV_GAIN]
     slow = values[_SLOW]
+    shared = values[_SHARED]
     slope = values[_SLOPE]
     total = values[_TOTAL]
     squares = values[_SQUARES]
@@ -96,14 +99,13 @@ def fit_lanes(lanes):
     worst_t2 = values[_T2]
     sign = values[_SIGN]
     worst_d = values[_D]
-    lam = values[13]
-    eps = values[14]
-    inv_d = values[15]
-    inv_v = values[16]
-    swd = values[17]
-    f = values[18]
-    acc = values[19]
-    shared = values[_SHARED]
+    lam = values[_LAM]
+    eps = values[_EPS]
+    inv_d = values[_INV_D]
+    inv_v = values[_INV_V]
+    swd = values[_SWD]
+    f = values[_F]
+    acc = values[_ACC]
     # start with the plain mean, then twice the weights of the last slope
     for b in range(LANES):
         slope[b] = values[_SUM, b] / n_used[b]

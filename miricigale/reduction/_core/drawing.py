@@ -260,6 +260,55 @@ def _sums(lengths, n, v, s, n_differences, n_whole):
 
 
 @njit(error_model="numpy")
+def _divide(i, entries, charge_per_group, n_usable, groups, limit, lengths, kept_hits):
+    """
+    Divide the integrations of a pixel where it is cut or full, from its first entry ``i`` on.
+
+    Filled are ``lengths`` of the segments that are not whole integrations, and the hits that stay: segment,
+    difference in it and charge. Returns the numbers of whole integrations, segments, hits that stay and jumps,
+    and whether a neighbor has a jump and the pixel is full.
+    """
+    link, slot, charge, cut = entries
+    n_whole, n_group, g0, g1 = groups
+    n_diff = g1 - g0 - 1
+    n_seg = 0
+    n_kept = 0
+    n_cut = 0
+    near_jump = False
+    full = n_usable < n_diff
+    while i >= 0:
+        k = slot[i] // n_group
+        n_whole -= 1
+        begin = 1
+        last = n_usable
+        extra = 0.0
+        while i >= 0 and slot[i] // n_group == k:
+            g = slot[i] % n_group
+            j = g - g0
+            near_jump = near_jump or (cut[i] & _NEIGHBOR) > 0
+            if j <= last:
+                extra += charge[i]
+                last = min(last, _usable(charge_per_group, extra, g, limit, g0, g1))
+                if 1 <= j <= last and cut[i]:
+                    n_cut += cut[i] & _OWN
+                    if j > begin:
+                        lengths[n_seg] = j - begin
+                        n_seg += 1
+                    begin = j + 1
+                elif 1 <= j <= last:
+                    kept_hits[n_kept, 0] = n_seg
+                    kept_hits[n_kept, 1] = j - begin + 1
+                    kept_hits[n_kept, 2] = charge[i]
+                    n_kept += 1
+            i = link[i]
+        full = full or last < n_diff
+        if last >= begin:
+            lengths[n_seg] = last - begin + 1
+            n_seg += 1
+    return n_whole, n_seg, n_kept, n_cut, near_jump, full
+
+
+@njit(error_model="numpy")
 def hit_slopes(mean, hits, electrons, groups, noise, truth, thresholds, rng, out):
     """
     Change the slopes of pixels that lose groups to hits or saturation, or keep a hit.
@@ -289,50 +338,17 @@ def hit_slopes(mean, hits, electrons, groups, noise, truth, thresholds, rng, out
     link, slot, charge, cut = _cut_neighbors(
         rate, entries, cut, n, jumps, own_jumps, groups, neighbor
     )
-    # segments that are not whole integrations; hits that stay: segment, difference, charge
+    entries = link, slot, charge, cut
     lengths = np.empty(n_int * (n_diff + 1) + 1, np.int64)
     kept_hits = np.empty((n_int * n_group, 3))
     for y, x in np.ndindex(ny, nx):
-        i = head[y, x]
         charge_per_group = mean[y, x] * step
         n_usable = _usable(charge_per_group, 0.0, 0, limit, g0, g1)
-        if rate[y, x] != rate[y, x] or (i < 0 and n_usable == n_diff):
+        if rate[y, x] != rate[y, x] or (head[y, x] < 0 and n_usable == n_diff):
             continue
-        n_whole = n_int
-        n_seg = 0
-        n_kept = 0
-        n_cut = 0
-        near_jump = False
-        full = n_usable < n_diff
-        while i >= 0:
-            k = slot[i] // n_group
-            n_whole -= 1
-            begin = 1
-            last = n_usable
-            extra = 0.0
-            while i >= 0 and slot[i] // n_group == k:
-                g = slot[i] % n_group
-                j = g - g0
-                near_jump = near_jump or (cut[i] & _NEIGHBOR) > 0
-                if j <= last:
-                    extra += charge[i]
-                    last = min(last, _usable(charge_per_group, extra, g, limit, g0, g1))
-                    if 1 <= j <= last and cut[i]:
-                        n_cut += cut[i] & _OWN
-                        if j > begin:
-                            lengths[n_seg] = j - begin
-                            n_seg += 1
-                        begin = j + 1
-                    elif 1 <= j <= last:
-                        kept_hits[n_kept, 0] = n_seg
-                        kept_hits[n_kept, 1] = j - begin + 1
-                        kept_hits[n_kept, 2] = charge[i]
-                        n_kept += 1
-                i = link[i]
-            full = full or last < n_diff
-            if last >= begin:
-                lengths[n_seg] = last - begin + 1
-                n_seg += 1
+        n_whole, n_seg, n_kept, n_cut, near_jump, full = _divide(
+            head[y, x], entries, charge_per_group, n_usable, groups, limit, lengths, kept_hits
+        )
         n_differences = n_whole * n_usable
         for m in range(n_seg):
             n_differences += lengths[m]

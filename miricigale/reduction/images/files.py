@@ -162,11 +162,7 @@ def read_images(path):
             flags |= np.where(_plane(hdus, "MASK", shape, path) != 0, int(DQ.DO_NOT_USE), 0)
     error = _usable_error(error, planes, path)
     if len(shape) == 2:
-        mask = False
-        if "WHT" in planes:
-            mask = ~(planes["WHT"] > 0)
-        image = flagged_image(data, unit, error=error, flags=flags, wcs=wcs, meta=meta, mask=mask)
-        return [ImageFile(image, planes, header)]
+        return [_image_file(data, unit, error, flags, wcs, meta, planes, header)]
     return _integrations(data, unit, error, flags, wcs, meta, planes, header)
 
 
@@ -187,6 +183,15 @@ def _usable_error(error, planes, path):
     return np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
 
 
+def _image_file(data, unit, error, flags, wcs, meta, planes, header):
+    """Make an `ImageFile` of arrays, masked where its weight is not above 0."""
+    mask = False
+    if "WHT" in planes:
+        mask = ~(planes["WHT"] > 0)
+    image = flagged_image(data, unit, error=error, flags=flags, wcs=wcs, meta=meta, mask=mask)
+    return ImageFile(image, planes, header)
+
+
 def _integrations(data, unit, error, flags, wcs, meta, planes, header):
     """`ImageFile` of each integration of arrays whose first axis has these."""
     files = []
@@ -194,18 +199,6 @@ def _integrations(data, unit, error, flags, wcs, meta, planes, header):
         error_of = None
         if error is not None:
             error_of = error[number]
-        mask = False
-        if "WHT" in planes:
-            mask = ~(planes["WHT"][number] > 0)
-        image = flagged_image(
-            data[number],
-            unit,
-            error=error_of,
-            flags=flags[number],
-            wcs=wcs,
-            meta={**meta, "integration": number},
-            mask=mask,
-        )
         own_planes = {}
         for name, plane in planes.items():
             # maps and counts are those of all integrations
@@ -213,7 +206,8 @@ def _integrations(data, unit, error, flags, wcs, meta, planes, header):
                 own_planes[name] = plane
             else:
                 own_planes[name] = plane[number]
-        files.append(ImageFile(image, own_planes, header))
+        arrays = (data[number], unit, error_of, flags[number], wcs)
+        files.append(_image_file(*arrays, meta | {"integration": number}, own_planes, header))
     return files
 
 
