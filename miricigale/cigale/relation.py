@@ -130,8 +130,13 @@ def _take_best(results, new, i, index, scale, flux, values):
     sigma = results.sigma[i]
     limit = results.limit[i]
     has_data = np.isfinite(sigma)
-    data = (results.flux[i][has_data], sigma[has_data], limit[has_data])
-    chi2 = chi2_at(np.ones(len(flux)), flux[:, has_data], *data)
+    chi2 = chi2_at(
+        np.ones(len(flux)),
+        flux[:, has_data],
+        results.flux[i][has_data],
+        sigma[has_data],
+        limit[has_data],
+    )
     k = int(np.argmin(chi2))
     new["chi2"][i] = chi2[k]
     new["best_flux"][i] = flux[k]

@@ -197,8 +197,9 @@ class CigaleSetup:
         path = path or self.data_file
         if path is None:
             raise config_error(self.path, "names no data_file")
-        options = {"bands": self.columns, "limits": self.limits, "names": self.names}
-        return read_cigale_catalog(path, **options, strict=strict)
+        return read_cigale_catalog(
+            path, bands=self.columns, limits=self.limits, names=self.names, strict=strict
+        )
 
     def filters(self, names=None):
         """

@@ -357,8 +357,7 @@ def _limit(linear, constant):
 def _ramps(filter, time, n_dithers, *, n_groups=None, readout="FASTR1", subarray="FULL"):
     """Integrations, frame time and sub-array for `fitted_noise`; by default those of an `Exposure` of the time."""
     if n_groups is None:
-        form = {"readout": readout, "subarray": subarray}
-        exposure = Exposure(filter, time=time / n_dithers, **form)
+        exposure = Exposure(filter, time=time / n_dithers, readout=readout, subarray=subarray)
         n_integrations = n_dithers * exposure.n_integrations
         return {
             "n_integrations": n_integrations,

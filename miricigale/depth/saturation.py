@@ -170,8 +170,7 @@ def saturation_forecast(exposure, *, background=None, detector=None):
     """
     if detector is None:
         detector = miri_detector()
-    part = {"detector": detector, "subarray": exposure.subarray}
-    rate = electron_rate(exposure.filter, background, **part)
+    rate = electron_rate(exposure.filter, background, detector=detector, subarray=exposure.subarray)
     fraction = _filled(rate, exposure, detector.full_well)
     if np.ndim(fraction) == 0:
         return float(fraction)

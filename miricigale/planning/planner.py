@@ -424,8 +424,13 @@ class Planner:
             plans = [self.evaluate((), name=EXISTING)]
             bar.update()
             for name, share in zip(sets, shares, strict=True):
-                options = {"name": _short_name(name), "share": share, "measured": measured}
-                plans.append(self.evaluate(self.config.set_bands(name), **options))
+                plan = self.evaluate(
+                    self.config.set_bands(name),
+                    name=_short_name(name),
+                    share=share,
+                    measured=measured,
+                )
+                plans.append(plan)
                 bar.update()
         return plans
 

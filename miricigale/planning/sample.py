@@ -118,8 +118,9 @@ def _catalog_galaxies(config, executor):
     redshift = floats(catalog["redshift"])
     chosen = (redshift >= options.redshift[0]) & (redshift <= options.redshift[1])
     catalog = _cut(catalog, chosen & ~np.asarray(catalog["star"], bool), "[sample] redshift")
-    fit = {"model_error": config.fit.model_error, "executor": executor}
-    results = fit_seds(catalog, config.sed, **fit).to_table()
+    results = fit_seds(
+        catalog, config.sed, model_error=config.fit.model_error, executor=executor
+    ).to_table()
     sources = galaxy_parameters(study, catalog, results, seed=config.plan.seed)
     sources["luminosity"] = results["dust_luminosity_best"].to(u.Lsun)
     if "dust_excess" in sources.colnames:

@@ -73,8 +73,14 @@ def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
     ax = resolve_axes(ax)
     for k, name in enumerate(flux):
         # neighbors differ in more than a shade
-        style = {"color": (colors or {}).get(name), "ls": ("-", "--")[k % 2]}
-        (line,) = ax.loglog(flux[name], sigma[name], lw=1.6, label=plain_text(name), **style)
+        (line,) = ax.loglog(
+            flux[name],
+            sigma[name],
+            lw=1.6,
+            label=plain_text(name),
+            color=(colors or {}).get(name),
+            ls=("-", "--")[k % 2],
+        )
         limit = (limits or {}).get(name, np.nan)
         if np.isfinite(limit):
             ax.plot(limit, limit / 5, "o", color=line.get_color(), ms=5)

@@ -124,8 +124,7 @@ def plot_pdf_2d(
     inside[order] = np.concatenate([[0.0], total[:-1]]) / max(total[-1], 1e-300)
     inside = inside.reshape(weights.shape)
     for i, level in enumerate(levels):
-        border = {"colors": "black", "linewidth": max(1.5 - 0.7 * i, 0.5)}
-        add_borders(ax, (inside < level).T, x, y, **border)
+        add_borders(ax, (inside < level).T, x, y, colors="black", linewidth=max(1.5 - 0.7 * i, 0.5))
     for edges, sums, limits in ((x, weights.sum(axis=1), "xlim"), (y, weights.sum(axis=0), "ylim")):
         occupied = np.flatnonzero(sums > 1e-4 * sums.sum())
         if occupied.size:
@@ -189,8 +188,9 @@ def plot_sed_fit(
     if ax is None:
         import matplotlib.pyplot as plt
 
-        panels = {"sharex": True, "height_ratios": (3, 1), "layout": "constrained"}
-        _, (ax, residual_ax) = plt.subplots(2, 1, figsize=(7, 5), **panels)
+        _, (ax, residual_ax) = plt.subplots(
+            2, 1, figsize=(7, 5), sharex=True, height_ratios=(3, 1), layout="constrained"
+        )
     elif isinstance(ax, (tuple, list, np.ndarray)):
         ax, residual_ax = ax
     wave = _value(wave, u.um)

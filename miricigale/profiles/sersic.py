@@ -200,8 +200,9 @@ def sersic_image(shape, *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta
     1.0
     """
     _check(total_flux, r_eff, n, axis_ratio)
-    shapes = {"r_eff": r_eff, "n": n, "axis_ratio": axis_ratio, "theta": theta}
-    rows = parameter_rows(x=x, y=y, total_flux=total_flux, **shapes)
+    rows = parameter_rows(
+        x=x, y=y, total_flux=total_flux, r_eff=r_eff, n=n, axis_ratio=axis_ratio, theta=theta
+    )
     image = np.zeros(shape)
     from miricigale.profiles import _core
 

@@ -62,8 +62,7 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
         scale = scalar(pixel_scale, ANGLE, "pixel_scale")
         # sums over cells take them as constant too
         width = math.sqrt(max(scale**2 - psf.cell**2, 0.0)) / psf.pixel_scale.value
-        form = {"oversampling": psf.n_cells, "pixel": False}
-        data = detector_response(data, **form, boxes=(width,))
+        data = detector_response(data, oversampling=psf.n_cells, pixel=False, boxes=(width,))
     return enclosed_light(psf, data, radius)
 
 

@@ -101,8 +101,9 @@ def _miri_data(telescope, oversampling, fov, includes, calibration, position=Non
             extra = _IN_FLIGHT_BLUR.get(name, 0.0)
         jitter = math.hypot(constants["jitter"], extra) / scale
     if "cruciform" in includes:
-        form = {"oversampling": oversampling, "calibration": calibration}
-        data = cruciform(data, name, shift=shift, **form)
+        data = cruciform(
+            data, name, shift=shift, oversampling=oversampling, calibration=calibration
+        )
     data = detector_response(
         data,
         oversampling=oversampling,

@@ -281,8 +281,9 @@ def psf_mosaic(
     n = 2 * round(0.5 * width / cell - 0.5) + 1
     blurred = psf.data
     if resampling == "drizzle":
-        form = {"oversampling": psf.n_cells, "pixel": False, "boxes": (pixfrac,)}
-        blurred = detector_response(psf.data, **form)
+        blurred = detector_response(
+            psf.data, oversampling=psf.n_cells, pixel=False, boxes=(pixfrac,)
+        )
     axis = (np.arange(n) - n // 2) * cell
     # dithers of one roll are alike
     different, counts = np.unique(turns, return_counts=True)

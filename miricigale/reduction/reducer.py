@@ -277,8 +277,7 @@ class Reducer(Interactive):
                 raise argument_error("rate", "slopes, or an image with its PHOTMJSR", "neither")
             rate = with_data(rate, rate.data / before, factor=1 / before, unit=RATE)
         brightness, references = brightness_of(self, rate)
-        mode = {"filter": facts.filter, "subarray": facts.subarray}
-        cal = calibrate(rate, **mode, **brightness)
+        cal = calibrate(rate, filter=facts.filter, subarray=facts.subarray, **brightness)
         cal.meta.update(references)
         return cal
 
@@ -466,8 +465,9 @@ class Reducer(Interactive):
             images.append(subtracted)
             backgrounds.append(background)
         check_that(images, "ramps", "at least one ramp", "none")
-        options = {"rates": rates, "wcs": wcs, "pixel_scale": pixel_scale, "align": align}
-        return self.combine(images, backgrounds, **options)
+        return self.combine(
+            images, backgrounds, rates=rates, wcs=wcs, pixel_scale=pixel_scale, align=align
+        )
 
     __call__ = run
 

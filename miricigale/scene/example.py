@@ -113,6 +113,7 @@ def example_field(filters=("wfc3.f160w", "miri.f770w"), *, size=30 * u.arcsec, s
         psfs[name] = filter_psf(name, pixel_scale=pixel, pa=0 * u.deg)
         wcs = north_up_wcs(_CENTER, pixel, (n_pixels, n_pixels))
         depth = _DEPTHS[camera] * u.ABmag
-        options = {"filter": name, "wcs": wcs, "psf": psfs[name], "depth": depth}
-        images[name] = highres_image(truth, seed=seed, **options)
+        images[name] = highres_image(
+            truth, seed=seed, filter=name, wcs=wcs, psf=psfs[name], depth=depth
+        )
     return ExampleField(images, psfs, truth)

@@ -192,9 +192,15 @@ class Painter:
             radius = r_eff[extended] * os_
             index = n[extended]
             ratio = axis_ratio[extended]
-            shapes = {"r_eff": radius, "n": index, "axis_ratio": ratio, "theta": theta[extended]}
-            places = {"x": node_x[extended], "y": node_y[extended]}
-            rows = parameter_rows(**places, total_flux=flux[extended], **shapes)
+            rows = parameter_rows(
+                x=node_x[extended],
+                y=node_y[extended],
+                total_flux=flux[extended],
+                r_eff=radius,
+                n=index,
+                axis_ratio=ratio,
+                theta=theta[extended],
+            )
             tables = light_table(index)
             # the cusp, and profiles thinner than the nodes as a whole, in small cells
             zone = np.where(ratio * radius < 4, np.maximum(4 / ratio, 3 * radius), 4 / ratio)

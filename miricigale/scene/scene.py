@@ -191,8 +191,9 @@ class Scene(WithTable):
         scale = float(np.abs(np.linalg.det(self._center_jacobian())) ** -0.5)
         self._check_psf(psf, scale)
         radius = positive(max_radius, ANGLE, "max_radius") / scale
-        options = {"enclosed": enclosed, "max_radius": radius, "n_threads": n_threads}
-        self._painter = Painter(self._shape, psf, **options)
+        self._painter = Painter(
+            self._shape, psf, enclosed=enclosed, max_radius=radius, n_threads=n_threads
+        )
         self._cutouts = self._check_cutouts(cutouts)
         self._galaxy_flux, self._agn_flux = self._split_flux(agn)
         self._warn_of_fluxes()

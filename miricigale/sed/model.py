@@ -262,8 +262,9 @@ class SEDModel(Interactive):
 
     def _of_components(self, components):
         """Model of other components, with the cosmology and the AGN fractions of this one."""
-        options = {"frac_agn_definition": self.frac_agn_definition}
-        return type(self)(components, cosmology=self.cosmology, **options)
+        return type(self)(
+            components, cosmology=self.cosmology, frac_agn_definition=self.frac_agn_definition
+        )
 
     def named_axes(self, name=None):
         """

@@ -92,9 +92,14 @@ class Parameter:
 
     def replace(self, default, name=None):
         """Copy with another default, and another name if one is given."""
-        kind = {"absent_at_zero": self.absent_at_zero, "label": self.label}
         new = Parameter(
-            default, self.bounds, self.doc, unit=self.unit, logarithms=self.logarithms, **kind
+            default,
+            self.bounds,
+            self.doc,
+            unit=self.unit,
+            logarithms=self.logarithms,
+            absent_at_zero=self.absent_at_zero,
+            label=self.label,
         )
         new.name = name or self.name
         return new

@@ -116,8 +116,7 @@ class _Objects:
             for k, level in enumerate(("16 %", "50 %", "84 %")):
                 table[f"{key}_{k}"] = percentiles[:, k]
                 title = f"{meaning}, percentile of the posterior"
-                options = {"group": label, "digits": digits}
-                columns.append(list_column(f"{key}_{k}", level, title, **options))
+                columns.append(list_column(f"{key}_{k}", level, title, group=label, digits=digits))
         line = None
         if np.isfinite(numbers["z_known"]).any():
             # the posterior of the redshift has a line there

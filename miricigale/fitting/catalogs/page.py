@@ -81,8 +81,13 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None, browser=
         classes = {"galaxy": results}
     results = classes["galaxy"]
     job = results.job
-    names = {"catalog_map": catalog_map, "flux_unit": job["catalogue"]["flux_unit"]}
-    rows = open_catalog(path, job["chunk_rows"], hdu=hdu, **names)
+    rows = open_catalog(
+        path,
+        job["chunk_rows"],
+        hdu=hdu,
+        catalog_map=catalog_map,
+        flux_unit=job["catalogue"]["flux_unit"],
+    )
     step = max(1, -(-len(results) // _MAX_OBJECTS))
     all_numbers = fit_numbers(results, step)
     numbers = all_numbers
@@ -106,8 +111,7 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None, browser=
         page.notice("thinned", step=step, n=len(all_numbers))
     _notices(page, numbers)
     non_galaxies = " or ".join(list(classes)[1:])
-    facts = {"n": len(numbers), "n_all": len(all_numbers), "others": non_galaxies}
-    page.section("summary", text, **facts)
+    page.section("summary", text, n=len(numbers), n_all=len(all_numbers), others=non_galaxies)
     _summary(page, numbers)
     curves = fitted_curves(next(iter(results.parts())))
     if browser is not None and len(all_numbers):

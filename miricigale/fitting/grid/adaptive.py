@@ -404,8 +404,7 @@ class AdaptiveSampler:
         score = score[order]
         self.label[new] = label
         self.score[new] = score
-        of_new = (self.place[new], self.evaluated[new], self.flux[new])
-        self._evaluate(label, score, *of_new)
+        self._evaluate(label, score, self.place[new], self.evaluated[new], self.flux[new])
         if self.borders.size:
             self.peak[new] = np.searchsorted(self.borders, self._redshift(self.place[new, 0]))
         self.group[new] = self._groups(label, self.peak[new])
@@ -415,8 +414,9 @@ class AdaptiveSampler:
 
     def _evaluate(self, label, score, place, evaluated, flux):
         """Evaluate places; see `_core.evaluate_places`."""
-        of_places = (label, score, place, evaluated, flux, self.work)
-        _core.evaluate_places(self.space, self.labels, self.target, *of_places)
+        _core.evaluate_places(
+            self.space, self.labels, self.target, label, score, place, evaluated, flux, self.work
+        )
 
     def _reserve(self, n):
         """Make memory for n places."""
@@ -436,8 +436,7 @@ class AdaptiveSampler:
         """Add densities of parts of a mixture at blocks of places to columns of others, or to one."""
         if column is None:
             column = np.zeros(len(parts.share), np.int64)
-        places = (ends, self.score, self.scratch, density)
-        _core.add_density(self.labels, parts, column, *places)
+        _core.add_density(self.labels, parts, column, ends, self.score, self.scratch, density)
 
     def _redshift(self, place):
         """Compute the redshifts of places in the unit interval."""

@@ -295,12 +295,19 @@ class GridEngine(Frozen):
         if self.mixture is not None:
             broad = self.mixture.broad(data, sigma)
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
-            given = data[i], sigma[i], log_prior[i]
-            target = stated = _core.make_target(*given, self.template_error)
+            target = stated = _core.make_target(
+                data[i], sigma[i], log_prior[i], self.template_error
+            )
             limits = _core.make_limits(limit[i], inverse[i], getattr(self.mixture, "part", None))
             if broad is not None:
-                more = broad[i], limit[i], limit_sigma[i] if limits is not None else None
-                target, wrong = self.tangents.touch(stated, log_prior[i], sigma[i], *more)
+                target, wrong = self.tangents.touch(
+                    stated,
+                    log_prior[i],
+                    sigma[i],
+                    broad[i],
+                    limit[i],
+                    limit_sigma[i] if limits is not None else None,
+                )
             of_all = target
             tables, target, log_norm = self._of_masses(target, workspace[2])
             given = tables, self._scales, self._request, target, limits

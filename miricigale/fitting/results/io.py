@@ -69,8 +69,9 @@ def _write_results(results, path, *, shown, overwrite):
     }
     # FITS has no columns of arrays without elements
     full = {name: array for name, array in table.items() if array.size or not len(array)}
-    parts = {"shown": shown, "text": text, "tables": {"RESULTS": Table(full)}}
-    write_parts(path, _RESULTS, **parts, overwrite=overwrite)
+    write_parts(
+        path, _RESULTS, shown=shown, text=text, tables={"RESULTS": Table(full)}, overwrite=overwrite
+    )
 
 
 def read_results(path, *, rows=None):

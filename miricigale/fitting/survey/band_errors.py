@@ -358,8 +358,11 @@ def estimate_band_errors(fluxes, prior):
     ]
     fits = []
     for start in starts:
-        options = {"method": "L-BFGS-B", "bounds": _BOUNDS[:n_free]}
-        fits.append(minimize(minus_log_posterior, start[:n_free], **options))
+        fits.append(
+            minimize(
+                minus_log_posterior, start[:n_free], method="L-BFGS-B", bounds=_BOUNDS[:n_free]
+            )
+        )
     best = min(fits, key=lambda fit: fit.fun)
     zero_point = 1.0
     zero_point_err = 0.0

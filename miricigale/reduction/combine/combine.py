@@ -49,8 +49,10 @@ def drizzle(settings, images, wcs, variances=()):
         images = reject_outliers(
             images, wcs, threshold=settings.outlier_threshold, weights=weights, pixel_maps=maps
         )
-    options = {"weights": weights, "pixel_maps": maps, "variances": variances}
-    return drizzle_images(images, wcs, pixfrac=settings.pixfrac, **options), images
+    mosaic = drizzle_images(
+        images, wcs, pixfrac=settings.pixfrac, weights=weights, pixel_maps=maps, variances=variances
+    )
+    return mosaic, images
 
 
 def subtract_dithers(reducer, images, single_backgrounds=None, wcs=None):

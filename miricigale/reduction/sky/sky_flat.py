@@ -122,8 +122,9 @@ def flattened(reducer, images, backgrounds):
     flats = sky_flats(unsubtracted, window=reducer.background.sky_flat)
     for im, flat in zip(unsubtracted, flats, strict=True):
         error = flat.uncertainty.array
-        values = {"factor": 1 / flat.data, "sky_flat_error": float(np.median(error))}
-        flat_image = with_data(im, im.data / flat.data, **values)
+        flat_image = with_data(
+            im, im.data / flat.data, factor=1 / flat.data, sky_flat_error=float(np.median(error))
+        )
         flat_image, background = reducer.subtract_background(flat_image)
         error = np.hypot(background.error, background.level * error).astype(np.float32)
         out.append((flat_image, dataclasses.replace(background, error=error)))

@@ -78,5 +78,6 @@ def remove_stripes(image):
             unknown += int(
                 np.count_nonzero(~measured & ~mask.all(axis=0 if part is pattern else 1))
             )
-    values = {"stripes": float(np.std(pattern[~mask])), "stripes_unknown": unknown}
-    return with_data(image, image.data - pattern, **values)
+    return with_data(
+        image, image.data - pattern, stripes=float(np.std(pattern[~mask])), stripes_unknown=unknown
+    )

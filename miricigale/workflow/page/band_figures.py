@@ -37,8 +37,14 @@ def magnitude_figure(table, bands):
         ax.plot(true[name], measured[name], ".", ms=3.5, color=MEASURED, alpha=0.7)
         ax.axline((high, high), slope=1, color=TRUE, lw=1)
         lost = true[name][np.isfinite(true[name]) & ~(measured[name] < high)]
-        at_bottom = {"transform": ax.get_xaxis_transform()}
-        ax.plot(lost, np.full(len(lost), 0.02), "|", color=TRUE, ms=6, **at_bottom)
+        ax.plot(
+            lost,
+            np.full(len(lost), 0.02),
+            "|",
+            color=TRUE,
+            ms=6,
+            transform=ax.get_xaxis_transform(),
+        )
         ax.set_title(band_title(name))
     low = magnitudes.min(initial=high)
     bright = np.nanmin(np.concatenate([*measured.values(), [low]]))

@@ -201,8 +201,9 @@ def residual_figure(images, names, *, size=220):
             model, _ = _binned(model, scale)
             image, scale = _binned(image, scale)
         titles = ("mosaic", "model", "mosaic - model") if row == 0 else (None, None, None)
-        options = {"titles": titles, "unit": "MJy/sr", "pixel_scale": scale}
-        plot_model_residual(image, model, ax=axes[row], **options)
+        plot_model_residual(
+            image, model, ax=axes[row], titles=titles, unit="MJy/sr", pixel_scale=scale
+        )
         for ax in axes[row]:
             mark_sky(ax, 5 if size else 20, **_directions(pair[0]))
         axes[row, 0].set_ylabel(band_title(name))
@@ -234,8 +235,9 @@ def subtraction_figure(rate, cal, reducer):
         (axes[0, 0], "before", before, SECOND),
         (axes[0, 1], "after", after, MEASURED),
     ):
-        options = {"pixel_scale": scale, "colorbar": "MJy/sr", "stretch": "linear"}
-        plot_image(image, ax=ax, title=title, **options)
+        plot_image(
+            image, ax=ax, title=title, pixel_scale=scale, colorbar="MJy/sr", stretch="linear"
+        )
         sky = np.where(sources, np.nan, image)
         level = np.nanmedian(sky)
         number = f"{level:.0f}" if abs(level) >= 10 else f"{level:.2g}"

@@ -91,8 +91,7 @@ def _draw_estimates(ax, k, injected, value, low, high, label):
     spread = np.abs([value - low, high - value])
     # the sets apart
     place = injected + 0.012 * (k - 0.5)
-    style = {"fmt": marker, "ls": "-", "ms": 4.5, "color": color, "lw": 1.2}
-    ax.errorbar(place, value, spread, label=label, **style)
+    ax.errorbar(place, value, spread, label=label, fmt=marker, ls="-", ms=4.5, color=color, lw=1.2)
     ax.set_xlabel("injected fracAGN")
 
 
@@ -139,8 +138,7 @@ def histogram_figure(study, quantity):
             sample = values(truth, name)[inside]
             sample = sample[np.isfinite(sample)]
             color = STYLES[k][0]
-            style = {"histtype": "step", "color": color, "lw": 1.6}
-            ax.hist(np.clip(sample, *ends), bins, label=label, **style)
+            ax.hist(np.clip(sample, *ends), bins, label=label, histtype="step", color=color, lw=1.6)
             if sample.size:
                 note = f"{np.median(sample):.3f} ± {sigma_mad(sample):.3f}"
                 if quantity == "redshift":
@@ -278,8 +276,9 @@ def detection_figure(study):
     good = reference.field & (power > 0) & np.isfinite(z)
     figure, [[ax]] = new_figure(size=(7.0, 3.8))
     undetected = good & ~np.any(list(groups.values()), axis=0)
-    style = {"ms": 4, "color": "0.75", "zorder": 1}
-    ax.semilogy(z[undetected], power[undetected], ".", label="not detected", **style)
+    ax.semilogy(
+        z[undetected], power[undetected], ".", label="not detected", ms=4, color="0.75", zorder=1
+    )
     for k, (name, rows) in enumerate(groups.items()):
         color, marker = STYLES[k]
         style = {"ms": 3 + 2.5 * k, "color": color, "mfc": "none" if k else color, "alpha": 0.75}
@@ -415,8 +414,14 @@ def rank_figure(ranks):
         for k, (name, values) in enumerate(by_name[label].items()):
             n, edges = np.histogram(values[np.isfinite(values)], _RANK_BINS, (0, 1))
             n_max = max(n_max, n.sum())
-            style = {"color": STYLES[k][0], "lw": 1.6, "ls": ("-", "--")[k]}
-            ax.stairs(n * _RANK_BINS / max(n.sum(), 1), edges, label=name, **style)
+            ax.stairs(
+                n * _RANK_BINS / max(n.sum(), 1),
+                edges,
+                label=name,
+                color=STYLES[k][0],
+                lw=1.6,
+                ls=("-", "--")[k],
+            )
         if n_max:
             # binomial, of a uniform distribution
             error = np.sqrt((_RANK_BINS - 1) / n_max)
