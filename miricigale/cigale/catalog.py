@@ -215,5 +215,6 @@ def _in_unit(path, table, name, values, default):
     try:
         return (values * u.Unit(unit)).to(default)
     except (u.UnitConversionError, TypeError, ValueError):
-        problem = f"cannot be used: column {name!r} must be convertible to {default}, got {unit}"
-        raise data_error(path, problem) from None
+        raise data_error(
+            path, f"cannot be used: column {name!r} must be convertible to {default}, got {unit}"
+        ) from None

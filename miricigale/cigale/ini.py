@@ -43,8 +43,9 @@ def parse_ini(path):
     analysis = config.get("analysis_params", {})
     sections = config.get("sed_modules_params"), analysis
     if "sed_modules" not in config or not all(isinstance(part, dict) for part in sections):
-        problem = "is no configuration of CIGALE: no sed_modules, or no [sed_modules_params]"
-        raise data_error(path, problem)
+        raise data_error(
+            path, "is no configuration of CIGALE: no sed_modules, or no [sed_modules_params]"
+        )
     for section in (config, analysis):
         for key in [key for key, value in section.items() if value == ""]:
             del section[key]

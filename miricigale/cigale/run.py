@@ -167,8 +167,9 @@ class _RunBands:
             raise config_error(path, f"has no band that is known here, of {names}")
         for band in self.fitted.values():
             if band not in self.columns:
-                text = f"has {error_column(band)} among the bands, and not {band}"
-                raise config_error(path, text)
+                raise config_error(
+                    path, f"has {error_column(band)} among the bands, and not {band}"
+                )
 
     def fitted_columns(self):
         """List the columns of the catalog that belong to bands that are fitted: tuple of str."""

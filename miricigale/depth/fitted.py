@@ -147,8 +147,7 @@ def fitted_noise(
     step = n_frames * scalar(frame_time, u.s, "frame_time")
     n_groups = int(seconds / n_integrations / step * (1 + 1e-9))
     group = "frames" if n_frames == 1 else "groups"
-    wanted = f"at least two {group} of {step} s in each integration"
-    check_that(n_groups >= 2, "time", wanted, time)
+    check_that(n_groups >= 2, "time", f"at least two {group} of {step} s in each integration", time)
     factor = excess_factor(excess)
     share = _share(filter, psf, size)
     boxes = ()

@@ -403,11 +403,12 @@ class Detector(Interactive):
         for effect in self.effects:
             pink = isinstance(effect, ReadNoise) and effect.pink > 0
             if pink or isinstance(effect, (BrighterFatter, ResetDecay)) or place_of(effect) is None:
-                wanted = (
+                raise argument_error(
+                    "effects",
                     "the package's own, without 1/f noise, brighter-fatter effect and decay after resets, "
-                    "to be collected without groups"
+                    "to be collected without groups",
+                    repr(effect),
                 )
-                raise argument_error("effects", wanted, repr(effect))
         seed = check_seed(seed)
         task = self._task(image, exposure, seed, previous)
         wanted = "one of groups that are single frames, to be collected without them"
@@ -473,8 +474,9 @@ class Detector(Interactive):
         effects = self._acting(included)
         previous = checked_previous(previous, exposure)
         if previous and not any(isinstance(e, Persistence) for e in self.effects):
-            wanted = "given to a detector whose effects hold Persistence"
-            raise argument_error("previous", wanted, "one without it")
+            raise argument_error(
+                "previous", "given to a detector whose effects hold Persistence", "one without it"
+            )
         fraction = self._check_sky(light, exposure)
         meta = provenance(
             seed=seed,

@@ -151,6 +151,7 @@ def checked_previous(previous, exposure):
     for latent in previous:
         check_that(isinstance(latent, Latent), "previous", "a Latent or several", repr(latent))
         if latent.subarray != exposure.subarray or latent.rate.shape != exposure.shape:
-            wanted = f"of {exposure.subarray}, {exposure.shape} pixels"
-            raise argument_error("previous", wanted, repr(latent))
+            raise argument_error(
+                "previous", f"of {exposure.subarray}, {exposure.shape} pixels", repr(latent)
+            )
     return previous

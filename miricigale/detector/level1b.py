@@ -91,8 +91,9 @@ def keywords(exposure):
 
 def write(path, ramp, *, start=None, filename=None, overwrite=False):
     """Write a level-1b file: see `~miricigale.detector.Ramp.write`."""
-    wanted = "counts (uint16) to be written"
-    check_that(ramp.data.dtype == np.uint16, "data", wanted, ramp.data.dtype)
+    check_that(
+        ramp.data.dtype == np.uint16, "data", "counts (uint16) to be written", ramp.data.dtype
+    )
     if jwst_product(path) not in (None, "uncal"):
         wanted = "a name that is not of another product of JWST: ramps are x_uncal.fits"
         raise argument_error("path", wanted, repr(os.fspath(path)))

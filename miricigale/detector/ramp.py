@@ -109,8 +109,9 @@ class Ramp(Interactive, NDData):
         data = np.asarray(getattr(data, "unmasked", data))
         shape = (exposure.n_integrations, exposure.n_groups) + exposure.shape
         check_that(data.shape == shape, "data", f"of the exposure's shape {shape}", data.shape)
-        wanted = "of dtype uint16 or float32"
-        check_that(data.dtype in (np.uint16, np.float32), "data", wanted, data.dtype)
+        check_that(
+            data.dtype in (np.uint16, np.float32), "data", "of dtype uint16 or float32", data.dtype
+        )
         if pixel_dq is None:
             pixel_dq = np.zeros(shape[2:], np.uint32)
         pixel_dq = _flags(pixel_dq, "pixel_dq", shape[2:], np.uint32)

@@ -103,8 +103,9 @@ def _read(path, hdus):
 def _check_unit(path, head):
     """Refuse a ramp that states another unit than counts."""
     unit = str(head.get("BUNIT", "") or "").strip()
-    problem = f"must hold a ramp in DN, got the unit {unit!r} in SCI"
-    check_data(unit.lower() in _COUNTS, path, problem)
+    check_data(
+        unit.lower() in _COUNTS, path, f"must hold a ramp in DN, got the unit {unit!r} in SCI"
+    )
 
 
 def _ramp_shape(path, head):

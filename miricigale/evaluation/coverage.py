@@ -55,9 +55,10 @@ def posterior_ranks(true, values, levels, *, seed=None):
         values = np.broadcast_to(floats(values), shape)
         levels = np.broadcast_to(floats(levels), shape)
     except ValueError:
-        got = f"{np.shape(values)}, {np.shape(levels)} and {true.shape}"
         raise argument_error(
-            "values", "of one shape with 'levels', for each of 'true'", got
+            "values",
+            "of one shape with 'levels', for each of 'true'",
+            f"{np.shape(values)}, {np.shape(levels)} and {true.shape}",
         ) from None
     if true.ndim != 1 or shape[0] != true.size or shape[1] < 2:
         raise argument_error("values", f"of shape (k,) or ({true.size}, k)", shape)

@@ -107,8 +107,7 @@ class CatalogMap:
     def __post_init__(self):
         for argument in ("columns", "units", "error_factors"):
             names = getattr(self, argument) or {}
-            wanted = "a dict by our names of columns"
-            check_type(names, argument, Mapping, wanted)
+            check_type(names, argument, Mapping, "a dict by our names of columns")
             for name in names:
                 if "." in str(name) and not is_band(name):
                     band = str(name).removesuffix(error_column(""))
@@ -233,8 +232,9 @@ class CatalogMap:
         if self.survey is not None:
             columns, lost = SURVEYS[self.survey].columns(colnames)
             if not any(map(is_band, {**columns, **self.columns})):
-                wanted = f"a table with columns of {self.survey!r}"
-                raise argument_error(argument, wanted, f"columns {colnames}")
+                raise argument_error(
+                    argument, f"a table with columns of {self.survey!r}", f"columns {colnames}"
+                )
         mapped = set(self.columns.values())
         if "id" not in {**columns, **self.columns}:
             theirs = id_column([name for name in colnames if name not in mapped], argument)
@@ -360,8 +360,9 @@ class CatalogMap:
                 say = "AB magnitudes are units={'flux': 'ABmag'}"
             elif unit is not None:
                 say = "say another, such as units={'flux': 'uJy'}, if it is wrong"
-            got = f"{unit or 'no unit'}: {say}"
-            raise units_error(argument, f"convertible to {FNU}", got, column=name)
+            raise units_error(
+                argument, f"convertible to {FNU}", f"{unit or 'no unit'}: {say}", column=name
+            )
         values = _column_floats(table[name], name, argument)
         errors = None
         if error in table.colnames:
@@ -412,8 +413,9 @@ class CatalogMap:
 def _column_floats(column, name, argument):
     """Numbers of a column that has one in each row (`miricigale.utils.missing_values.plain_floats`)."""
     shape = np.shape(column)
-    wanted = f"a table with one number in a row of {name!r}"
-    check_that(len(shape) == 1, argument, wanted, f"shape {shape}")
+    check_that(
+        len(shape) == 1, argument, f"a table with one number in a row of {name!r}", f"shape {shape}"
+    )
     return plain_floats(column, name, argument)
 
 
@@ -484,8 +486,9 @@ def _angles(column, unit, name, argument):
     try:
         return u.Quantity(Angle(np.asarray(column).astype(str), unit).to(u.deg))
     except (ValueError, u.UnitsError) as err:
-        wanted = f"a table with angles in {name!r}"
-        raise argument_error(argument, wanted, repr(str(column[0]))) from err
+        raise argument_error(
+            argument, f"a table with angles in {name!r}", repr(str(column[0]))
+        ) from err
 
 
 def _unit(unit, name):

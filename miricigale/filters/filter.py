@@ -108,8 +108,9 @@ class Filter(Frozen, WithTable):
         if wave.size < 2 or wave.shape != throughput.shape:
             shapes = f"{wave.shape} and {throughput.shape}"
             raise argument_error("throughput", "as many values as 'wave', two or more", shapes)
-        good = wave[0] > 0 and is_ascending(wave)
-        check_that(good, "wave", "positive and strictly ascending", wave)
+        check_that(
+            wave[0] > 0 and is_ascending(wave), "wave", "positive and strictly ascending", wave
+        )
         if np.any(throughput < 0) or not np.any(throughput > 0):
             raise argument_error("throughput", "not negative, and somewhere positive", throughput)
         wave, throughput = _core.padded(wave, throughput)

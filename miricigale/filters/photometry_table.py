@@ -302,8 +302,9 @@ def _our_names(colnames, bands, argument):
     for name in columns:
         namesakes = [label for label in colnames if label.lower() == name.lower()]
         if name != "id":
-            wanted = f"a table with one column for {name!r}"
-            check_that(len(namesakes) == 1, argument, wanted, namesakes)
+            check_that(
+                len(namesakes) == 1, argument, f"a table with one column for {name!r}", namesakes
+            )
     unmatched = [name for name in colnames if name not in columns and name != ids]
     logarithmic = [name for name in unmatched if _MAGNITUDE.match(name_and_unit(name)[0])]
     linear = [name for name in unmatched if name not in logarithmic]

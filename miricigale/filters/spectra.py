@@ -17,8 +17,9 @@ def check_wave(wave):
         wave = to_array(wave, WAVE, "wave")
     else:
         wave = floats(wave)
-    wanted = "two or more strictly ascending wavelengths"
-    check_that(is_ascending(wave, min_size=2), "wave", wanted, wave)
+    check_that(
+        is_ascending(wave, min_size=2), "wave", "two or more strictly ascending wavelengths", wave
+    )
     return wave
 
 

@@ -27,8 +27,7 @@ def chosen_settings(engine, settings):
     if engine == "grid":
         kind = GridSettings
     settings = settings or kind()
-    wanted = f"{kind.__name__} with engine={engine!r}"
-    check_type(settings, "settings", kind, wanted)
+    check_type(settings, "settings", kind, f"{kind.__name__} with engine={engine!r}")
     return settings
 
 

@@ -304,8 +304,9 @@ class ImageField:
         """The PSF of the image, `~miricigale.psf.InstrumentPSF`."""
         psf = image_psf(self.file)
         if psf is None:
-            wanted = f"given, for there is no model PSF for {self.file.path}"
-            raise argument_error("psf", wanted, None)
+            raise argument_error(
+                "psf", f"given, for there is no model PSF for {self.file.path}", None
+            )
         return psf
 
     @functools.cached_property

@@ -204,8 +204,9 @@ def read_sources(catalog, band, prior_band, wcs):
     if "profile" in table.colnames:
         profile = np.asarray(table["profile"]).astype(str)
         unknown = sorted(set(profile.tolist()) - {"point", "sersic"})
-        wanted = "a table with 'point' and 'sersic' in 'profile'"
-        check_that(not unknown, "catalog", wanted, unknown)
+        check_that(
+            not unknown, "catalog", "a table with 'point' and 'sersic' in 'profile'", unknown
+        )
         extended = profile == "sersic"
     _check_shapes(shapes, extended)
     rows["profile"] = np.where(extended, "sersic", "point")

@@ -134,8 +134,7 @@ def dither_offsets(pattern, n=None, *, start=0):
     else:
         last = start + n
     if offsets.shape[1] != 2 or len(offsets) < last or last <= start:
-        wanted = f"offsets of shape ({last}, 2)"
-        raise argument_error("pattern", wanted, f"shape {offsets.shape}")
+        raise argument_error("pattern", f"offsets of shape ({last}, 2)", f"shape {offsets.shape}")
     return offsets[start:last] * ANGLE
 
 

@@ -79,8 +79,9 @@ def header_wcs(header, hdus=None, *, where):
             is_celestial = wcs.has_celestial
         except WcsError as err:
             reason = str(err).strip().splitlines()[-1]
-            problem = f"has world coordinates that cannot be used: {reason}"
-            raise data_error(where, problem) from None
+            raise data_error(
+                where, f"has world coordinates that cannot be used: {reason}"
+            ) from None
     if not is_celestial:
         return None
     if header.get("NAXIS", 2) > 2:

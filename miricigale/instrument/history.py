@@ -72,8 +72,9 @@ class ExposureHistory:
         for name in ("day", "gain"):
             value = getattr(self, name)
             if value is not None and not isinstance(value, numbers.Real):
-                wanted = f"one whose meta[{name!r}] is a number"
-                raise argument_error("exposure", wanted, repr(value))
+                raise argument_error(
+                    "exposure", f"one whose meta[{name!r}] is a number", repr(value)
+                )
 
     replace = dataclasses.replace
 

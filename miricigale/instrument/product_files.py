@@ -86,8 +86,9 @@ def check_product(path, image):
     product = jwst_product(path)
     name = repr(os.fspath(path))
     if product in _RAMPS:
-        wanted = "a name of images; miricigale.detector.Ramp.write(path) writes ramps"
-        raise argument_error("path", wanted, name)
+        raise argument_error(
+            "path", "a name of images; miricigale.detector.Ramp.write(path) writes ramps", name
+        )
     unit = with_adu(image.unit)
     if product in _RATES and not unit.is_equivalent(RATE):
         raise argument_error(
@@ -98,10 +99,11 @@ def check_product(path, image):
         raise argument_error("path", wanted, f"{name} for {image.unit}")
     n_axes = 3 if str(product).endswith("ints") else 2
     if product is not None and image.data.ndim != n_axes:
-        wanted = (
-            f"of {n_axes} axes to be written as {name} (integrations: rateints, calints, crfints)"
+        raise argument_error(
+            "image",
+            f"of {n_axes} axes to be written as {name} (integrations: rateints, calints, crfints)",
+            f"the shape {image.data.shape}",
         )
-        raise argument_error("image", wanted, f"the shape {image.data.shape}")
     band = ImageFacts.of(image).band
     bands = [filter_name.removeprefix("miri.") for filter_name in imager_filters()]
     if product is not None and band not in bands:
@@ -233,8 +235,9 @@ def _flags(image, further):
     """Flags of an image and further ones, with masked pixels as not to be used."""
     shape = image.data.shape
     further = np.asarray(further, np.int64)
-    wanted = f"of {shape} pixels"
-    check_that(further.shape in ((), shape), "planes", wanted, f"DQ of {further.shape}")
+    check_that(
+        further.shape in ((), shape), "planes", f"of {shape} pixels", f"DQ of {further.shape}"
+    )
     flags = np.zeros(shape, np.int64) | further
     if image.flags is not None:
         flags = flags | np.asarray(image.flags, np.int64)
@@ -247,8 +250,9 @@ def _plane_hdu(name, plane, shape):
     """Extension of a further plane."""
     plane = np.asarray(plane)
     if name not in PLANES or plane.shape[-2:] != shape[-2:]:
-        wanted = f"of {shape} pixels, named {', '.join(PLANES)}"
-        raise argument_error("planes", wanted, f"{name} of {plane.shape}")
+        raise argument_error(
+            "planes", f"of {shape} pixels, named {', '.join(PLANES)}", f"{name} of {plane.shape}"
+        )
     if name != "CON":
         return fits.ImageHDU(plane.astype(np.float32), name=name)
     plane = plane.astype(np.int32)

@@ -106,9 +106,11 @@ def grid_angle(wcs, shape):
     angle = middle.position_angle(up).to(u.deg)
     turn = (angle - middle.position_angle(right)).to_value(u.deg) % 360
     if turn > 180:
-        wanted = "of an image of the sky (east left of north)"
-        got = "a mirrored one: flip the pixels and the coordinates along one axis"
-        raise argument_error("wcs", wanted, got)
+        raise argument_error(
+            "wcs",
+            "of an image of the sky (east left of north)",
+            "a mirrored one: flip the pixels and the coordinates along one axis",
+        )
     return angle
 
 

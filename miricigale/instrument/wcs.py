@@ -374,8 +374,9 @@ def mosaic_wcs(exposures, pixel_scale):
     ra = []
     dec = []
     for wcs in wcss:
-        wanted = "WCSs with a pixel_shape"
-        check_that(wcs.pixel_shape is not None, "exposures", wanted, "one without")
+        check_that(
+            wcs.pixel_shape is not None, "exposures", "WCSs with a pixel_shape", "one without"
+        )
         nx, ny = wcs.pixel_shape
         # distorted edges bulge between the corners
         tx = np.linspace(-0.5, nx - 0.5, 17)

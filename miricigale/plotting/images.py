@@ -439,8 +439,9 @@ def plot_segmentation(image, labels, *, ax=None, pixel_scale=1.0, center=None, *
     """
     image = np.asarray(image)
     labels = np.asarray(labels)
-    wanted = f"of the image's shape {image.shape}"
-    check_that(image.shape == labels.shape, "labels", wanted, labels.shape)
+    check_that(
+        image.shape == labels.shape, "labels", f"of the image's shape {image.shape}", labels.shape
+    )
     ax = plot_image(image, ax=ax, pixel_scale=pixel_scale, center=center, **kwargs)
     x_min, _, bottom, _ = _extent(image.shape, pixel_scale, center)
     y, x = (np.arange(n + 1) * pixel_scale for n in image.shape)

@@ -178,8 +178,9 @@ class PSFFile:
             return self.turn * u.deg
         angle = scalar(user_angle, u.deg, argument)
         if self.turn is not None and abs((angle - self.turn + 180) % 360 - 180) > 0.5:
-            wanted = f"{self.turn:.4g} deg, as the header of {self.path} says"
-            raise argument_error(argument, wanted, user_angle)
+            raise argument_error(
+                argument, f"{self.turn:.4g} deg, as the header of {self.path} says", user_angle
+            )
         return angle * u.deg
 
     def make_psf(self, **options):
@@ -353,9 +354,10 @@ def _check_square(matrix):
     """Refuse coordinates (arcsec) with pixels that are longer than wide."""
     width, height = np.hypot(matrix[0], matrix[1])
     if abs(width / height - 1) > _SAME_SCALE:
-        got = f"{width:.4g} by {height:.4g} arcsec"
         raise argument_error(
-            "path", "a file with square pixels, to which others are resampled", got
+            "path",
+            "a file with square pixels, to which others are resampled",
+            f"{width:.4g} by {height:.4g} arcsec",
         )
 
 
@@ -469,8 +471,9 @@ def _stated_oversampling(path, header):
     """Read OVERSAMP of a header, 1 without it; a `DataError` unless it is a whole number."""
     value = header.get("OVERSAMP", 1)
     is_whole = isinstance(value, (int, float)) and value >= 1 and value == int(value)
-    problem = f"has an OVERSAMP of {value!r}, which is no whole number of 1 or more"
-    check_data(is_whole, path, problem)
+    check_data(
+        is_whole, path, f"has an OVERSAMP of {value!r}, which is no whole number of 1 or more"
+    )
     return int(value)
 
 

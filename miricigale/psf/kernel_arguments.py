@@ -57,8 +57,9 @@ def as_kernel(kernel, argument="kernel"):
         # kernels of astropy hold their array
         array = np.asarray(getattr(array, "array", array))
         return MatchingKernel.from_array(array, pixel_scale=scale)
-    wanted = (
+    raise argument_error(
+        argument,
         "a MatchingKernel, a KernelField, a file, or an array with its pixel scale, such as "
-        "(array, 0.03 * u.arcsec) (or give 'psf')"
+        "(array, 0.03 * u.arcsec) (or give 'psf')",
+        type(kernel).__name__,
     )
-    raise argument_error(argument, wanted, type(kernel).__name__)

@@ -74,8 +74,9 @@ class KernelField:
         if any(kernel.source is None or kernel.target is None for kernel in kernels):
             raise argument_error("kernels", "with their source and target", "one without")
         if not isinstance(self.sky, SkyCoord) or self.sky.shape != (len(kernels),):
-            wanted = f"a SkyCoord of shape ({len(kernels)},), a place for each kernel"
-            raise argument_error("sky", wanted, self.sky)
+            raise argument_error(
+                "sky", f"a SkyCoord of shape ({len(kernels)},), a place for each kernel", self.sky
+            )
         place = plain_positions(self.sky).spherical
         bad = int(np.count_nonzero(~(np.isfinite(place.lon) & np.isfinite(place.lat))))
         check_that(not bad, "sky", "finite", f"{bad} positions that are masked or NaN")

@@ -81,8 +81,9 @@ def _read_kernel(path, *, ext=None, plane=None, pixel_scale=None, source=None):
         cell = kernel_file.cell
         _check_pixel(path, cell, pixel_scale)
         if pixel_scale is None and cell is None:
-            wanted = f"given: the header of {path} does not state the pixel"
-            raise argument_error("pixel_scale", wanted, None)
+            raise argument_error(
+                "pixel_scale", f"given: the header of {path} does not state the pixel", None
+            )
         if pixel_scale is None:
             pixel_scale = cell * ANGLE
         # kernels are not moved to their cores: the images that they match may be shifted

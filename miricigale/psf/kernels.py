@@ -203,8 +203,9 @@ class MatchingKernel(Interactive):
         lo = named_psf(lo)
         if pixel_scale is None:
             pixel_scale = getattr(hi, "pixel_scale", None)
-        wanted = "given where 'hi' does not state it"
-        check_that(pixel_scale is not None, "pixel_scale", wanted, "None")
+        check_that(
+            pixel_scale is not None, "pixel_scale", "given where 'hi' does not state it", "None"
+        )
         scale = scalar(pixel_scale, ANGLE, "pixel_scale")
         check_choice(resampling, "resampling", ("drizzle", None))
         source, target, mended = psf_pair(
@@ -242,11 +243,12 @@ class MatchingKernel(Interactive):
         """
         psf = instrument_psf(named_psf(psf))
         if psf.frame == "detector" and angle is None and psf.pa_aper is None:
-            wanted = (
+            raise argument_error(
+                "angle",
                 "given to 'MatchingKernel.identity' for a PSF in the detector's frame, or the PSF that of the "
-                "image: psf_mosaic(miri_psf('F770W'), pixel_scale, exposure.pa_aper)"
+                "image: psf_mosaic(miri_psf('F770W'), pixel_scale, exposure.pa_aper)",
+                "None",
             )
-            raise argument_error("angle", wanted, "None")
         source, target, mended = psf_pair(psf, psf, psf.cell, angles=(angle, angle))
         array = np.zeros_like(source)
         array[tuple(n // 2 for n in array.shape)] = mended["energy"]

@@ -28,8 +28,9 @@ def _degrees(angle, argument):
 def _turn_by(psf, angle, grid_angle, argument):
     """Counter-clockwise turn in deg that brings the PSF to the grid."""
     if psf.frame == "sky":
-        wanted = "left out for a PSF that stands on the sky already"
-        check_that(angle is None, argument, wanted, angle)
+        check_that(
+            angle is None, argument, "left out for a PSF that stands on the sky already", angle
+        )
         start = psf.angle.value
     else:
         start = _degrees(angle, argument)

@@ -94,8 +94,7 @@ def gaussian_gain(source, target, names="hi, lo"):
     # one alone misleads: a blurred core has no wings, a pattern of resampling may be narrow
     if cores[0] > 1.05 * cores[1] and halves[0] > 1.1 * halves[1]:
         wanted = "the sharp and the wide PSF, in this order"
-        got = f"FWHM of {halves[0]:.4g} and {halves[1]:.4g} pixels"
-        raise argument_error(names, wanted, got)
+        raise argument_error(names, wanted, f"FWHM of {halves[0]:.4g} and {halves[1]:.4g} pixels")
     return 1 / math.sqrt(max(4 * math.pi * (cores[1] ** 2 - cores[0] ** 2), 1.0))
 
 

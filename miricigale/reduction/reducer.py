@@ -270,8 +270,9 @@ class Reducer(Interactive):
         rate = as_exposure(rate)
         facts = ImageFacts.of(rate)
         for key in ("filter", "subarray"):
-            wanted = f"an image whose meta has {key!r}"
-            check_that(getattr(facts, key) is not None, "rate", wanted, "none")
+            check_that(
+                getattr(facts, key) is not None, "rate", f"an image whose meta has {key!r}", "none"
+            )
         if ExposureHistory.of(rate).done("photom"):
             if not (before := rate.meta.get("photmjsr")):
                 raise argument_error("rate", "slopes, or an image with its PHOTMJSR", "neither")
@@ -392,14 +393,12 @@ class Reducer(Interactive):
         exposure = as_exposure(exposure)
         if isinstance(exposure, (Ramp, Charge)):
             exposure = self.fit_ramp(exposure)
-        wanted = "a Ramp, a Charge, CCDData or a path"
-        check_type(exposure, "exposure", CCDData, wanted)
+        check_type(exposure, "exposure", CCDData, "a Ramp, a Charge, CCDData or a path")
         rate = None
         if exposure.unit.is_equivalent(RATE):
             rate = exposure
         if rate is None and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
-            wanted = f"in {RATE} or {SURFACE_BRIGHTNESS}"
-            raise argument_error("exposure", wanted, exposure.unit)
+            raise argument_error("exposure", f"in {RATE} or {SURFACE_BRIGHTNESS}", exposure.unit)
         files = self.references
         history = ExposureHistory.of(exposure)
         has_photom = isinstance(files, ReferenceFiles) and files.photom is not None

@@ -84,15 +84,17 @@ class Painter:
             data = data[np.newaxis]
             origin = self.psf.origin
         else:
-            wanted = "a photutils ImagePSF or GriddedPSFModel"
-            raise argument_error("psf", wanted, type(self.psf).__name__)
+            raise argument_error(
+                "psf", "a photutils ImagePSF or GriddedPSFModel", type(self.psf).__name__
+            )
         oversampling = np.broadcast_to(self.psf.oversampling, 2)
         if oversampling[0] != oversampling[1]:
             raise argument_error("psf", "oversampled alike in x and y", oversampling.tolist())
         origin = np.asarray(origin, dtype=float)
         if np.any(np.abs(origin - np.round(origin)) > 1e-6):
-            got = f"origin {origin.tolist()}"
-            raise argument_error("psf", "centered on a node (odd shape)", got)
+            raise argument_error(
+                "psf", "centered on a node (odd shape)", f"origin {origin.tolist()}"
+            )
         check_that(0 < self.enclosed < 1, "enclosed", "between 0 and 1", self.enclosed)
         check_that(self.max_radius > 0, "max_radius", "positive", self.max_radius)
         thread_count(self.n_threads)

@@ -237,8 +237,9 @@ class Scene(WithTable):
         if lacking := sorted(set(ids) - set(cutouts), key=str):
             raise argument_error("cutouts", "one for each profile 'cutout'", f"none for {lacking}")
         if foreign := sorted(set(cutouts) - set(ids), key=str):
-            wanted = "for ids whose profile is 'cutout'"
-            raise argument_error("cutouts", wanted, f"some for {foreign}")
+            raise argument_error(
+                "cutouts", "for ids whose profile is 'cutout'", f"some for {foreign}"
+            )
         return {ids[key]: value for key, value in cutouts.items()}
 
     def _split_flux(self, agn):
@@ -319,8 +320,9 @@ class Scene(WithTable):
             wanted = self._filter.lower()
             have = psf.filter.lower()
             if have not in (wanted, wanted.rpartition(".")[2]):
-                got = f"one of {psf.filter}"
-                raise argument_error("psf", f"one of the filter {self._filter}", got)
+                raise argument_error(
+                    "psf", f"one of the filter {self._filter}", f"one of {psf.filter}"
+                )
 
     @functools.cached_property
     def _painted(self):

@@ -103,8 +103,9 @@ def register(cls):
     Gray(tau=1)
     """
     check_that(cls.name, "name", "a name", f"{cls.name!r} of {cls.__name__}")
-    got = f"{cls.role!r} of {cls.__name__}"
-    check_that(cls.role in ROLES, "role", f"one of {', '.join(ROLES)}", got)
+    check_that(
+        cls.role in ROLES, "role", f"one of {', '.join(ROLES)}", f"{cls.role!r} of {cls.__name__}"
+    )
     is_redefined = False
     if cls.name in COMPONENTS:
         old = COMPONENTS.get(cls.name)
@@ -175,8 +176,9 @@ class Component:
         self.__dict__.update({name: values[0] for name, values in options.items()})
         for name, value in defaults.items():
             if name in options:
-                wanted = f"one of {', '.join(options[name])}"
-                check_that(value in options[name], name, wanted, repr(value))
+                check_that(
+                    value in options[name], name, f"one of {', '.join(options[name])}", repr(value)
+                )
             elif name in parameters:
                 value = parameters[name].check(value)
             else:

@@ -396,8 +396,9 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
     check_that(_KEY not in photometry.meta, "photometry", "a table not corrected yet", got)
     values, scalar = _color_excess(ebv)
     got = f"{values.size} for {len(photometry)} rows"
-    good = scalar or values.size == len(photometry)
-    check_that(good, "ebv", "one number or one for each row", got)
+    check_that(
+        scalar or values.size == len(photometry), "ebv", "one number or one for each row", got
+    )
     table = band_extinction(bands, values, law=law, r_v=r_v, sed=sed, beyond=beyond)
     out = photometry.copy()
     for name in bands.names:

@@ -204,13 +204,15 @@ class ModelGrid(Frozen):
         f = self.frac_agn
         n_alike = self.agn_multiplicity
         check_that(is_ascending(z) and z[0] >= 0, "redshift", "ascending and >= 0", z)
-        good = is_ascending(f) and f[0] >= 0 and f[-1] < 1
-        check_that(good, "frac_agn", "ascending values in [0, 1)", f)
+        check_that(
+            is_ascending(f) and f[0] >= 0 and f[-1] < 1, "frac_agn", "ascending values in [0, 1)", f
+        )
         check_that(n_a or f.tolist() == [0.0], "frac_agn", "[0] for a grid without AGN", f)
         check_that(np.all(n_alike >= 1), "agn_multiplicity", ">= 1", n_alike)
         for name in ("galaxy", "agn", "dust_luminosity"):
-            good = np.all(np.isfinite(getattr(self, name)))
-            check_that(good, name, "finite", "NaN or infinite values")
+            check_that(
+                np.all(np.isfinite(getattr(self, name))), name, "finite", "NaN or infinite values"
+            )
 
     @property
     def n_galaxies(self):

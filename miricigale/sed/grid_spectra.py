@@ -66,8 +66,9 @@ def band_names(grid, filters):
     """
     if filters is None:
         return list(grid.filters), {}
-    wanted = "a list of names or a FilterSet"
-    check_that(not isinstance(filters, str), "filters", wanted, repr(filters))
+    check_that(
+        not isinstance(filters, str), "filters", "a list of names or a FilterSet", repr(filters)
+    )
     names = []
     curves = {}
     for band in filters:

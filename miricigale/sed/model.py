@@ -483,8 +483,9 @@ class SEDModel(Interactive):
         5.79 solMass / yr
         """
         if values is not None:
-            wanted = "a dict of parameters by name"
-            check_that(isinstance(values, Mapping), "values", wanted, repr(values))
+            check_that(
+                isinstance(values, Mapping), "values", "a dict of parameters by name", repr(values)
+            )
             twice = sorted(set(values) & set(parameters))
             check_that(not twice, "values", "without those given by keyword", twice)
             parameters = dict(values) | parameters

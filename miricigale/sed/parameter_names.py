@@ -179,8 +179,9 @@ def named_first(values, filters, named, argument):
     if filters is None:
         filters, values = values, None
     # an option that is spelled wrong stands among the values too
-    wanted = f"left out beside values by name ({', '.join(named)})"
-    check_that(values is None, argument, wanted, "both")
+    check_that(
+        values is None, argument, f"left out beside values by name ({', '.join(named)})", "both"
+    )
     return named, filters
 
 

@@ -67,8 +67,9 @@ def seen_agn(chain, parts):
 
 def _columns(model, table):
     """Values of every parameter for every row, in the declared units."""
-    wanted = "a table with a column 'redshift'"
-    check_that("redshift" in table.colnames, "table", wanted, table.colnames)
+    check_that(
+        "redshift" in table.colnames, "table", "a table with a column 'redshift'", table.colnames
+    )
     out = {}
     for name, par in model.parameters.items():
         if name in table.colnames:

@@ -305,11 +305,11 @@ def _checked_scalar(section, key, value, hint, limits):
     if hint is str:
         good = not limits.choices or value in limits.choices
         require(good, section, key, f"must be one of {list(limits.choices)}", shown)
-        good = not limits.folder or is_file_name(value)
-        require(good, section, key, _FOLDER_NAME, shown)
+        require(not limits.folder or is_file_name(value), section, key, _FOLDER_NAME, shown)
         return value
-    good = hint is not float or math.isfinite(value)
-    require(good, section, key, "must be a finite number", shown)
+    require(
+        hint is not float or math.isfinite(value), section, key, "must be a finite number", shown
+    )
     wanted = f"at least {limits.low}"
     if limits.high < math.inf:
         wanted = f"between {limits.low} and {limits.high}"

@@ -177,8 +177,9 @@ class SedSection(Section):
 
     def __post_init__(self):
         good = len(self.alpha) == 2 and 0 < self.alpha[0] <= self.alpha[1] <= 4
-        wanted = "must be two numbers in order, above 0 to 4"
-        require(good, "sed", "alpha", wanted, list(self.alpha))
+        require(
+            good, "sed", "alpha", "must be two numbers in order, above 0 to 4", list(self.alpha)
+        )
 
 
 class ExposureSection(Section):

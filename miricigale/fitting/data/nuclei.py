@@ -70,11 +70,10 @@ class NucleusColumns:
         for column, band in nucleus_columns(colnames).items():
             if band not in bands:
                 continue
-            wanted = f"a table with one flux of nuclei in {band!r}"
             check_that(
                 band not in column_of_band,
                 "photometry",
-                wanted,
+                f"a table with one flux of nuclei in {band!r}",
                 f"{column_of_band.get(band)!r} and {column!r}",
             )
             column_of_band[band] = column
@@ -269,7 +268,8 @@ def _numbers(table, name):
     try:
         numbers = np.array(getattr(column, "unmasked", column), float)
     except (TypeError, ValueError):
-        wanted = f"a table with numbers in column {name!r}"
-        check_that(False, "photometry", wanted, str(column.dtype))
+        check_that(
+            False, "photometry", f"a table with numbers in column {name!r}", str(column.dtype)
+        )
     numbers[mask] = np.nan
     return numbers * unit.to(u.dimensionless_unscaled)

@@ -53,8 +53,7 @@ class TemplateError:
     def __post_init__(self):
         wave = to_array(self.wave, WAVE, "wave", ndim=1)
         error = floats(self.error)
-        good = is_ascending(wave) and wave[0] > 0
-        check_that(good, "wave", "ascending values above 0", wave)
+        check_that(is_ascending(wave) and wave[0] > 0, "wave", "ascending values above 0", wave)
         good = error.shape == wave.shape and are_not_negative(error)
         check_that(good, "error", f"{wave.size} finite values, 0 or more", error)
         self.__dict__.update(wave=frozen_array(wave) * WAVE, error=frozen_array(error))

@@ -291,8 +291,7 @@ def _span(prior, argument):
     wanted = "(low, high) or (low, high, 'log'), two numbers in order (with 'log' above 0)"
     is_span = is_number(low) and is_number(high) and low < high
     is_log = scale == ["log"]
-    good = is_span and (not scale or (is_log and low > 0))
-    check_that(good, argument, wanted, prior)
+    check_that(is_span and (not scale or (is_log and low > 0)), argument, wanted, prior)
     if is_log:
         return stats.loguniform(low, high)
     return stats.uniform(low, high - low)
@@ -443,10 +442,10 @@ def read_density(redshift_prior, n):
     nodes = _unmasked(redshift_prior[0], "redshift_prior[0]")
     density = _unmasked(redshift_prior[1], "redshift_prior[1]")
     if nodes.ndim != 1 or nodes.size < 2 or density.shape not in (nodes.shape, (n, nodes.size)):
-        shapes = f"shapes {nodes.shape} and {density.shape}"
-        raise argument_error("redshift_prior", wanted, shapes)
-    good = is_ascending(nodes) and nodes[0] >= 0
-    check_that(good, "redshift_prior[0]", ">= 0 and ascending", nodes)
+        raise argument_error("redshift_prior", wanted, f"shapes {nodes.shape} and {density.shape}")
+    check_that(
+        is_ascending(nodes) and nodes[0] >= 0, "redshift_prior[0]", ">= 0 and ascending", nodes
+    )
     if np.any(density < 0) or np.any(np.isinf(density)):
         raise argument_error("redshift_prior[1]", "finite and not negative", "others")
     return nodes, density

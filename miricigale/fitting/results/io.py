@@ -211,12 +211,12 @@ class FitFolder(RecordFolder):
         """Check facts and records of the manifest, whose facts are complete; none before the fit is known."""
         facts, parts = super().parse(values)
         if facts.get("format", FORMAT) != FORMAT:
-            problem = (
+            raise data_error(
+                self.folder,
                 f"holds results of fit_file in the layout {facts['format']!r} of another version of the package, "
                 f"and this one reads {FORMAT!r}: fit again in another folder, or read it with the version that "
-                "wrote it"
+                "wrote it",
             )
-            raise data_error(self.folder, problem)
         if facts or parts:
             facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
         return facts, parts

@@ -487,8 +487,7 @@ class FitResults(FitRows):
             msg = f"probability('redshift', 2) is that of redshifts above 2; got {type(name).__name__} as the name"
             raise TypeError(msg)
         unit = self.unit(name)
-        wanted = "given, or 'high'"
-        check_that(low is not None or high is not None, "low", wanted, "None")
+        check_that(low is not None or high is not None, "low", "given, or 'high'", "None")
         ends = [u.Quantity(end, unit).value for end in (low, high) if end is not None]
         check_that(ends == sorted(ends), "high", f"at least 'low', {low}", high)
         values, levels = self.cdf(name)

@@ -34,8 +34,7 @@ def models_and_bands(model, filters, axes):
         Bands.
     """
     if isinstance(model, (list, tuple, FilterSet)):
-        wanted = "left out where 'model' is a list of bands"
-        check_that(filters is None, "filters", wanted, filters)
+        check_that(filters is None, "filters", "left out where 'model' is a list of bands", filters)
         filters = model
         model = None
     if filters is not None and not isinstance(filters, (str, FilterSet)):
@@ -165,8 +164,9 @@ def chosen_calibration(calibration, grid, model_error, template_error=None, *, b
     if calibration is None or hasattr(calibration, "template_error"):
         return calibration
     if not isinstance(calibration, str) or calibration != DEFAULT:
-        wanted = f"a SurveyCalibration, {DEFAULT!r} or None"
-        raise argument_error("calibration", wanted, repr(calibration))
+        raise argument_error(
+            "calibration", f"a SurveyCalibration, {DEFAULT!r} or None", repr(calibration)
+        )
     return default_calibration(grid, model_error, template_error, bands=bands)
 
 

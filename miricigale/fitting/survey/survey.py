@@ -84,8 +84,9 @@ class SurveyCalibration:
     errors: dict = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        wanted = ("band", "zero_point", "error_factor", "error_part", "outlier")
-        require_columns(self.bands, wanted, "bands")
+        require_columns(
+            self.bands, ("band", "zero_point", "error_factor", "error_part", "outlier"), "bands"
+        )
 
     def __repr__(self):
         numbers = f"{len(self.bands)} bands, {len(self.priors)} priors"

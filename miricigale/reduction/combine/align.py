@@ -184,8 +184,9 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
     check_that(images, "images", "at least one image", "none")
     reach = positive(radius, ANGLE, "radius")
     groups = list(range(len(images)) if groups is None else groups)
-    wanted = f"one for each of {len(images)} images"
-    check_that(len(groups) == len(images), "groups", wanted, len(groups))
+    check_that(
+        len(groups) == len(images), "groups", f"one for each of {len(images)} images", len(groups)
+    )
     reference = None
     out = [None] * len(images)
     alignments = [None] * len(images)
@@ -228,8 +229,9 @@ def _positions(catalog, images):
     if not isinstance(catalog, SkyCoord) or catalog.isscalar:
         raise argument_error("catalog", "a SkyCoord of several positions", repr(catalog)[:60])
     unknown = int(np.count_nonzero(~np.isfinite(catalog.cartesian.norm())))
-    got = f"{unknown} of {len(catalog)} that are not"
-    check_that(not unknown, "catalog", "of finite positions", got)
+    check_that(
+        not unknown, "catalog", "of finite positions", f"{unknown} of {len(catalog)} that are not"
+    )
     epochs = [epoch_of(im) for im in images]
     days = [np.nan if epoch is None else epoch.utc.mjd for epoch in epochs]
     # of any without a time the mean is unknown

@@ -368,8 +368,9 @@ def _flags(hdus, shape, path):
         flags = read_dq(hdu)
     else:
         flags = np.asarray(hdu.data).astype(np.int64)
-    problem = f"must have {shape} pixels in DQ, as in SCI, got {flags.shape}"
-    check_data(flags.shape == shape, path, problem)
+    check_data(
+        flags.shape == shape, path, f"must have {shape} pixels in DQ, as in SCI, got {flags.shape}"
+    )
     return with_own_bits(flags, hdus)
 
 
@@ -423,8 +424,9 @@ def exposure_list(exposures):
             raise DataError(msg)
         return paths
     if isinstance(exposures, (str, os.PathLike)) and os.path.isdir(exposures):
-        wanted = f"files, such as {os.path.join(exposures, '*_uncal.fits')!r}"
-        raise argument_error("ramps", wanted, "a folder")
+        raise argument_error(
+            "ramps", f"files, such as {os.path.join(exposures, '*_uncal.fits')!r}", "a folder"
+        )
     is_single = isinstance(exposures, (str, os.PathLike, Ramp, Charge, CCDData)) or is_data_model(
         exposures
     )

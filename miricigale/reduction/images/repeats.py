@@ -96,8 +96,9 @@ class ExposureRecord:
             header["ORIGIN"] = ORIGIN
         stage = f"{np.ndim(data)} {getattr(exposure, 'unit', None)}"
         duplicate = self.add(name, np.asarray(data), header, stage)
-        wanted = "exposures that differ"
-        check_that(duplicate is None, "ramps", wanted, f"{name}, the same as {duplicate}")
+        check_that(
+            duplicate is None, "ramps", "exposures that differ", f"{name}, the same as {duplicate}"
+        )
 
 
 def _is_simulated(header):

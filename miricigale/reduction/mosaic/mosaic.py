@@ -160,9 +160,10 @@ def pixel_map(wcs_in, wcs_out, shape):
     try:
         pixels = wcs_out.all_world2pix(*world, 0)
     except NoConvergence:
-        wanted = "a WCS whose distortion can be inverted where the image lies"
         raise argument_error(
-            "wcs_out (the grid's wcs)", wanted, "one that diverges there"
+            "wcs_out (the grid's wcs)",
+            "a WCS whose distortion can be inverted where the image lies",
+            "one that diverges there",
         ) from None
     x, y = np.reshape(pixels, (2,) + grid_x.shape)
     if x.shape == (ny, nx):

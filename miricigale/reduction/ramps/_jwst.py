@@ -178,10 +178,11 @@ class _References:
         bias = self._maps.bias
         if np.any(np.asarray(bias) != 0):
             if coefficients.ndim != 1 or np.ndim(bias):
-                wanted = (
-                    "with one bias and one polynomial for all pixels, or no bias, for the pipeline"
+                raise argument_error(
+                    "references",
+                    "with one bias and one polynomial for all pixels, or no bias, for the pipeline",
+                    "maps of both",
                 )
-                raise argument_error("references", wanted, "maps of both")
             # the pipeline's polynomial is one of raw DN
             shift = Polynomial([-float(bias), 1.0])
             coefficients = (Polynomial(coefficients)(shift) + float(bias)).coef

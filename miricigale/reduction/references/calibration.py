@@ -63,8 +63,9 @@ def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
     if unit is None or not unit.is_equivalent(RATE):
         raise argument_error("rate", f"in {RATE}", f"unit {rate.unit}")
     inside = field_mask(subarray=subarray)
-    wanted = f"of shape {inside.shape} for {subarray!r}"
-    check_that(rate.shape == inside.shape, "rate", wanted, rate.shape)
+    check_that(
+        rate.shape == inside.shape, "rate", f"of shape {inside.shape} for {subarray!r}", rate.shape
+    )
     flat = np.broadcast_to(floats(flat).astype(np.float32), rate.shape)
     scale = np.float32(unit.to(RATE) * conversion) / flat
     out = with_data(

@@ -119,5 +119,6 @@ class ReferenceCache:
         for path in (folder / "miri" / name, folder / name):
             if path.is_file():
                 return path
-        problem = f"lacks the reference file {name}, which {self.context} chooses"
-        raise data_error(self.folder, problem)
+        raise data_error(
+            self.folder, f"lacks the reference file {name}, which {self.context} chooses"
+        )

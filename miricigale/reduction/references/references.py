@@ -271,8 +271,9 @@ class ReferenceFiles:
             if value is None or (value == "measured" and name in _MEASURED):
                 continue
             if isinstance(value, (str, os.PathLike)):
-                wanted = "the path of a file"
-                check_that(Path(value).is_file(), name, wanted, f"{value}: there is none")
+                check_that(
+                    Path(value).is_file(), name, "the path of a file", f"{value}: there is none"
+                )
                 object.__setattr__(self, name, Path(value))
                 continue
             number = isinstance(value, numbers.Real) and not isinstance(value, bool)

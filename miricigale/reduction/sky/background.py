@@ -362,11 +362,11 @@ def warn_of(background, mask, unit):
     level = np.median(background.level[good])
     error = np.median(background.error[good])
     share = 100 * background.source_mask[good].mean()
-    text = (
+    warn(
         f"the background of {level:.4g} cannot be trusted to better than {error:.2g} {unit} "
-        f"({share:.0f} % of the pixels are sources): {reasons}"
+        f"({share:.0f} % of the pixels are sources): {reasons}",
+        ReductionWarning,
     )
-    warn(text, ReductionWarning)
 
 
 def _sep_background(data, mask, box, filter_size, correlation):

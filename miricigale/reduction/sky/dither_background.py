@@ -107,8 +107,9 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
         images, single, masks, sources, levels, templates, strict=True
     ):
         finite = np.isfinite(template)
-        wanted = "ones that leave some sky to each other"
-        check_that(finite.any(), "images", wanted, "none in common")
+        check_that(
+            finite.any(), "images", "ones that leave some sky to each other", "none in common"
+        )
         boxes = sky_boxes(np.where(finite, template, 0), ~finite, _BOX)
         smooth = boxes.smooth(boxes.level, shape, filter_size=1)
         error = boxes.smooth(boxes.error, shape, filter_size=1)

@@ -168,8 +168,9 @@ def _metallicity(part, file):
         check_data(named is not None, file, f"states no metallicity: {wanted}")
         return named
     if named is not None and not np.isclose(named, metallicity, rtol=0.01):
-        problem = f"states Z = {metallicity:g}, but its name (m{match[1]}) means Z = {named:g}"
-        raise data_error(file, problem)
+        raise data_error(
+            file, f"states Z = {metallicity:g}, but its name (m{match[1]}) means Z = {named:g}"
+        )
     return metallicity
 
 

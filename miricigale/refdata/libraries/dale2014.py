@@ -158,8 +158,9 @@ def _read_stars(data, place):
     wave, light, _, _ = _numbers(data, place, 4, "wavelength in A and starlight in W/A").T
     wave = wave / 1e4
     if not is_ascending(wave) or wave[0] > 1.0 or wave[-1] < 5.0 or np.any(light < 0):
-        problem = "must hold starlight, not negative, at ascending wavelengths from 1 to 5 um"
-        raise data_error(place, problem)
+        raise data_error(
+            place, "must hold starlight, not negative, at ascending wavelengths from 1 to 5 um"
+        )
     return wave, light
 
 

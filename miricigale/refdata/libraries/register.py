@@ -202,8 +202,9 @@ def _read(reader, name, path):
         reason = err
         if isinstance(err, KeyError) and err.args:
             reason = err.args[0]
-        problem = f"cannot be read as {name!r}: {reason or type(err).__name__}"
-        raise data_error(path, problem) from err
+        raise data_error(
+            path, f"cannot be read as {name!r}: {reason or type(err).__name__}"
+        ) from err
 
 
 def _entry(library, source):

@@ -103,8 +103,9 @@ def _check_product(path, axes):
         strange = sorted(set(nodes.tolist()) - set(SKIRTOR_AXES[name]))
         if strange:
             expected = " ".join(f"{v:g}" for v in SKIRTOR_AXES[name])
-            problem = f"has {name} {strange[0]:g}, which is not of SKIRTOR 2016: it has {expected}"
-            raise data_error(path, problem)
+            raise data_error(
+                path, f"has {name} {strange[0]:g}, which is not of SKIRTOR 2016: it has {expected}"
+            )
     present = set(zip(*(column.tolist() for column in axes.values()), strict=True))
     wanted = int(np.prod([v.size for v in values.values()]))
     if len(present) < wanted:

@@ -94,8 +94,9 @@ class LibraryTable:
 
     def _check_names(self):
         got = f"axes {list(self.axes)} and spectra {list(self.spectra)}"
-        wanted = "one axis and one kind of spectra at least"
-        check_that(self.axes and self.spectra, "axes", wanted, got)
+        check_that(
+            self.axes and self.spectra, "axes", "one axis and one kind of spectra at least", got
+        )
         names = [*self.axes, *self.values, *self.spectra]
         # columns of a FITS table have names without case
         lower_names = set()
@@ -144,8 +145,9 @@ class LibraryTable:
         if len(index) < self.n_rows:
             row = next(i for i, place in enumerate(places.tolist()) if index[place] != i)
             values = ", ".join(f"{name} = {column[row]:g}" for name, column in self.axes.items())
-            got = f"{values} in rows {row} and {index[places[row]]}"
-            raise argument_error("axes", "different in every row", got)
+            raise argument_error(
+                "axes", "different in every row", f"{values} in rows {row} and {index[places[row]]}"
+            )
         return index
 
     def missing(self, **values):

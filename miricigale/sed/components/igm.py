@@ -153,6 +153,7 @@ def load_lines(path):
         table = np.array([columns[name] for name in _COLUMNS], dtype=float).T
     positive = table.shape == (39, len(_COLUMNS)) and np.all(np.isfinite(table) & (table > 0))
     if not positive or np.any(np.diff(table[:, 0]) >= 0):
-        problem = "must hold six columns of 39 positive numbers, from the longest wavelength on"
-        raise data_error(path, problem)
+        raise data_error(
+            path, "must hold six columns of 39 positive numbers, from the longest wavelength on"
+        )
     return tuple(map(frozen_array, _core.inoue_lines(table)))

@@ -220,8 +220,7 @@ def all_exposures(field, options, patterns, stamp):
             # offsets of a file
             n_dithers = n_dithers or len(pattern)
             wanted = f"must be at most {len(pattern)} for {name}, as its file of dithers has"
-            good = n_dithers <= len(pattern)
-            require(good, "exposures", "n_dithers", wanted, n_dithers)
+            require(n_dithers <= len(pattern), "exposures", "n_dithers", wanted, n_dithers)
             pattern = pattern * u.arcsec
         number = 0
         for pointing in pointings:

@@ -318,8 +318,9 @@ def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False
     column of errors, and ``max_wavelength`` (um), up to which these are fitted.
     """
     bands, longest = input_bands(catalog, options.max_wavelength)
-    wanted = "leaves none of the catalog's bands"
-    require(bands, "sed", "max_wavelength", wanted, options.max_wavelength)
+    require(
+        bands, "sed", "max_wavelength", "leaves none of the catalog's bands", options.max_wavelength
+    )
     photometry = QTable({"id": catalog["id"]})
     photometry["redshift"] = floats(catalog["redshift"])
     for name in bands:

@@ -148,8 +148,9 @@ def catalog_fractions(catalog):
     values = floats(catalog["frac_agn"])
     bad = values[~((values >= 0) & (values <= 0.99))]
     wanted = "'catalog' needs a column frac_agn of values between 0 and 0.99"
-    got = f"{len(bad)} of {len(values)} others, {bad[:3]}"
-    require(not len(bad), "sed", "frac_agn", wanted, got)
+    require(
+        not len(bad), "sed", "frac_agn", wanted, f"{len(bad)} of {len(values)} others, {bad[:3]}"
+    )
     return values
 
 
