@@ -99,23 +99,11 @@ class Filter(Frozen, WithTable):
             if throughput is None:
                 self.__dict__.update(Filter.from_name(wave).__dict__)
                 return
-            # the name first, as others have it
+            # the name first, as in sedpy
             wave, throughput, name = throughput, name, wave
         for argument, value in (("throughput", throughput), ("name", name)):
             check_that(value is not None, argument, "given with 'wave'", "None")
-        wave = to_array(wave, WAVE, "wave", ndim=1, finite=True)
-        throughput = to_array(throughput, u.one, "throughput", ndim=1, finite=True)
-        if wave.size < 2 or wave.shape != throughput.shape:
-            shapes = f"{wave.shape} and {throughput.shape}"
-            raise argument_error("throughput", "as many values as 'wave', two or more", shapes)
-        check_that(
-            wave[0] > 0 and is_ascending(wave), "wave", "positive and strictly ascending", wave
-        )
-        if np.any(throughput < 0) or not np.any(throughput > 0):
-            raise argument_error("throughput", "not negative, and somewhere positive", throughput)
-        wave, throughput = _core.padded(wave, throughput)
-        wave = frozen_quantity(wave * WAVE, WAVE, "wave")
-        throughput = frozen_array(throughput)
+        wave, throughput = _checked_curve(wave, throughput)
         meta = dict(self.meta or {})
         self.__dict__.update(wave=wave, throughput=throughput, name=str(name), meta=meta)
         for argument, unit in (("reference_wavelength", WAVE), ("reference_temperature", u.K)):
@@ -136,6 +124,7 @@ class Filter(Frozen, WithTable):
         }
 
     def _key(self):
+        """What makes two filters equal: name and curve, and how catalogs quote its fluxes."""
         curve = self.wave.value.tobytes(), self.throughput.tobytes()
         return self.name, *curve, self.reference_wavelength, self.reference_temperature
 
@@ -145,10 +134,11 @@ class Filter(Frozen, WithTable):
         return NotImplemented
 
     def __hash__(self):
+        # filters that differ in their references alone may share a hash
         return hash(self._key()[:3])
 
     def __call__(self, wave):
-        """Throughput at wavelengths, by straight lines; 0 outside."""
+        """Return the throughput at wavelengths, linear between the points and 0 outside."""
         x = to_array(wave, WAVE, "wave")
         return np.interp(x, self.wave.value, self.throughput, left=0.0, right=0.0)
 
@@ -198,13 +188,13 @@ class Filter(Frozen, WithTable):
 
     @staticmethod
     def names():
-        """Names of the library, sorted, as a tuple."""
+        """Return the names of the library, sorted, as a tuple."""
         return tuple(FILTERS.names())
 
     @staticmethod
     def search(text):
         """
-        Names of the library by a part of them, or by a wavelength.
+        Find filters of the library by a part of their name, or by a wavelength.
 
         Parameters
         ----------
@@ -239,48 +229,6 @@ class Filter(Frozen, WithTable):
             if band(wave * WAVE) >= 0.5 * band.throughput.max():
                 matches.append((abs(band.pivot.value - wave), name))
         return tuple(name for _, name in sorted(matches))
-
-    @classmethod
-    def from_svo(cls, path, *, name=None):
-        """
-        Make a filter of a file of the SVO Filter Profile Service; nothing is downloaded.
-
-        Parameters
-        ----------
-        path : path-like
-            The file, as the service gives it: a VOTable, or its ASCII table, whose wavelengths are in Angstrom.
-        name : str, optional
-            As for `read`, which does the same.
-
-        Returns
-        -------
-        filter : `Filter`
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.DataError`
-            If there is no such file, or it is none of a filter; the message says where the service has it.
-        """
-        if not Path(path).is_file():
-            # the service has most curves of the library under its own names
-            problem = "is no file; nothing is downloaded: save the VOTable of http://svo2.cab.inta-csic.es/theory/fps"
-            raise data_error(path, f"{problem}, or take Filter({str(path)!r}) of the library")
-        unit = None
-        with Path(path).open("rb") as file:
-            if not file.read(256).lstrip().startswith(b"<"):
-                # the ASCII table does not say so
-                unit = u.AA
-        return cls.read(path, name=name, unit=unit)
-
-    @property
-    def min_wavelength(self):
-        """Shortest wavelength of `bounds`."""
-        return self.bounds[0]
-
-    @property
-    def max_wavelength(self):
-        """Longest wavelength of `bounds`."""
-        return self.bounds[1]
 
     @classmethod
     @takes_other_keywords
@@ -329,31 +277,41 @@ class Filter(Frozen, WithTable):
             options = curve.options | {"meta": {"source": Path(path).name, **curve.options["meta"]}}
             return cls(curve.wave, curve.throughput, name or curve.name, **options)
 
-    def to_table(self):
-        """
-        Return the curve as a `~astropy.table.QTable` of ``wave`` (um) and ``throughput``.
-
-        Its meta has what else makes the filter: ``reference_wavelength`` (um), ``reference_temperature`` (K).
-        """
-        meta = {"name": self.name, **self.meta}
-        if self.reference_wavelength is not None:
-            meta["reference_wavelength"] = float(self.reference_wavelength.value)
-        if self.reference_temperature is not None:
-            meta["reference_temperature"] = float(self.reference_temperature.value)
-        return QTable({"wave": self.wave, "throughput": self.throughput}, meta=meta)
-
-    def write(self, path, *, overwrite=False):
-        """
-        Write the curve as a table, in the format of the suffix (``.ecsv``, ``.fits``, ...).
-
-        CSV is refused, which keeps neither units nor the wavelength at which catalogs quote fluxes.
-        """
-        wanted = "a file of a format with units, such as .ecsv or .fits"
-        check_that(table_suffix(path) != ".csv", "path", wanted, str(path))
-        write_table(self.to_table(), path, overwrite=overwrite)
-
     #: Other name of `read`.
     from_file = read
+
+    @classmethod
+    def from_svo(cls, path, *, name=None):
+        """
+        Make a filter of a file of the SVO Filter Profile Service; nothing is downloaded.
+
+        Parameters
+        ----------
+        path : path-like
+            The file, as the service gives it: a VOTable, or its ASCII table, whose wavelengths are in Angstrom.
+        name : str, optional
+            As for `read`, which does the same.
+
+        Returns
+        -------
+        filter : `Filter`
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If there is no such file, or it is none of a filter; the message says where the service has it.
+        """
+        if not Path(path).is_file():
+            # the service has most curves of the library under its own names
+            problem = "is no file; nothing is downloaded: save the VOTable of http://svo2.cab.inta-csic.es/theory/fps"
+            raise data_error(path, f"{problem}, or take Filter({str(path)!r}) of the library")
+        with Path(path).open("rb") as file:
+            is_votable = file.read(256).lstrip().startswith(b"<")
+        unit = None
+        if not is_votable:
+            # the ASCII table does not state its unit
+            unit = u.AA
+        return cls.read(path, name=name, unit=unit)
 
     @classmethod
     def from_synphot(cls, bandpass, *, name=None):
@@ -403,7 +361,7 @@ class Filter(Frozen, WithTable):
         return cls(band.wavelength * u.AA, np.maximum(throughput, 0.0), str(name), meta=meta)
 
     def to_synphot(self):
-        """This filter as a `synphot.SpectralElement` (photon response, linear between points)."""
+        """Return the filter as a `synphot.SpectralElement` (photon response, linear between points)."""
         from synphot import Empirical1D, SpectralElement
 
         return SpectralElement(
@@ -412,6 +370,29 @@ class Filter(Frozen, WithTable):
             lookup_table=self.throughput,
             meta={"expr": self.name},
         )
+
+    def to_table(self):
+        """
+        Return the curve as a `~astropy.table.QTable` of ``wave`` (um) and ``throughput``.
+
+        Its meta has what else makes the filter: ``reference_wavelength`` (um), ``reference_temperature`` (K).
+        """
+        meta = {"name": self.name, **self.meta}
+        if self.reference_wavelength is not None:
+            meta["reference_wavelength"] = float(self.reference_wavelength.value)
+        if self.reference_temperature is not None:
+            meta["reference_temperature"] = float(self.reference_temperature.value)
+        return QTable({"wave": self.wave, "throughput": self.throughput}, meta=meta)
+
+    def write(self, path, *, overwrite=False):
+        """
+        Write the curve as a table, in the format of the suffix (``.ecsv``, ``.fits``, ...).
+
+        CSV is refused, which keeps neither units nor the wavelength at which catalogs quote fluxes.
+        """
+        wanted = "a file of a format with units, such as .ecsv or .fits"
+        check_that(table_suffix(path) != ".csv", "path", wanted, str(path))
+        write_table(self.to_table(), path, overwrite=overwrite)
 
     @cached_property
     def _fine(self):
@@ -437,10 +418,6 @@ class Filter(Frozen, WithTable):
         wave, throughput, _ = self._fine
         return _core.photon_integral(wave, throughput, 1) / throughput.max() * WAVE
 
-    def integrate(self):
-        """Integral of the throughput over wavelength, um: the equivalent width."""
-        return self.width * self.throughput.max()
-
     @cached_property
     def fwhm(self):
         """Full width at half of the highest throughput, um."""
@@ -453,10 +430,20 @@ class Filter(Frozen, WithTable):
         """Wavelengths beyond which the throughput is 0, um, shape (2,)."""
         return self.wave[[0, -1]]
 
+    @property
+    def min_wavelength(self):
+        """Shortest wavelength of `bounds`."""
+        return self.bounds[0]
+
+    @property
+    def max_wavelength(self):
+        """Longest wavelength of `bounds`."""
+        return self.bounds[1]
+
     @cached_property
     def catalog_factor(self):
         """
-        What turns the AB flux of a band into the one that catalogs quote.
+        Factor from the AB flux of a band to the flux that catalogs quote.
 
         1 where they are the same. IRAC fluxes are quoted at a nominal wavelength for
         nu F_nu = const, those of MIPS for a black body of 10^4 K; for a source of
@@ -478,9 +465,13 @@ class Filter(Frozen, WithTable):
         spectrum = body(wave * WAVE).value / body(self.reference_wavelength).value
         return float(norm / _core.photon_integral(wave, throughput * spectrum))
 
+    def integrate(self):
+        """Return the integral of the throughput over wavelength, um: the equivalent width."""
+        return self.width * self.throughput.max()
+
     def weights(self, wave, *, tolerance=UNCOVERED):
         """
-        Weights of the values of a spectrum in this band.
+        Compute the weights of the values of a spectrum in this band.
 
         Parameters
         ----------
@@ -508,6 +499,7 @@ class Filter(Frozen, WithTable):
         return weights
 
     def _weights(self, wave, tolerance):
+        """Compute the weights that are not 0, and the place of the first of them in ``wave`` (um)."""
         first, part = _core.band_weights(wave, *self._fine)
         covered = part.sum()
         if not covered >= 1 - tolerance:
@@ -521,7 +513,7 @@ class Filter(Frozen, WithTable):
 
     def synthetic_flux(self, sed, flux=None):
         """
-        Mean flux density of a spectrum in this band (photon-counting, AB convention).
+        Compute the mean flux density of a spectrum in this band, uJy (photon-counting, AB convention).
 
         Parameters
         ----------
@@ -562,7 +554,7 @@ class Filter(Frozen, WithTable):
         return float(part @ fnu[first : first + part.size]) * FNU
 
     def synthetic_magnitude(self, sed, flux=None):
-        """AB magnitude of a spectrum in this band; see `synthetic_flux`."""
+        """Compute the AB magnitude of a spectrum in this band; see `synthetic_flux`."""
         return self.synthetic_flux(sed, flux).to(u.ABmag)
 
     def plot(self, ax=None, **kwargs):
@@ -589,3 +581,17 @@ class Filter(Frozen, WithTable):
 def _from_name(name):
     wave, throughput, options = load_curve(name)
     return Filter(wave, throughput, name=name, **options)
+
+
+def _checked_curve(wave, throughput):
+    """Return wavelengths (um) and throughput of a filter, read-only and with a zero at each end."""
+    wave = to_array(wave, WAVE, "wave", ndim=1, finite=True)
+    throughput = to_array(throughput, u.one, "throughput", ndim=1, finite=True)
+    if wave.size < 2 or wave.shape != throughput.shape:
+        shapes = f"{wave.shape} and {throughput.shape}"
+        raise argument_error("throughput", "as many values as 'wave', two or more", shapes)
+    check_that(wave[0] > 0 and is_ascending(wave), "wave", "positive and strictly ascending", wave)
+    if np.any(throughput < 0) or not np.any(throughput > 0):
+        raise argument_error("throughput", "not negative, and somewhere positive", throughput)
+    wave, throughput = _core.padded(wave, throughput)
+    return frozen_quantity(wave * WAVE, WAVE, "wave"), frozen_array(throughput)
