@@ -157,10 +157,8 @@ class Scene(WithTable):
         if exposure is not None:
             check_kind(exposure, "exposure", Exposure)
             exposure.check_sky()
-            if filter is None:
-                filter = exposure.filter
-            if wcs is None:
-                wcs = exposure.wcs
+            filter = exposure.filter if filter is None else filter
+            wcs = exposure.wcs if wcs is None else wcs
         example = "Scene(catalog, Exposure('F770W', 1000 * u.s, pointing='53.1 -27.8'))"
         check_that(filter is not None, "filter", f"given, or an exposure: {example}", "None")
         wanted = (
@@ -211,7 +209,7 @@ class Scene(WithTable):
         return ("flux", *self._catalog.colnames)
 
     def replace(self, **changes):
-        """Scene with other values of the constructor's arguments, such as ``background="high"``."""
+        """Return a scene with other values of the constructor's arguments, such as ``background="high"``."""
         return type(self)(**(self._arguments | changes))
 
     def __len__(self):
@@ -228,7 +226,7 @@ class Scene(WithTable):
     background = property(attrgetter("_background"), doc="The background, or None.")
 
     def _check_cutouts(self, cutouts):
-        """Cutouts by row of the catalog."""
+        """Return the cutouts by row of the catalog; refuse others, and sources without theirs."""
         cutouts = dict(cutouts or {})
         for key, value in cutouts.items():
             check_type(value, "cutouts", Cutout, f"a Cutout for {key!r}")
@@ -243,7 +241,7 @@ class Scene(WithTable):
         return {ids[key]: value for key, value in cutouts.items()}
 
     def _split_flux(self, agn):
-        """Light of the profiles and of the points at their centers, uJy."""
+        """Return the light of the profiles and of the points at their centers, uJy."""
         flux = self._catalog[self._filter].to_value(FNU)
         if agn is None:
             return flux, np.zeros(len(flux))
@@ -265,8 +263,8 @@ class Scene(WithTable):
             raise argument_error("agn", wanted, f"{column[row]} in row {row}")
         values = np.nan_to_num(values, nan=0.0)
         if is_share:
-            return (flux * (1 - values), flux * values)
-        return (flux, values)
+            return flux * (1 - values), flux * values
+        return flux, values
 
     def _warn_of_fluxes(self):
         """Warn of sources that are not painted: without a finite, positive flux."""
@@ -286,6 +284,7 @@ class Scene(WithTable):
         warn(msg, CatalogWarning)
 
     def _check_background(self, background):
+        """Return the `Background` of one, of its level or of how bright the zodiacal light is; None for none."""
         if background is None or isinstance(background, Background):
             return background
         if isinstance(background, str):
@@ -298,6 +297,7 @@ class Scene(WithTable):
         return local_jacobian(self._wcs, *middle_pixel(self._shape))
 
     def _check_psf(self, psf, scale):
+        """Refuse a PSF on pixels other than ``scale`` (arcsec), turned, of other places or another filter."""
         if not isinstance(psf, _TYPED):
             # a plain photutils model is taken as it is
             return
@@ -328,48 +328,19 @@ class Scene(WithTable):
     def _painted(self):
         """The light in each pixel (uJy), and the table of truth."""
         catalog = self._catalog
-        shape = self._shape
-        ny, nx = shape
-        galaxy = self._galaxy_flux
-        agn = self._agn_flux
-        flux = galaxy + agn
-        x, y, is_near = pixel_positions(self._wcs, catalog["sky"], shape)
-        flags = np.zeros(len(catalog), dtype=int)
+        ny, nx = self._shape
+        flux = self._galaxy_flux + self._agn_flux
+        x, y, is_near = pixel_positions(self._wcs, catalog["sky"], self._shape)
         inside = is_near & (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
-        flags[~inside] |= SceneFlags.OUTSIDE_IMAGE
         valid = np.isfinite(flux) & (flux >= 0)
-        flags[~valid] |= SceneFlags.NO_FLUX
         sersic = catalog["profile"] == "sersic"
         spoilt = (catalog["flags"] & int(CatalogFlags.unusable_profile())) != 0
+        flags = np.zeros(len(catalog), dtype=int)
+        flags[~inside] |= SceneFlags.OUTSIDE_IMAGE
+        flags[~valid] |= SceneFlags.NO_FLUX
         flags[sersic & spoilt] |= SceneFlags.DRAWN_AS_POINT
         sersic &= ~spoilt
-
-        # rows of the profiles, then those of the points at their centers
-        rows = np.flatnonzero(is_near & valid)
-        n_profiles = rows.size
-        rows = np.append(rows, rows[agn[rows] > 0])
-        profile = np.arange(rows.size) < n_profiles
-        jacobian = local_jacobian(self._wcs, x[rows], y[rows])
-        is_sersic = sersic[rows] & profile
-        radius = np.where(is_sersic, catalog["half_light_radius"].to_value(ANGLE)[rows], 0)
-        ratio = np.where(is_sersic, catalog["axis_ratio"][rows], 1.0)
-        ellipse = {"radius": radius, "axis_ratio": ratio}
-        ellipse["position_angle"] = np.nan_to_num(catalog["position_angle"].to_value(u.rad))[rows]
-        radius, ratio, theta = ellipse_to_pixels(jacobian, **ellipse)
-        images = {}
-        for k, row in enumerate(rows[:n_profiles]):
-            if row in self._cutouts:
-                images[k] = self._cutouts[row].pieces(jacobian[k])
-        sources = {"is_sersic": is_sersic, "r_eff": radius, "axis_ratio": ratio, "theta": theta}
-        sources |= {"x": x[rows], "y": y[rows], "n": catalog["sersic_index"][rows]}
-        light = np.where(profile, galaxy[rows], agn[rows])
-        image, landed, drawn_share = self._painter.paint(flux=light, images=images, **sources)
-        in_image = np.bincount(rows, weights=landed, minlength=len(catalog))
-        # of all light, the points' included
-        lost = np.zeros(len(catalog))
-        profile_rows = rows[:n_profiles]
-        total = np.where(flux[profile_rows] > 0, flux[profile_rows], 1.0)
-        lost[profile_rows] = (1 - drawn_share[:n_profiles]) * galaxy[profile_rows] / total
+        image, in_image, lost = self._paint(np.flatnonzero(is_near & valid), x, y, sersic)
         flags[lost > 0.01] |= SceneFlags.CUT_PROFILE
         dim = in_image < 0.95 * flux * (1 - lost) * self._painter.enclosed_by_psf
         flags[inside & valid & dim] |= SceneFlags.NEAR_EDGE
@@ -382,7 +353,7 @@ class Scene(WithTable):
             "y": y,
             "profile": painted_as,
             "flux_total": flux * FNU,
-            "flux_agn": agn * FNU,
+            "flux_agn": self._agn_flux * FNU,
             "flux_in_image": in_image * FNU,
             "flags": flags,
         }
@@ -390,6 +361,52 @@ class Scene(WithTable):
             "flags": SceneFlags.describe()
         }
         return image, described_columns(columns, texts, provenance(filter=self._filter))
+
+    def _paint(self, rows, x, y, sersic):
+        """
+        Paint sources of the catalog at pixels x and y, as profiles (``sersic``, cutouts) or points.
+
+        Returned are the light in each pixel (uJy), and of each source the light in the image (uJy) and the part of
+        its light that lies beyond the isophote where it is cut.
+        """
+        catalog = self._catalog
+        galaxy = self._galaxy_flux
+        agn = self._agn_flux
+        n_profiles = rows.size
+        profile_rows = rows
+        # after the profiles the points at their centers
+        rows = np.append(rows, rows[agn[rows] > 0])
+        profile = np.arange(rows.size) < n_profiles
+        jacobian = local_jacobian(self._wcs, x[rows], y[rows])
+        is_sersic = sersic[rows] & profile
+        radius, ratio, theta = ellipse_to_pixels(
+            jacobian,
+            radius=np.where(is_sersic, catalog["half_light_radius"].to_value(ANGLE)[rows], 0),
+            axis_ratio=np.where(is_sersic, catalog["axis_ratio"][rows], 1.0),
+            position_angle=np.nan_to_num(catalog["position_angle"].to_value(u.rad))[rows],
+        )
+        images = {}
+        for k, row in enumerate(profile_rows):
+            if row in self._cutouts:
+                images[k] = self._cutouts[row].pieces(jacobian[k])
+        image, landed, drawn_share = self._painter.paint(
+            x=x[rows],
+            y=y[rows],
+            flux=np.where(profile, galaxy[rows], agn[rows]),
+            is_sersic=is_sersic,
+            r_eff=radius,
+            n=catalog["sersic_index"][rows],
+            axis_ratio=ratio,
+            theta=theta,
+            images=images,
+        )
+        in_image = np.bincount(rows, weights=landed, minlength=len(catalog))
+        # of all light, the points' included
+        lost = np.zeros(len(catalog))
+        flux = galaxy[profile_rows] + agn[profile_rows]
+        total = np.where(flux > 0, flux, 1.0)
+        lost[profile_rows] = (1 - drawn_share[:n_profiles]) * galaxy[profile_rows] / total
+        return image, in_image, lost
 
     @property
     def truth(self):
