@@ -32,7 +32,7 @@ def best_model_table(
     model, parameters, *, modules=None, bands=("B_B90", "V_B90", "FUV"), far=None, xray=None
 ):
     """
-    One model in the layout of CIGALE's best models.
+    Return one model in the layout of CIGALE's best models.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def _galaxy_parts(chain, values, stars):
 
 
 def _agn(model, values, derived):
-    """Light of the parts of an AGN in W/um, and its quantities: two dicts by CIGALE's names."""
+    """Return the light of the parts of an AGN in W/um, and its quantities: two dicts by CIGALE's names."""
     chain = model.chain
     nucleus = chain.agn(values)
     parts = {}
@@ -157,7 +157,7 @@ def _agn(model, values, derived):
 
 
 def _observed_table(wave, parts, redshift, source_distance):
-    """Table of parts in W/um at wavelengths in um, both at rest, as observed from a distance in m."""
+    """Return the table of parts in W/um at wavelengths in um, both at rest, as observed from a distance in m."""
     table = Table()
     table["wavelength"] = wave * (1.0 + redshift) * 1e3 * u.nm
     # W/um at rest to W/nm of observed wavelength
@@ -229,7 +229,7 @@ def _stars(model, values):
 
 
 def _attenuation(chain, parts, bands):
-    """Attenuation of a galaxy's light in rest-frame bands, in mag."""
+    """Return the attenuation of a galaxy's light in rest-frame bands, in mag."""
 
     def light(*starts):
         return sum(part for name, part in parts.items() if name.startswith(starts))

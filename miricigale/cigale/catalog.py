@@ -152,7 +152,7 @@ _NEAR = 0.01
 
 
 def _choose(path, table, bands):
-    """Bands to read."""
+    """Return the bands to read."""
     have = table.colnames
     if bands is None:
         candidates = [name for name in have if name not in _OWN]
@@ -202,7 +202,7 @@ def _add_band(out, name, flux, error, limits):
 
 
 def _numbers(path, table, name):
-    """Column as floats, NaN where masked."""
+    """Return the column as floats, NaN where masked."""
     try:
         return plain_floats(table[name], name, path)
     except ValueError:
@@ -210,7 +210,7 @@ def _numbers(path, table, name):
 
 
 def _in_unit(path, table, name, values, default):
-    """Numbers of a column in its unit, or the default one where it has none, converted to that."""
+    """Return the numbers of a column in its unit, or the default one where it has none, converted to that."""
     unit = table[name].unit or default
     try:
         return (values * u.Unit(unit)).to(default)

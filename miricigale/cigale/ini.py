@@ -58,7 +58,7 @@ def parse_ini(path):
 
 def parse_values(value, name):
     """
-    Numbers of a parameter, ascending: array of shape (n,); ``name`` is for messages.
+    Return the numbers of a parameter, ascending: array of shape (n,); ``name`` is for messages.
 
     ``value`` is numbers; ``range start stop step``, which includes ``stop``; or ``eval`` and an
     expression of numbers, lists and the functions of numpy in `FUNCTIONS`. Nothing is executed: the

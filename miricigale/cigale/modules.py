@@ -51,11 +51,11 @@ class Module:
         return f"{self.name}.{key}"
 
     def has_key(self, key):
-        """Whether the file has a parameter."""
+        """Tell whether the file has a parameter."""
         return key in self._values
 
     def numbers(self, key, default=None):
-        """Values of a parameter, ascending; ``default`` where it is not in the file."""
+        """Return the values of a parameter, ascending; ``default`` where it is not in the file."""
         self._taken.add(key)
         value = self._values.get(key, "")
         if value in ("", []):
@@ -72,7 +72,7 @@ class Module:
         return ", ".join(value)
 
     def pair(self, key, default, wanted):
-        """Two numbers, of which ``wanted`` says how they are written."""
+        """Return two numbers, of which ``wanted`` says how they are written."""
         text = self.text(key, default)
         try:
             first, second = map(float, text.replace("&", "/").split("/"))
@@ -81,7 +81,7 @@ class Module:
         return first, second
 
     def single(self, key, default):
-        """A parameter that can have one value here: the first; others are left out."""
+        """Return a parameter that can have one value here: the first; others are left out."""
         values = self.numbers(key, default)
         if values.size > 1:
             left_out = ", ".join(f"{x:g}" for x in values[1:])
@@ -152,7 +152,7 @@ class Module:
         return value
 
     def values(self, kind):
-        """Values of the parameters of a component, each with its key in the file, for `add`."""
+        """Return the values of the parameters of a component, each with its key in the file, for `add`."""
         names = cigale_names({kind.role: self.name})
         out = {}
         declared = kind.declared()
@@ -166,7 +166,7 @@ class Module:
         return out
 
     def choose(self, better, fallback, covers):
-        """The registered library if it holds the values, or what stands in for it, and why."""
+        """Return the registered library if it holds the values, or what stands in for it, and why."""
         if self.libraries == "bundled":
             return fallback, "the bundled tables were asked for"
         if find_resource(better.resource) is None:
@@ -183,7 +183,7 @@ _KEYS = {"ebv": "E_BVs_young", "ebv_factor": "E_BVs_old_factor", "r_v_gas": "Rv"
 
 
 def _reader(kind, **options):
-    """Reader of a module without rules of its own."""
+    """Return the reader of a module without rules of its own."""
     return lambda m: m.add(kind, m.values(kind), **options)
 
 
@@ -243,7 +243,7 @@ def _nebular(m):
 
 
 def _metallicity(chain):
-    """Metallicities of the stars."""
+    """Return the metallicities of the stars."""
     stars = [part.metallicity for part in chain.components if part.role == "stellar"]
     return chain.parameters.get("metallicity", np.array(stars))
 

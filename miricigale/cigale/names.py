@@ -16,7 +16,7 @@ AGN_PARTS = {
 
 def cigale_names(modules):
     """
-    CIGALE's names of what we have: our name to CIGALE's, its unit, and the factor to it from ours.
+    Return CIGALE's names of what we have: our name to CIGALE's, its unit, and the factor to it from ours.
 
     ``modules`` is the role of a component to CIGALE's module, on which some names depend.
     """
@@ -32,7 +32,7 @@ def cigale_names(modules):
 
 
 def unit_of(name):
-    """Unit of a quantity of CIGALE's name; None if it is not known."""
+    """Return the unit of a quantity of CIGALE's name; None if it is not known."""
     for module in ["", *DECLARED["modules"]]:
         for theirs, unit, _ in cigale_names({"": module}).values():
             if theirs == name:

@@ -82,7 +82,7 @@ def near_relation(fitter, photometry, results, max_deviation, *, redshift, seed)
 
 
 def _is_near(samples, max_deviation):
-    """Which draws are near the relation, or have no AGN: shape (n, n_draws)."""
+    """Tell which draws are near the relation, or have no AGN: shape (n, n_draws)."""
     if "alpha_ox" in samples.axes:
         slope = samples.values("alpha_ox").value
     else:
@@ -91,7 +91,7 @@ def _is_near(samples, max_deviation):
 
 
 def _distance(slope, light):
-    """How far a slope is from the relation; NaN without a disk."""
+    """Tell how far a slope is from the relation; NaN without a disk."""
     light = light.to_value(u.erg / u.s / u.Hz)
     log_light = np.log10(light, where=light > 0, out=np.full(np.shape(light), np.nan))
     return np.abs(slope - (_JUST[0] * log_light + _JUST[1]))

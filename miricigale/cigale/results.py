@@ -110,7 +110,7 @@ def described(note):
 
 
 def _columns(results, names, variables):
-    """CIGALE's name to mean, standard deviation (None if not wanted), best value and unit."""
+    """Return CIGALE's name to mean, standard deviation (None if not wanted), best value and unit."""
     constants = dict(results.constants)
     gas = [part.gas for part in getattr(results.model, "components", ()) if part.role == "nebular"]
     if gas != ["free"]:

@@ -183,7 +183,7 @@ class _RunBands:
 
 
 def _computed_variables(chain, bands):
-    """CIGALE's names of the quantities that are computed for these modules and bands: set of str."""
+    """Return CIGALE's names of the quantities that are computed for these modules and bands: set of str."""
     computed = {entry[0] for entry in cigale_names(chain.modules).values()}
     if bands.dark or not bands.hard:
         computed -= {"xray.alpha_ox", "xray.agn_Lx_2to10keV", "agn.intrin_Lnu_2500A_30deg"}
@@ -218,7 +218,7 @@ def _without_error(column):
 
 
 def _frozen(value):
-    """A list as a tuple, and anything else as it is."""
+    """Return a list as a tuple, and anything else as it is."""
     if isinstance(value, list):
         return tuple(value)
     return value

@@ -31,7 +31,7 @@ _MOST = 2_000_000
 
 
 def with_agn_parts(grid, model):
-    """A grid whose AGN have the luminosities of their parts too (`AGN_PARTS`), for each W of AGN power."""
+    """Return a grid whose AGN have the luminosities of their parts too (`AGN_PARTS`), for each W of AGN power."""
     if not grid.n_agn:
         return grid
     chain = model.chain
@@ -137,7 +137,7 @@ class CigaleSetup:
 
     def axes(self, redshifts=None):
         """
-        Axes of the grid.
+        Return the axes of the grid.
 
         Parameters
         ----------
@@ -166,7 +166,7 @@ class CigaleSetup:
 
     def rounded(self, redshifts):
         """
-        Redshifts to ``redshift_decimals``.
+        Return the redshifts to ``redshift_decimals``.
 
         Those that would become 0, which stands for 10 pc, stay as they are; negative ones are
         missing (NaN).
@@ -203,7 +203,7 @@ class CigaleSetup:
 
     def filters(self, names=None):
         """
-        Filters of bands: a `~miricigale.filters.FilterSet`.
+        Return the filters of bands: a `~miricigale.filters.FilterSet`.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ class CigaleSetup:
         return FilterSet([by_name.get(name, name) for name in names])
 
     def xray_bands(self):
-        """X-ray bands among ``bands`` and ``predicted``: name to lowest and highest energy."""
+        """Return the X-ray bands among ``bands`` and ``predicted``: name to lowest and highest energy."""
         names = [name for name in self.bands | self.predicted if xray_energies(name)]
         return {name: xray_energies(name) * u.keV for name in names if name not in self.names}
 
@@ -390,7 +390,7 @@ class CigaleSetup:
 
 
 def _column(table, name):
-    """A column of a table; None if it has none of this name."""
+    """Return a column of a table; None if it has none of this name."""
     if name in table.colnames:
         return table[name]
     return None

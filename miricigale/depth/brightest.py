@@ -10,7 +10,7 @@ from miricigale.utils.options import check_that
 
 def saturation_flux(exposure, *, background=None, psf=None, detector=None):
     """
-    Flux of the point source whose brightest pixel is full at the end of an integration.
+    Return the flux of the point source whose brightest pixel is full at the end of an integration.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ _SIZE = 91
 
 def extraction_map(share, boxes):
     """
-    Weight of the detector's pixels in the flux that is fitted on a mosaic, shape (n, n).
+    Return the weight of the detector's pixels in the flux that is fitted on a mosaic, shape (n, n).
 
     ``share`` (n, n) is the light of a detector's pixel whose middle is there, sampled
     ``_SAMPLES`` times a side. A template fitted with equal weights to a mosaic that is the
@@ -63,7 +63,7 @@ def fitted_noise(
     excess="flight",
 ):
     """
-    Noise of sources fitted on the mosaic of an exposure.
+    Return the noise of sources fitted on the mosaic of an exposure.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def fitted_noise(
 
 
 def excess_factor(excess):
-    """The factor on the noise of the sky: a number, or that of a name in ``EXCESS``."""
+    """Return the factor on the noise of the sky: a number, or that of a name in ``EXCESS``."""
     if isinstance(excess, str):
         check_choice(excess, "excess", EXCESS)
         return EXCESS[excess]
@@ -205,7 +205,7 @@ def _pixels(angle, name):
 
 
 def _share(filter, psf, size):
-    """Light of a source in a pixel, by the place of the pixel's middle."""
+    """Return the light of a source in a pixel, by the place of the pixel's middle."""
     pixel = u.Quantity(MIRI_PIXEL_SCALE, ANGLE) / _SAMPLES
     n = _SIZE * _SAMPLES
     if psf is None:

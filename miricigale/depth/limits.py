@@ -25,7 +25,7 @@ _TIME = 1e4 * u.s
 
 def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
     """
-    Weight of each pixel, (n, n) with n odd, in the flux: aperture less the sky of the annulus.
+    Return the weight of each pixel, (n, n) with n odd, in the flux: aperture less the sky of the annulus.
 
     Overlap of pixel and circle, and in the annulus minus the ratio of the areas. Radii are in
     pixels; ``annulus`` is None if the sky is known, ``offset`` that of the center from the middle
@@ -42,7 +42,7 @@ def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
 
 
 def _radii(aperture, annulus, setup):
-    """Radii in arcsec, checked."""
+    """Return the radii in arcsec, checked."""
     radius = aperture
     if aperture is None:
         radius = setup.radius
@@ -57,7 +57,7 @@ def _radii(aperture, annulus, setup):
 
 
 def _extraction(radius, annulus, psf, correlation, filter):
-    """Light in the extraction and noise powers, means over positions within the pixel."""
+    """Return the light in the extraction and noise powers, means over positions within the pixel."""
     psf = psf_of(psf, filter)
     scale = MIRI_PIXEL_SCALE.value
     edges = None
@@ -91,7 +91,7 @@ def aperture_noise(
     detector=None,
 ):
     """
-    Noise and light in a circular aperture, and the flux of the point source that is measured there.
+    Return the noise and light in a circular aperture, and the flux of the point source that is measured there.
 
     Photon noise of sky, dark current and source, read noise of optimally fitted ramps, and,
     if asked for, a residual pattern, summed in the aperture.
@@ -237,7 +237,7 @@ def sensitivity(
     **options,
 ):
     """
-    Flux of the point source that an exposure measures with a given significance.
+    Return the flux of the point source that an exposure measures with a given significance.
 
     It is the limit of `~miricigale.photometry.ErrorModel.from_exposure` and of plans, and by default that of
     surveys in flight.
@@ -317,7 +317,7 @@ def sensitivity(
 
 
 def _fit_limit(filter, time, n_sigma, residual, excess, n_dithers, options):
-    """Flux in uJy that a fit measures with the given significance; options as for `sensitivity`."""
+    """Return the flux in uJy that a fit measures with the given significance; options as for `sensitivity`."""
     check_positive(n_sigma, "n_sigma")
     filter = etc_setup(filter).filter
     check_least(n_dithers, "n_dithers", 1, whole=True)
@@ -347,7 +347,7 @@ def _fit_limit(filter, time, n_sigma, residual, excess, n_dithers, options):
 
 def _limit(linear, constant):
     """
-    Flux whose own photons add to its noise: the positive root of F^2 = linear F + constant.
+    Return the flux whose own photons add to its noise: the positive root of F^2 = linear F + constant.
 
     A flux F of n sigma with the variance V + s F has F^2 = n^2 (V + s F).
     """
@@ -385,7 +385,7 @@ _COLUMNS = {"noise": "white", "residual": "residual", "limit_white": "flux_white
 
 def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=5.0, **options):
     """
-    Limits of several filters in apertures, compared with those of the exposure time calculator.
+    Return the limits of several filters in apertures, compared with those of the exposure time calculator.
 
     Parameters
     ----------

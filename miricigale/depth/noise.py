@@ -107,7 +107,7 @@ class ExposureNoise:
 
     def variance(self, further=0.0):
         """
-        Variance of the mean slope.
+        Return the variance of the mean slope.
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class ExposureNoise:
 
 def ramp_variance(rate, *, n_groups, group_time, read_noise, n_frames=1):
     """
-    Variance of the optimally weighted slope of one ramp, (electrons per second) squared.
+    Return the variance of the optimally weighted slope of one ramp, (electrons per second) squared.
 
     The differences of groups have Poisson variance on the diagonal (``rate`` in electrons per
     second times ``group_time`` in s) and share the ``read_noise`` (electrons) with their
@@ -162,7 +162,7 @@ def _averaged_sum(n_differences, photons, read, n_frames):
 
 def noise_power(weights, correlation=None):
     """
-    Variance of a weighted sum of pixels of unit variance: the sum of w_i w_j rho_ij.
+    Return the variance of a weighted sum of pixels of unit variance: the sum of w_i w_j rho_ij.
 
     ``correlation`` is the Gaussian width in pixels with which white noise was smoothed (and brought
     back to unit variance); None or 0 for white noise.
@@ -180,7 +180,7 @@ def noise_power(weights, correlation=None):
 
 
 def pattern_amplitude(residual, filter):
-    """Fraction of the light that stays as a pattern: none, a number, or by its name."""
+    """Return the fraction of the light that stays as a pattern: none, a number, or by its name."""
     if residual is None or residual is False:
         return 0.0
     if isinstance(residual, str):

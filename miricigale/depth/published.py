@@ -62,7 +62,7 @@ class EtcSetup:
 
 def etc_setup(filter):
     """
-    Exposures and extraction behind the published limits: 10 sigma in 10 ks.
+    Return the exposures and extraction behind the published limits: 10 sigma in 10 ks.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def etc_limit(filter, version="4.0"):
 
 def scaled_limit(filter, time, *, n_sigma=5.0, version="4.0"):
     """
-    The calculator's limit scaled to another exposure, as the root of the time.
+    Return the calculator's limit scaled to another exposure, as the root of the time.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def scaled_limit(filter, time, *, n_sigma=5.0, version="4.0"):
 
 def proposal_limit(filter):
     """
-    The 5-sigma limit that the CEERS proposal quotes for its exposures.
+    Return the 5-sigma limit that the CEERS proposal quotes for its exposures.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def proposal_limit(filter):
 
 def residual_presets():
     """
-    Names of the sets of residuals that `residual_amplitude` knows.
+    Return the names of the sets of residuals that `residual_amplitude` knows.
 
     Examples
     --------
@@ -200,7 +200,7 @@ def residual_presets():
 
 def residual_amplitude(filter, preset="etc"):
     """
-    Size of the fixed pattern that flat field and sky subtraction leave behind.
+    Return the size of the fixed pattern that flat field and sky subtraction leave behind.
 
     Parameters
     ----------

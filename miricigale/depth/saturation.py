@@ -73,7 +73,7 @@ class SaturationForecast:
     @classmethod
     def from_rate(cls, rate, exposure, limit, sources=None):
         """
-        Forecast from the rate of charge of every pixel.
+        Return the forecast from the rate of charge of every pixel.
 
         Parameters
         ----------
@@ -119,7 +119,7 @@ class SaturationForecast:
 
     def describe(self):
         """
-        One line of text, for a log.
+        Return one line of text, for a log.
 
         Returns
         -------
@@ -142,7 +142,7 @@ class SaturationForecast:
 
 def saturation_forecast(exposure, *, background=None, detector=None):
     """
-    How full the sky and the dark current make the wells by the end of an integration.
+    Tell how full the sky and the dark current make the wells by the end of an integration.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def saturation_forecast(exposure, *, background=None, detector=None):
 
 def saturation_time(filter, *, background=None, detector=None):
     """
-    Time in which the sky and the dark current fill the well.
+    Return the time in which the sky and the dark current fill the well.
 
     Parameters are those of `saturation_forecast`, with the filter for the exposure.
 
@@ -221,7 +221,7 @@ def saturation_group(rate, limit, step):
 
 
 def _sources(sources, rate, group, limit, exposure):
-    """The table of sources on the image."""
+    """Return the table of sources on the image."""
     if sources is None:
         sources = QTable({"id": np.zeros(0, int), "x": np.zeros(0), "y": np.zeros(0)})
     require_columns(sources, ("id", "x", "y"), "sources")
@@ -244,7 +244,7 @@ def _sources(sources, rate, group, limit, exposure):
 
 def forecast_table(forecasts):
     """
-    Forecasts of several exposures side by side.
+    Return the forecasts of several exposures side by side.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ def _table():
 
 def zodiacal_levels():
     """
-    Names of the levels of `zodiacal_factor`, from dark to bright.
+    Return the names of the levels of `zodiacal_factor`, from dark to bright.
 
     Examples
     --------
@@ -104,7 +104,7 @@ def zodiacal_factor(filter, level="medium", *, position=None, date=None):
 
 def sky_background(filter, level="low", *, position=None, date=None):
     """
-    Background of sky and telescope by level, position or day.
+    Return the background of sky and telescope by level, position or day.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def sky_background(filter, level="low", *, position=None, date=None):
 
 
 def _factor_on(name, position, date):
-    """Light of the model of Kelsall et al. 1998 on a day, over the low one."""
+    """Return the light of the model of Kelsall et al. 1998 on a day, over the low one."""
     sun = get_sun(date)
     angle = position.separation(SkyCoord(sun.ra, sun.dec)).deg
     nearest, farthest = _FIELD_OF_REGARD

@@ -65,7 +65,7 @@ class Charge(Timed):
     meta: dict
 
     def shows(self, kind):
-        """Whether an effect acted, as for `Ramp.shows`."""
+        """Tell whether an effect acted, as for `Ramp.shows`."""
         return self._effect(kind) is not None
 
     @property
@@ -97,7 +97,7 @@ class Charge(Timed):
         return level.mean(axis=0)
 
     def measured(self, electrons):
-        """DN above the level that charges read."""
+        """Return the DN above the level that charges read."""
         dn = np.asarray(electrons, float) / self.properties.gain
         effect = self._effect(Nonlinearity)
         if effect is None:
@@ -105,7 +105,7 @@ class Charge(Timed):
         return effect.response(dn, self.properties)
 
     def limit(self, dn):
-        """Charge in electrons that reads ``dn`` above the level, or at which the pixel is full."""
+        """Return the charge in electrons that reads ``dn`` above the level, or at which the pixel is full."""
         effect = self._effect(Nonlinearity)
         linear = dn
         if effect is not None:

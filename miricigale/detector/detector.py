@@ -112,7 +112,7 @@ class Detector(Interactive):
     @classmethod
     def miri_imager(cls, *effects, properties=None):
         """
-        The MIRI imager's detector.
+        Return the MIRI imager's detector.
 
         Parameters
         ----------
@@ -190,7 +190,7 @@ class Detector(Interactive):
 
     def without(self, *kinds):
         """
-        Detector without some effects.
+        Return the detector without some effects.
 
         Parameters
         ----------

@@ -88,7 +88,7 @@ class Latent(Frozen):
     @classmethod
     def from_ramp(cls, ramp, gap, *, threshold=0.1):
         """
-        What a ramp leaves behind.
+        Return what a ramp leaves behind.
 
         Parameters
         ----------
@@ -141,7 +141,7 @@ class Latent(Frozen):
 
 
 def checked_previous(previous, exposure):
-    """Exposures before one, a `Latent` or several, as a tuple; those of other pixels are refused."""
+    """Return the exposures before one, a `Latent` or several, as a tuple; those of other pixels are refused."""
     if previous is None:
         return ()
     if np.iterable(previous):

@@ -33,7 +33,7 @@ _START = "2022-06-21T00:00:00"
 
 def header(exposure, *, filename="", start=None):
     """
-    Headers of the primary and the SCI extension of a file (without the structural keywords).
+    Return the headers of the primary and the SCI extension of a file (without the structural keywords).
 
     ``start`` is the `~astropy.time.Time` when the exposure began; 2022-06-21 plus an hour for each
     dither if not given.
@@ -83,7 +83,7 @@ def header(exposure, *, filename="", start=None):
 
 
 def keywords(exposure):
-    """Keywords of an exposure in one header."""
+    """Return the keywords of an exposure in one header."""
     primary, science = header(exposure)
     primary.update(science)
     return primary

@@ -144,7 +144,7 @@ class Ramp(Interactive, NDData):
         super().__setattr__(name, value)
 
     def _values(self):
-        """Arguments by which the ramp can be made again, but for data and exposure."""
+        """Return the arguments by which the ramp can be made again, but for data and exposure."""
         names = ("pixel_dq", "group_dq", "effects", "properties", "steps")
         values = attributes(self, names)
         return values | {"header": self._header, "meta": dict(self.meta)}
@@ -191,7 +191,7 @@ class Ramp(Interactive, NDData):
 
     def integration(self, number):
         """
-        One integration as a ramp of its own.
+        Return one integration as a ramp of its own.
 
         Parameters
         ----------
@@ -289,7 +289,7 @@ class Ramp(Interactive, NDData):
 
     def shows(self, kind):
         """
-        Whether an effect acted on this ramp.
+        Tell whether an effect acted on this ramp.
 
         Parameters
         ----------

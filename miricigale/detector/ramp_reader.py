@@ -120,7 +120,7 @@ def _ramp_shape(path, head):
 
 
 def _exposure(path, header, shape):
-    """The exposure that the keywords and the shape describe."""
+    """Return the exposure that the keywords and the shape describe."""
     n_int, n_group, *size = shape
     name, readout, part, dither = exposure_keywords(header)
     for key, value in (("READPATT", readout), ("SUBARRAY", part)):
@@ -198,12 +198,12 @@ def _check_header(path, header, exposure):
 
 
 def _is_time(value, true):
-    """Whether a time in a header is that of the table, which is rounded to a millisecond or three digits."""
+    """Tell whether a time in a header is that of the table, which is rounded to a millisecond or three digits."""
     return value is not None and abs(value - true) < 5e-3 * true
 
 
 def _counts(hdu):
-    """Counts as they are kept, in the byte order of the machine."""
+    """Return the counts as they are kept, in the byte order of the machine."""
     if hdu.data.dtype.kind == "f":
         return np.asarray(hdu.data, np.float32)
     data = hdu.data.astype(np.uint16)
@@ -213,7 +213,7 @@ def _counts(hdu):
 
 
 def _flags(path, hdus, exposure, shape):
-    """Flags of pixels and groups, as far as the file has them; reference pixels are always known."""
+    """Return the flags of pixels and groups, as far as the file has them; reference pixels are always known."""
     pixel_dq = np.zeros(shape[2:], np.uint32)
     planes = {"SIM_PIXELDQ", "PIXELDQ"} & {hdu.name for hdu in hdus}
     for name in sorted(planes):

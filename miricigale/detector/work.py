@@ -101,7 +101,7 @@ class Work:
         return mean, electrons, places, np.concatenate([charge for _, charge in hits]), pixel_dq
 
     def _with_halo(self, rows, chain):
-        """Rows that the effects of a chain need for some rows, and where these are in them."""
+        """Return the rows that the effects of a chain need for some rows, and where these are in them."""
         halo = sum(effect.halo for effect, _ in chain)
         wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.light.shape[0]))
         return wide, slice(rows.start - wide.start, rows.stop - wide.start)

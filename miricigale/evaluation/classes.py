@@ -18,7 +18,7 @@ CLASS_LIMITS = (0.1, 0.4)
 
 def classify(frac_agn, *, limits=CLASS_LIMITS):
     """
-    Class of each source from its fracAGN.
+    Return the class of each source from its fracAGN.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def classify(frac_agn, *, limits=CLASS_LIMITS):
 
 def confusion(true, found):
     """
-    How many sources of each true class were found in each class.
+    Tell how many sources of each true class were found in each class.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class SelectionQuality:
 
 def selection_quality(wanted, selected):
     """
-    Purity and completeness of a selection.
+    Return the purity and completeness of a selection.
 
     They mean something only in a sample with the right share of wanted sources: a realistic field, with
     sources that were not detected as rows that are not selected.
@@ -142,7 +142,7 @@ def selection_quality(wanted, selected):
 
 def sky_quality(galaxies, wanted, selected, weight):
     """
-    Purity and completeness of a selection in skies in which the same galaxies stand more than once.
+    Return the purity and completeness of a selection in skies in which the same galaxies stand more than once.
 
     Parameters
     ----------

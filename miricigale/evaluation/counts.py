@@ -33,7 +33,7 @@ CEERS_DUST = convert_values(tuple, _TABLES["ceers_dust"])
 
 def main_sequence_sfr(stellar_mass, age_of_universe):
     """
-    Star-formation rate of the main sequence.
+    Return the star-formation rate of the main sequence.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def main_sequence_sfr(stellar_mass, age_of_universe):
 
 def sfr_to_infrared_luminosity(sfr):
     """
-    Infrared (8-1000 um) luminosity of a dusty galaxy of given star-formation rate.
+    Return the infrared (8-1000 um) luminosity of a dusty galaxy of given star-formation rate.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def dust_obscured_fraction(stellar_mass):
 
 def uvj_quiescent(u_v, v_j, redshift):
     """
-    Whether galaxies are quiescent by their rest-frame colors.
+    Tell whether galaxies are quiescent by their rest-frame colors.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def uvj_quiescent(u_v, v_j, redshift):
 
 def main_sequence_dust(table, *, seed, scatter=0.2):
     """
-    Dust luminosities of star-forming galaxies that lie on the main sequence.
+    Return the dust luminosities of star-forming galaxies that lie on the main sequence.
 
     The star-formation rate of Speagle et al. 2014 for the galaxy's mass and redshift, its share that
     dust hides (`dust_obscured_fraction`) and the luminosity of that (Kennicutt & Evans 2012, log L
@@ -219,7 +219,7 @@ def main_sequence_dust(table, *, seed, scatter=0.2):
 
 def ceers_dust(table, component, *, seed):
     """
-    Dust luminosities of galaxies that have the dust colors of CEERS.
+    Return the dust luminosities of galaxies that have the dust colors of CEERS.
 
     Drawn from the distribution in ``CEERS_DUST``: log10 of the luminosity over the mass is normal about a mean
     that rises with the mass and the specific star-formation rate, whatever the fitted attenuation took; of
@@ -302,7 +302,7 @@ def _dust_table(ids, quiescent, dust, excess):
 
 def number_counts(flux, area, edges):
     """
-    Differential number counts in bins of magnitude.
+    Return the differential number counts in bins of magnitude.
 
     Parameters
     ----------
@@ -338,7 +338,7 @@ def number_counts(flux, area, edges):
 
 def integrated_light(flux, area, wavelength):
     """
-    Surface brightness of all sources together.
+    Return the surface brightness of all sources together.
 
     Parameters
     ----------

@@ -72,12 +72,12 @@ class Estimate:
 
 
 def median(values):
-    """Median along the last axis without NaN: a statistic for `bootstrap`."""
+    """Return the median along the last axis without NaN: a statistic for `bootstrap`."""
     return np.nanmedian(values, axis=-1)
 
 
 def scatter(values):
-    """`sigma_mad` along the last axis without NaN: a statistic for `bootstrap`."""
+    """Return the `sigma_mad` along the last axis without NaN: a statistic for `bootstrap`."""
     return sigma_mad(values, axis=-1, ignore_nan=True)
 
 
@@ -115,7 +115,7 @@ def weighted_share(found, among):
 
 def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):
     """
-    A statistic of a sample, with the scatter that it has in samples drawn with replacement.
+    Return a statistic of a sample, with the scatter that it has in samples drawn with replacement.
 
     Parameters
     ----------

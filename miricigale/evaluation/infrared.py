@@ -13,7 +13,7 @@ PAH_FEATURES = (3.3, 6.2, 7.7, 8.6, 11.3, 12.7) * u.um
 
 def feature_magnitude(width, redshift, filter_width):
     """
-    Magnitudes by which a feature within a broad band makes a source brighter.
+    Return the magnitudes by which a feature within a broad band makes a source brighter.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def feature_magnitude(width, redshift, filter_width):
 
 def feature_redshifts(feature, pivot, filter_width):
     """
-    Redshifts between which a feature is within a band.
+    Return the redshifts between which a feature is within a band.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def feature_redshifts(feature, pivot, filter_width):
 
 def feature_residuals(residual, redshift, *, feature, pivot, filter_width, seed):
     """
-    Median residuals in a band of sources with a feature in it, and of the others.
+    Return the median residuals in a band of sources with a feature in it, and of the others.
 
     Their difference is what the templates lack or have too much of the feature, to be compared with
     `feature_magnitude`.

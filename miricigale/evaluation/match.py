@@ -172,7 +172,7 @@ class _Candidates:
         self.separation[i[chosen]] = distance[chosen]
 
     def reasons(self, k):
-        """`AssociationFlags` of the rows of list ``k``."""
+        """Return the `AssociationFlags` of the rows of list ``k``."""
         flags = np.zeros(len(self.sky[k]), int)
         if k == 0:
             ambiguous = AssociationFlags.SEVERAL_SECOND

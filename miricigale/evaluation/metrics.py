@@ -14,7 +14,7 @@ OUTLIER = 0.15
 
 
 def one_by_one(dtype=float, **arrays):
-    """Two 1-D arrays of one length, of a type; an error by their names if they are not."""
+    """Return two 1-D arrays of one length, of a type; an error by their names if they are not."""
     (name, first), (second_name, second) = arrays.items()
     first = _plain_values(first, name, dtype)
     second = _plain_values(second, second_name, dtype)
@@ -25,7 +25,7 @@ def one_by_one(dtype=float, **arrays):
 
 
 def _plain_values(values, name, dtype):
-    """Values of a type: of numbers NaN where they are masked; others may not be masked."""
+    """Return the values of a type: of numbers NaN where they are masked; others may not be masked."""
     if dtype is float:
         return floats(values)
     values, mask = without_mask(values)
@@ -43,7 +43,7 @@ def _plain_values(values, name, dtype):
 
 def sigma_mad(values, *, axis=None, ignore_nan=False):
     """
-    Robust scatter: 1.48 times the median absolute deviation from the median.
+    Return the robust scatter: 1.48 times the median absolute deviation from the median.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def sigma_mad(values, *, axis=None, ignore_nan=False):
 
 def fraction_interval(n_success, n_total):
     """
-    A fraction with its 68 % interval (Wilson).
+    Return a fraction with its 68 % interval (Wilson).
 
     Parameters
     ----------
@@ -262,7 +262,7 @@ def recovery_metrics(true, measured, *, relative=False):
 
 def running_median(x, y, *, size=20):
     """
-    Median of ``y`` and ``x`` in consecutive bins of ``size`` points sorted by ``x``.
+    Return the median of ``y`` and ``x`` in consecutive bins of ``size`` points sorted by ``x``.
 
     Parameters
     ----------

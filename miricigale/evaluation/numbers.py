@@ -18,7 +18,7 @@ from miricigale.utils.tables import described_columns, described_rows
 
 def study_numbers(study, *, seed, n_draws=500):
     """
-    All numbers of the fits: each truth, each band set, whole sample and bins of redshift.
+    Return all numbers of the fits: each truth, each band set, whole sample and bins of redshift.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def study_numbers(study, *, seed, n_draws=500):
 
 def study_confusion(study, band_set="all"):
     """
-    Classes found of the sources of each true class, of all truths with one AGN fraction together.
+    Return the classes found of the sources of each true class, of all truths with one AGN fraction together.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def study_confusion(study, band_set="all"):
 
 def selection_table(sky, *, limits=CLASS_LIMITS):
     """
-    Purity and completeness of selections by the fitted AGN fraction in a realistic field.
+    Return the purity and completeness of selections by the fitted AGN fraction in a realistic field.
 
     Parameters
     ----------

@@ -89,7 +89,7 @@ _TABLE = tomllib.loads(_FILE.read_text(encoding="utf-8"))
 
 
 def _published(fields):
-    """A number from its fields in the file."""
+    """Return a number from its fields in the file."""
     fields["definition"] = fields.get("definition", "").format_map(_TABLE["texts"])
     fields["why"] = _TABLE["measured"].get(fields["key"], "")
     if fields.get("truth") == "above 0":
@@ -201,7 +201,7 @@ def _difference(number, ours):
 
 
 def _excess(published, ours):
-    """How much our value, or of a bound its size, is above the published one."""
+    """Tell how much our value, or of a bound its size, is above the published one."""
     value = ours.value
     if published.relation == "<":
         value = abs(value)
@@ -209,7 +209,7 @@ def _excess(published, ours):
 
 
 def _verdict(published, ours, sigma, why):
-    """Whether the two agree, in words."""
+    """Tell whether the two agree, in words."""
     if not np.isfinite(ours.value):
         return "not measured"
     if published.relation in "<>" and sigma == 0:

@@ -41,7 +41,7 @@ _ROWS = 4096  # computed together
 
 def xray_luminosity_function(l_x, redshift):
     """
-    Luminosity function of Compton-thin AGN.
+    Return the luminosity function of Compton-thin AGN.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def xray_obscured_fraction(l_x, redshift):
 
 def galaxy_mass_function(stellar_mass, redshift):
     """
-    Stellar mass function of all galaxies.
+    Return the stellar mass function of all galaxies.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def galaxy_mass_function(stellar_mass, redshift):
 
 def agn_fraction(l_6um, reference):
     """
-    AGN fraction that gives an AGN a luminosity at 6 um.
+    Return the AGN fraction that gives an AGN a luminosity at 6 um.
 
     The AGN's power goes as f / (1 - f), in either definition of ``frac_agn``.
 
@@ -233,7 +233,7 @@ class AGNPopulation:
 
     def density(self, stellar_mass, redshift, l_x):
         """
-        Probability in log luminosity that a galaxy has an AGN.
+        Return the probability in log luminosity that a galaxy has an AGN.
 
         Parameters
         ----------
@@ -264,7 +264,7 @@ class AGNPopulation:
         return out
 
     def _cumulative(self, log_mass, redshift):
-        """Probabilities of an AGN of at least each luminosity of the grid; 1 at most."""
+        """Return the probabilities of an AGN of at least each luminosity of the grid; 1 at most."""
         log_l = self._log_l
         density = self._density(log_mass, redshift, log_l)
         parts = 0.5 * (density[:, 1:] + density[:, :-1]) * np.diff(log_l)
@@ -274,7 +274,7 @@ class AGNPopulation:
 
     def probability(self, stellar_mass, redshift):
         """
-        Probability that a galaxy has an AGN of at least the least luminosity.
+        Return the probability that a galaxy has an AGN of at least the least luminosity.
 
         Parameters
         ----------
@@ -366,7 +366,7 @@ def _galaxies(stellar_mass, redshift):
 
 
 def _xlf(log_l, z):
-    """Luminosity function in Mpc^-3 dex^-1."""
+    """Return the luminosity function in Mpc^-3 dex^-1."""
     c = _LDDE
     z1 = c["z1"] * 10.0 ** (c["alpha1"] * np.minimum(log_l - c["la1"], 0.0))
     z2 = c["z2"] * 10.0 ** (c["alpha2"] * np.minimum(log_l - c["la2"], 0.0))
@@ -380,14 +380,14 @@ def _xlf(log_l, z):
 
 
 def _psi(log_l, z):
-    """Obscured among Compton-thin AGN."""
+    """Return the obscured share of Compton-thin AGN."""
     c = _PSI
     middle = c["at"] * (1.0 + np.minimum(z, c["until"])) ** c["evolution"]
     return np.clip(middle - c["slope"] * (log_l - 43.75), c["low"], c["high"])
 
 
 def _smf(log_mass, z):
-    """Mass function in Mpc^-3 dex^-1."""
+    """Return the mass function in Mpc^-3 dex^-1."""
     middles = 0.5 * (_SMF_EDGES[1:] + _SMF_EDGES[:-1])
     place = np.interp(z, middles, np.arange(middles.size))
     low = np.minimum(place.astype(int), middles.size - 2)
@@ -398,7 +398,7 @@ def _smf(log_mass, z):
 
 
 def _log_schechter(log_mass, row):
-    """Natural log of the mass function of a redshift bin."""
+    """Return the natural log of the mass function of a redshift bin."""
     star, slope1, phi1, slope2, phi2 = np.moveaxis(_SMF[row], -1, 0)
     x = 10.0 ** (log_mass - star)
     return np.log(np.log(10.0) * 1e-3 * x * (phi1 * x**slope1 + phi2 * x**slope2)) - x
@@ -406,7 +406,7 @@ def _log_schechter(log_mass, row):
 
 def _accretion(log_l_over_mass):
     """
-    Probability of a specific accretion rate, on an arbitrary scale.
+    Return the probability of a specific accretion rate, on an arbitrary scale.
 
     A power law with a break at the Eddington limit, and a Gaussian in the log of the black hole's
     mass, integrated in closed form.

@@ -38,7 +38,7 @@ def _share(is_detected, n_all=None):
 
 
 def _in_bin(sky, option):
-    """Rows of the sample in a bin of true redshift (all without), and sources of the field in it."""
+    """Return the rows of the sample in a bin of true redshift (all without), and sources of the field in it."""
     low, high = option or (0.0, np.inf)
     z = floats(sky.truth["redshift"])
     rows = (z >= low) & (z < high)
@@ -46,7 +46,7 @@ def _in_bin(sky, option):
 
 
 def _of_sample(values, statistic):
-    """Quantity that is a statistic of values of the sample, by bin of redshift."""
+    """Return the quantity that is a statistic of values of the sample, by bin of redshift."""
 
     def measure(_, sky, band_set, option, draws):
         rows, n_all = _in_bin(sky, option)
@@ -59,7 +59,7 @@ def _of_sample(values, statistic):
 
 
 def _ratio(values, statistic):
-    """Ratio of a statistic of values of the sample without MIRI to that with a band set."""
+    """Return the ratio of a statistic of values of the sample without MIRI to that with a band set."""
 
     def paired_columns(sky, band_set):
         return values(sky, "none"), values(sky, band_set)
@@ -82,7 +82,7 @@ def _high(values):
 
 
 def _trend(values, statistic):
-    """Ratio of a statistic at one AGN fraction to that at another, of the same sources."""
+    """Return the ratio of a statistic at one AGN fraction to that at another, of the same sources."""
 
     def measure(study, _, band_set, option, draws):
         ends = [study.at(frac) for frac in option]
@@ -141,7 +141,7 @@ def _types_known(study, sky, band, kinds):
 
 
 def _of_kind(sky, band, kind):
-    """Sources by shape or with a bright neighbor in a band; with "not " before it the others."""
+    """Return the sources by shape or with a bright neighbor in a band; with "not " before it the others."""
     if kind.startswith("not "):
         return ~_of_kind(sky, band, kind.removeprefix("not "))
     if kind == "crowded":
@@ -173,14 +173,14 @@ def _kind_errors(statistic):
 
 
 def _bright_error(study, sky, _, band, draws):
-    """Median size of measured minus true magnitude of the 30 brightest of the field in a band."""
+    """Return the median size of measured minus true magnitude of the 30 brightest of the field in a band."""
     rows = np.flatnonzero(sky.field & np.isfinite(sky.magnitude_error(band)))
     order = np.argsort(-sky.matched[f"{band}_true"][rows])
     return draws(_median, np.abs(sky.magnitude_error(band)[rows[order[:_FEW]]]))
 
 
 def _signal_to_noise(study, sky, _, band, draws):
-    """Median ratio of flux to error in a band, of the sample."""
+    """Return the median ratio of flux to error in a band, of the sample."""
     ratio = (sky.matched[band] / sky.matched[error_column(band)]).to_value(u.one)
     return draws(_median, ratio[sky.sample], n_all=int(np.count_nonzero(sky.field)))
 
@@ -202,7 +202,7 @@ def _class_share(study, sky, band_set, option, draws):
 
 
 def _truths(study, sky, column):
-    """One truth, or all with an AGN if none is given, that have a column."""
+    """Return one truth, or all with an AGN if none is given, that have a column."""
     truths = (sky,)
     if sky is None:
         truths = study.with_agn
@@ -262,7 +262,7 @@ def _xray_luminosity(study, sky, band_set, redshift, draws):
 
 
 def _feature(study, sky, band_set, option, draws):
-    """Magnitudes that a feature of given equivalent width (um) adds to a band at a redshift."""
+    """Return the magnitudes that a feature of given equivalent width (um) adds to a band at a redshift."""
     band, width, redshift = option
     value = feature_magnitude(width * u.um, redshift, Filter.from_name(band).width)
     return Estimate(float(value))
@@ -319,7 +319,7 @@ _OF_BANDS = ("etc_limit", "bright_error", "signal_to_noise")
 
 def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_draws=1000):
     """
-    One quantity of a study.
+    Return one quantity of a study.
 
     Parameters
     ----------

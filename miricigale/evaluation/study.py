@@ -94,23 +94,23 @@ class TruthResults:
         return np.asarray(self.matched["selection"]) == 0
 
     def true(self, name):
-        """True values of the sample."""
+        """Return the true values of the sample."""
         return floats(self.truth[name])[self.sample]
 
     def fitted(self, band_set, name):
-        """A column of a fit as plain numbers; NaN throughout if the truth has no such fit."""
+        """Return a column of a fit as plain numbers; NaN throughout if the truth has no such fit."""
         if band_set not in self.fits:
             return np.full(np.count_nonzero(self.sample), np.nan)
         column = self.fits[band_set][name]
         return floats(column)
 
     def redshift_error(self, band_set):
-        """(z_fit - z) / (1 + z) of the sample."""
+        """Return (z_fit - z) / (1 + z) of the sample."""
         z = self.true("redshift")
         return (self.fitted(band_set, "redshift_mean") - z) / (1 + z)
 
     def fraction_error(self, band_set):
-        """Fitted minus true AGN fraction of the sample."""
+        """Return the fitted minus true AGN fraction of the sample."""
         return self.fitted(band_set, "frac_agn_mean") - self.true("frac_agn")
 
     def power_error(self, band_set):
@@ -122,7 +122,7 @@ class TruthResults:
         return np.log10(ratio.to_value(u.one))
 
     def magnitude_error(self, band):
-        """Measured minus true magnitude of all sources in a band; NaN where not both are positive."""
+        """Return the measured minus true magnitude of all sources in a band; NaN where not both are positive."""
         measured = self.matched[band].to_value(FNU)
         true = self.matched[f"{band}_true"].to_value(FNU)
         good = (measured > 0) & (true > 0)
@@ -130,7 +130,7 @@ class TruthResults:
         return -2.5 * np.log10(ratio)
 
     def is_bright(self, band):
-        """Whether the true flux of all sources is above 5 sigma of the measured one in a band."""
+        """Tell whether the true flux of all sources is above 5 sigma of the measured one in a band."""
         # by measured flux it would be those that noise made brighter
         return self.matched[f"{band}_true"] > 5 * self.matched[error_column(band)]
 
@@ -142,7 +142,7 @@ class TruthResults:
         return {"point": point, "n < 2": ~point & (index < 2), "n >= 2": ~point & (index >= 2)}
 
     def of_catalog(self, values):
-        """Values of the sample at the rows of the catalog, NaN elsewhere."""
+        """Return the values of the sample at the rows of the catalog, NaN elsewhere."""
         out = np.full(len(self.truth), np.nan)
         out[self.sample] = values
         return out
@@ -195,7 +195,7 @@ class StudyResults:
     extra: dict = dataclasses.field(default_factory=dict)
 
     def at(self, frac_agn):
-        """The truth of an AGN fraction, or None."""
+        """Return the truth of an AGN fraction, or None."""
         for sky in self.truths:
             if sky.frac_agn is not None and np.isclose(sky.frac_agn, frac_agn, atol=1e-6):
                 return sky
@@ -207,5 +207,5 @@ class StudyResults:
         return tuple(sky for sky in self.truths if sky.frac_agn)
 
     def prior_magnitude(self, sky):
-        """AB magnitudes of all sources of a truth in the prior's band."""
+        """Return the AB magnitudes of all sources of a truth in the prior's band."""
         return ab_magnitude(sky.truth[self.prior_band])

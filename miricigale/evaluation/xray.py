@@ -66,7 +66,7 @@ XRAY_LIMITS = tuple(XRayLimit(row[0], row[1] * _CGS, *row[2:]) for row in _XRAY_
 
 def yang2021_xray_flux(l_6um, redshift):
     """
-    X-ray flux of an AGN as Yang et al. 2021 take it from the infrared.
+    Return the X-ray flux of an AGN as Yang et al. 2021 take it from the infrared.
 
     2-10 keV luminosity by `~miricigale.sed.stern2015`, a power law of Gamma 1.8, observed in 0.5-7 keV
     and halved for absorption.
@@ -96,7 +96,7 @@ def yang2021_xray_flux(l_6um, redshift):
 
 def xray_luminosity_at(flux, redshift):
     """
-    Rest-frame 2-10 keV luminosity, without absorption, of a source of a flux of `yang2021_xray_flux`.
+    Return the rest-frame 2-10 keV luminosity, without absorption, of a source of a flux of `yang2021_xray_flux`.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def completeness(values, found, edges):
 
 def half_complete(values, found):
     """
-    Value above which sources are more likely found than not.
+    Return the value above which sources are more likely found than not.
 
     The share found is taken as an error function of the value that rises to a share of the bright ones (some
     are lost whatever their value), with center, width and share of the highest likelihood.

@@ -25,7 +25,7 @@ _XRAY = re.compile(r"xray_boxcar_(\d+(?:p\d+)?)to(\d+(?:p\d+)?)keV")
 
 @cached
 def _tables():
-    """Names without a rule, rules of CIGALE's names, and rules of names written in any way."""
+    """Return the names without a rule, rules of CIGALE's names, and rules of names written in any way."""
     tables = declared("miricigale.filters", "band_names.toml")
     rules = [(re.compile(rule), ours, *back) for rule, ours, *back in tables["rules"]]
     patterns = [(re.compile(rule, re.IGNORECASE), ours) for rule, ours in tables["free"]]
@@ -243,7 +243,7 @@ def _by_rule(band):
 @cached
 def cigale_band(name):
     """
-    Band of CIGALE that a filter is.
+    Return the band of CIGALE that a filter is.
 
     Parameters
     ----------
@@ -279,7 +279,7 @@ def cigale_band(name):
 
 
 def is_line(band):
-    """Whether a band is an emission line, in W/m2."""
+    """Tell whether a band is an emission line, in W/m2."""
     return band.startswith(("line.", "linefilter."))
 
 
@@ -294,7 +294,7 @@ def xray_energies(band):
 
 def band_filters(bands, names):
     """
-    Filters of bands: a dict of our name to CIGALE's, and the bands without a filter here.
+    Return the filters of bands: a dict of our name to CIGALE's, and the bands without a filter here.
 
     ``names`` are filters that the user gave by CIGALE's names, as `given_filters` has them. Emission lines
     have no filter; two bands of the same filter are a ValueError. X-ray bands (`xray_energies`) keep their names.

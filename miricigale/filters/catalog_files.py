@@ -93,7 +93,7 @@ def mapped_table(path, catalog_map, hdu=None):
 
 
 def as_catalog_map(catalog_map, options=None):
-    """A `CatalogMap` of what a caller gave: one, the name of a survey or a file, with keyword arguments."""
+    """Return a `CatalogMap` of what a caller gave: one, the name of a survey or a file, with keyword arguments."""
     if hasattr(catalog_map, "trans") and hasattr(catalog_map, "error"):
         catalog_map = CatalogMap.from_translate(catalog_map)
     elif isinstance(catalog_map, str) and "\n" in catalog_map:
@@ -112,7 +112,7 @@ def as_catalog_map(catalog_map, options=None):
 
 
 def _is_file_name(text):
-    """Whether a text is the name of a file rather than of a survey."""
+    """Tell whether a text is the name of a file rather than of a survey."""
     return text.lower().endswith((".toml",) + TRANSLATE_SUFFIXES) or os.sep in text
 
 
@@ -140,7 +140,7 @@ def catalog_messages(lost, pieces):
 
 def codes_of(table, bands):
     """
-    Numbers of a table that stand for no value (`miricigale.utils.missing_values`).
+    Return the numbers of a table that stand for no value (`miricigale.utils.missing_values`).
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def codes_of(table, bands):
 
 def without_codes_of(table, coded):
     """
-    Table with missing fluxes and errors where `codes_of` found numbers for no value.
+    Return the table with missing fluxes and errors where `codes_of` found numbers for no value.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ class CountedRows:
         return getattr(self._rows, name)
 
     def chunk(self, i):
-        """A piece of the table."""
+        """Return a piece of the table."""
         table = self._rows.chunk(i)
         start, _ = self._rows.span(i)
         table.add_column(counted_ids(table, self._rows.path.name, start), index=0, name="id")
@@ -262,7 +262,7 @@ class MappedRows:
             return self.map.convert(self._rows.chunk(i), self._rows.path.name)
 
     def chunk(self, i):
-        """A piece of the table; its warnings are those of `messages`."""
+        """Return a piece of the table; its warnings are those of `messages`."""
         return self._convert(i, quiet=True)[0]
 
     def messages(self):

@@ -188,7 +188,7 @@ class CatalogMap:
         return ()
 
     def settings(self):
-        """What the map says, in plain values."""
+        """Return what the map says, in plain values."""
         values = field_values(self)
         if not self.limits:
             # as before limits were known, so that results of such maps can be resumed
@@ -204,7 +204,7 @@ class CatalogMap:
 
     def names(self, colnames, argument="catalog"):
         """
-        Our names of the columns of a file.
+        Return our names of the columns of a file.
 
         Parameters
         ----------
@@ -320,7 +320,7 @@ class CatalogMap:
         return values
 
     def _unit_of_column(self, name, column, of_flux, argument):
-        """Unit that the caller says a column has, or the file's; a warning where these differ."""
+        """Return the unit that the caller says a column has, or the file's; a warning where these differ."""
         asked_unit = self.units.get(name, self.units.get("flux") if of_flux else None)
         column_unit = getattr(column, "unit", None)
         if column_unit is not None:
@@ -397,7 +397,7 @@ class CatalogMap:
         return code
 
     def _errors(self, column, name, errors, flux, ab, argument):
-        """Errors of fluxes in uJy, from those in the file's unit."""
+        """Return the errors of fluxes in uJy, from those in the file's unit."""
         has_unit = not ab or name in self.units or "flux" not in self.units
         unit = u.mag
         if has_unit:
@@ -411,7 +411,7 @@ class CatalogMap:
 
 
 def _column_floats(column, name, argument):
-    """Numbers of a column that has one in each row (`miricigale.utils.missing_values.plain_floats`)."""
+    """Return the numbers of a column that has one in each row (`miricigale.utils.missing_values.plain_floats`)."""
     shape = np.shape(column)
     check_that(
         len(shape) == 1, argument, f"a table with one number in a row of {name!r}", f"shape {shape}"
@@ -420,7 +420,7 @@ def _column_floats(column, name, argument):
 
 
 def _translate_rows(text):
-    """Rows of a translate file of EAZY, in either of its forms: column, meaning and factor."""
+    """Return the rows of a translate file of EAZY, in either of its forms: column, meaning and factor."""
     lines = [line.partition("#")[0].strip().lstrip("\ufeff") for line in text.splitlines()]
     lines = [line for line in lines if line]
     with_commas = bool(lines) and lines[0].replace(" ", "").startswith("column,trans")
@@ -437,7 +437,7 @@ def _translate_rows(text):
 
 
 def _translated(rows, path):
-    """Arguments of a `CatalogMap` from the rows of a translate file of EAZY."""
+    """Return the arguments of a `CatalogMap` from the rows of a translate file of EAZY."""
     columns = {}
     factors = {}
     left_out = []
@@ -482,7 +482,7 @@ def _plain_ids(table, argument):
 
 
 def _angles(column, unit, name, argument):
-    """Angles from text such as 3:32:30.1."""
+    """Return the angles from text such as 3:32:30.1."""
     try:
         return u.Quantity(Angle(np.asarray(column).astype(str), unit).to(u.deg))
     except (ValueError, u.UnitsError) as err:
@@ -492,7 +492,7 @@ def _angles(column, unit, name, argument):
 
 
 def _unit(unit, name):
-    """A unit that the caller gave; AB magnitudes by any of their names."""
+    """Return a unit that the caller gave; AB magnitudes by any of their names."""
     flux = None
     if isinstance(unit, (str, u.UnitBase)):
         flux = flux_unit(unit)

@@ -116,7 +116,7 @@ def read_curve(path, unit=None):
 
 
 def _ascending(wave, throughput, path):
-    """A curve in the order of its wavelengths, with vertical edges of a finite width."""
+    """Return a curve in the order of its wavelengths, with vertical edges of a finite width."""
     if wave.size and wave[0] > wave[-1]:
         # the sides of a vertical edge in their order
         wave = wave[::-1]
@@ -141,7 +141,7 @@ def _ascending(wave, throughput, path):
 
 
 def _not_negative(throughput, path):
-    """Throughput with negative points at zero, and their number."""
+    """Return the throughput with negative points at zero, and their number."""
     peak = np.nanmax(throughput, initial=0.0)
     lowest = np.nanmin(throughput, initial=0.0)
     problem = f"has a throughput of {lowest:.3g}, beside a peak of {peak:.3g}"
@@ -199,7 +199,7 @@ def _unit_of_column(column, name, path):
 
 
 def _parameters(path):
-    """Parameters of the first table of a VOTable by name, as the SVO gives the type of the detector."""
+    """Return the parameters of the first table of a VOTable by name, as the SVO gives the type of the detector."""
     from astropy.io import votable
 
     with packed_open(path) as stream:
@@ -234,7 +234,7 @@ def _of_text(path, unit):
 
 
 def _text_rows(path):
-    """Comments of a text file, and the words of its rows of numbers."""
+    """Return the comments of a text file, and the words of its rows of numbers."""
     unpacked_size(path)
     try:
         with packed_open(path) as stream:
@@ -293,7 +293,7 @@ def _is_number(text):
 
 
 def _two_columns(rows):
-    """Wavelengths and throughput; of three columns the first of which counts the rows, the others."""
+    """Return the wavelengths and throughput; of three columns the first of which counts the rows, the others."""
     if len(rows) < 2:
         raise ValueError
     numbered = all(len(row) == 3 for row in rows) and len(rows) > 2
@@ -306,7 +306,7 @@ def _two_columns(rows):
 
 def unit_of_comments(comments, path):
     """
-    Unit of the wavelengths that comments name.
+    Return the unit of the wavelengths that comments name.
 
     That of the line of the columns, which speaks of wavelengths, counts before that of other lines, and a unit
     after a number, which measures something, counts for nothing.

@@ -124,7 +124,7 @@ class Filter(Frozen, WithTable):
         }
 
     def _key(self):
-        """What makes two filters equal: name and curve, and how catalogs quote its fluxes."""
+        """Return what makes two filters equal: name and curve, and how catalogs quote its fluxes."""
         curve = self.wave.value.tobytes(), self.throughput.tobytes()
         return self.name, *curve, self.reference_wavelength, self.reference_temperature
 

@@ -74,7 +74,7 @@ def _is_path(text):
 
 def given_filters(names):
     """
-    Filters that a user of CIGALE gave for bands, a dict by the band of what `as_filter` takes.
+    Return the filters that a user of CIGALE gave for bands, a dict by the band of what `as_filter` takes.
 
     An X-ray band by its name (``xray_boxcar_0p5to2keV``) is a filter of that name, by which `xray_energies` knows
     it; a curve at its wavelengths is refused.

@@ -9,7 +9,7 @@ from miricigale.utils.units import WAVE, to_array
 
 def searched_wavelength(text):
     """
-    Wavelength that a search is for.
+    Return the wavelength that a search is for.
 
     Parameters
     ----------

@@ -98,7 +98,7 @@ class FilterSet(WithTable):
         return name in self.names or (isinstance(name, str) and find_filter(name) in self.names)
 
     def __getitem__(self, key):
-        """The filter of a name or number; for a slice, a list of names or numbers, or a mask, a set."""
+        """Return the filter of a name or number; for a slice, a list of names or numbers, or a mask, a set."""
         if isinstance(key, slice):
             return FilterSet(self.filters[key])
         is_mask = np.ndim(key) == 1 and np.asarray(key).dtype == bool
@@ -118,7 +118,7 @@ class FilterSet(WithTable):
         return self.names.index(known_filter(name, self.names, "filter in this set"))
 
     def _ipython_key_completions_(self):
-        """What a session offers in brackets: the names."""
+        """Return what a session offers in brackets: the names."""
         return list(self.names)
 
     def __repr__(self):
@@ -128,7 +128,7 @@ class FilterSet(WithTable):
         return FilterSet((*self.filters, *FilterSet(other).filters))
 
     def to_table(self):
-        """The filters as a `~astropy.table.QTable`: ``name``, ``pivot`` and ``width`` (um)."""
+        """Return the filters as a `~astropy.table.QTable`: ``name``, ``pivot`` and ``width`` (um)."""
         return _table(self.filters)
 
     def _repr_html_(self):
@@ -136,7 +136,7 @@ class FilterSet(WithTable):
 
     def weights(self, wave, *, tolerance=UNCOVERED):
         """
-        Weights of the values of a spectrum in each band.
+        Return the weights of the values of a spectrum in each band.
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class FilterSet(WithTable):
 
     def synthetic_fluxes(self, sed, flux=None):
         """
-        Mean flux densities of a spectrum; see `Filter.synthetic_flux`.
+        Return the mean flux densities of a spectrum; see `Filter.synthetic_flux`.
 
         Parameters
         ----------
@@ -191,7 +191,7 @@ class FilterSet(WithTable):
         return self.weights(wave) @ fnu * FNU
 
     def synthetic_magnitudes(self, sed, flux=None):
-        """AB magnitudes of a spectrum, NaN where the flux is not positive; see `synthetic_fluxes`."""
+        """Return the AB magnitudes of a spectrum, NaN where the flux is not positive; see `synthetic_fluxes`."""
         return ab_magnitude(self.synthetic_fluxes(sed, flux)) * u.ABmag
 
     def plot(self, ax=None, **kwargs):
@@ -219,7 +219,7 @@ class FilterSet(WithTable):
 
 def filter_table(pattern=""):
     """
-    The filters whose name holds a text, or that see a wavelength.
+    Return the filters whose name holds a text, or that see a wavelength.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def _table(filters):
 
 
 def _members(item, unit):
-    """The filters that an item of a set stands for."""
+    """Return the filters that an item of a set stands for."""
     if isinstance(item, str) and "*" in item:
         names = fnmatch.filter(Filter.names(), item.lower())
         if not names:

@@ -20,7 +20,7 @@ SEDPY = "sedpy."
 
 
 def curve_folder():
-    """The folder of astro-sedpy with the curves; the package itself is not imported."""
+    """Return the folder of astro-sedpy with the curves; the package itself is not imported."""
     spec = find_spec("sedpy")
     if spec is None or spec.origin is None:
         raise DataError("astro-sedpy with its curves is not installed: pip install astro-sedpy")
@@ -83,7 +83,7 @@ def _load(name):
 
 
 def load_curve(name):
-    """Wavelengths, throughput and options of `Filter` of a filter of the library."""
+    """Return the wavelengths, throughput and options of `Filter` of a filter of the library."""
     if name.startswith(SEDPY):
         curves = [path.stem for path in curve_folder().glob("*.par")]
         check_names([name.removeprefix(SEDPY)], "curve of astro-sedpy", curves)
@@ -92,7 +92,7 @@ def load_curve(name):
 
 
 def _register():
-    """The registry of ``library.toml``."""
+    """Return the registry of ``library.toml``."""
     registry = Registry("filter")
     for instrument, group in declared("miricigale.filters", "library.toml").items():
         bands = group["bands"]

@@ -39,7 +39,7 @@ _LIMIT = "_limit"
 
 def as_photometry(data, bands, argument="photometry", *, units=None):
     """
-    Catalog with columns by the names of bands, of any table.
+    Return the catalog with columns by the names of bands, of any table.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def _warn_of_codes(coded, argument):
 
 
 def _stated_units(table, names, bands, units):
-    """Units that a caller says of fluxes and errors without one: by our names of the columns."""
+    """Return the units that a caller says of fluxes and errors without one: by our names of the columns."""
     by_name = _units_in_names(table, names, bands)
     if units is None:
         return by_name
@@ -166,7 +166,7 @@ def _stated_units(table, names, bands, units):
 
 
 def _units_in_names(table, names, bands):
-    """Units at the end of names of columns that have no other, by our names of the columns."""
+    """Return the units at the end of names of columns that have no other, by our names of the columns."""
     units = {}
     for band in bands:
         for name in (band, error_column(band)):
@@ -210,14 +210,14 @@ def unit_of_fluxes(unit, argument="units"):
 
 
 def _is_of_prospector(data):
-    """Whether something is the photometry of an object as Prospector has it."""
+    """Tell whether something is the photometry of an object as Prospector has it."""
     if isinstance(data, Mapping):
         return {"filters", "maggies", "maggies_unc"} <= set(data)
     return all(hasattr(data, name) for name in ("filters", "flux", "uncertainty"))
 
 
 def _of_prospector(data):
-    """Columns of one row of the photometry of Prospector, in maggies; masked bands are missing."""
+    """Return the columns of one row of the photometry of Prospector, in maggies; masked bands are missing."""
     if isinstance(data, Mapping):
         flux = floats(data["maggies"])
         error = floats(data["maggies_unc"])
@@ -248,7 +248,7 @@ def _of_prospector(data):
 
 def band_columns(table, argument="photometry"):
     """
-    Columns that are fluxes or magnitudes, and errors, of bands under names other than ours.
+    Return the columns that are fluxes or magnitudes, and errors, of bands under names other than ours.
 
     Parameters
     ----------
@@ -293,7 +293,7 @@ def our_names(colnames):
 
 
 def _our_names(colnames, bands, argument):
-    """Our names of the columns that are fluxes and errors of bands, and of ids, to theirs."""
+    """Return our names of the columns that are fluxes and errors of bands, and of ids, to theirs."""
     errors = {error_column(name): name for name in bands}
     columns = {name: name for name in (*bands, *errors) if name in colnames}
     ids = id_column(colnames, argument)
@@ -329,7 +329,7 @@ def _our_names(colnames, bands, argument):
 
 
 def _magnitude_counts(band, columns, magnitudes):
-    """Whether the magnitude of a band is taken: without a flux, or with an error that the flux has not."""
+    """Tell whether the magnitude of a band is taken: without a flux, or with an error that the flux has not."""
     if band not in magnitudes:
         return False
     if band not in columns:
@@ -339,7 +339,7 @@ def _magnitude_counts(band, columns, magnitudes):
 
 
 def _matched(names, colnames, bands, argument):
-    """Our names of columns under other names, to theirs."""
+    """Return our names of columns under other names, to theirs."""
     matches = {}
     for theirs in names:
         ours = _band_of(theirs, bands)

@@ -12,7 +12,7 @@ from miricigale.utils.units import FNU, WAVE, is_ascending, to_array
 
 
 def check_wave(wave):
-    """Wavelengths of a spectrum as an array in um."""
+    """Return the wavelengths of a spectrum as an array in um."""
     if hasattr(wave, "unit"):
         wave = to_array(wave, WAVE, "wave")
     else:
@@ -36,7 +36,7 @@ def _is_spectrum(item):
 
 def spectrum_arrays(sed, bands):
     """
-    Wavelengths (um) and F_nu (uJy) of a spectrum.
+    Return the wavelengths (um) and F_nu (uJy) of a spectrum.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def spectrum_arrays(sed, bands):
 
 
 def _wave_and_flux(sed, bands):
-    """Wavelengths and flux densities of a spectrum as it has them: see `spectrum_arrays`."""
+    """Return the wavelengths and flux densities of a spectrum as it has them: see `spectrum_arrays`."""
     if hasattr(sed, "wave") and hasattr(sed, "fnu"):
         return sed.wave, sed.fnu
     if isinstance(sed, (tuple, list)) and len(sed) == 2:
@@ -109,7 +109,7 @@ def _wave_and_flux(sed, bands):
 
 
 def _without_missing(wave, fnu, missing):
-    """Samples of a spectrum that are not masked or NaN, with a warning about the others."""
+    """Return the samples of a spectrum that are not masked or NaN, with a warning about the others."""
     if not missing.any():
         return wave, fnu
     n_good = int(np.count_nonzero(~missing))
@@ -124,5 +124,5 @@ def _without_missing(wave, fnu, missing):
 
 
 def _inside(bands):
-    """Wavelengths of the curves of bands, refined."""
+    """Return the wavelengths of the curves of bands, refined."""
     return np.unique(np.concatenate([band._fine[0] for band in bands])) * WAVE

@@ -28,7 +28,7 @@ class _Survey:
     bands: dict = dataclasses.field(default_factory=dict)
 
     def columns(self, colnames):
-        """Our names of the columns that are there to theirs; the bands without a filter."""
+        """Return our names of the columns that are there to theirs; the bands without a filter."""
         columns = {}
         lost = []
         for ours, choices in self.names.items():
@@ -61,7 +61,7 @@ SURVEYS = types.MappingProxyType(
 
 
 def flux_bands(colnames):
-    """Those of some columns that are the fluxes of filters of the library."""
+    """Return those of some columns that are the fluxes of filters of the library."""
     bands = []
     for name in colnames:
         if is_band(name) and not name.endswith(error_column("")):
@@ -70,6 +70,6 @@ def flux_bands(colnames):
 
 
 def is_band(name):
-    """Whether a column is called by a filter of the library, or is the error of one."""
+    """Tell whether a column is called by a filter of the library, or is the error of one."""
     band = name.removesuffix(error_column(""))
     return band in Filter.names() or band.startswith("sedpy.")

@@ -130,14 +130,14 @@ def _relative_flux(magnitude, middle):
 
 
 def _first_middle(magnitude, recovered):
-    """Magnitude that parts recovered sources from the others with the fewest on the wrong side."""
+    """Return the magnitude that parts recovered sources from the others with the fewest on the wrong side."""
     order = np.argsort(magnitude, kind="stable")
     gain = np.cumsum(np.where(recovered[order], 1, -1))
     return magnitude[order][np.argmax(gain)]
 
 
 def _log_posterior(values, magnitude, recovered):
-    """Logarithm of the likelihood times weak priors that keep plateau and width finite."""
+    """Return the logarithm of the likelihood times weak priors that keep plateau and width finite."""
     raw_plateau, middle, log_width = values
     log_plateau = -np.logaddexp(0.0, -raw_plateau)
     log_rest = -np.logaddexp(0.0, raw_plateau)
@@ -152,7 +152,7 @@ def _log_posterior(values, magnitude, recovered):
 
 
 def _limit(values):
-    """Magnitude at which the curve is one half; NaN if it never is."""
+    """Return the magnitude at which the curve is one half; NaN if it never is."""
     raw_plateau, middle, log_width = values
     if raw_plateau <= logit(0.5):
         return np.nan
@@ -163,7 +163,7 @@ def _limit(values):
 
 
 def _limit_error(loss, best):
-    """Error of the limit by the curvature of the likelihood; NaN where it has none."""
+    """Return the error of the limit by the curvature of the likelihood; NaN where it has none."""
     n = len(best)
     steps = _STEP * np.eye(n)
     curvature = np.empty((n, n))

@@ -72,7 +72,7 @@ def check_psfs(photometer):
 
 def field_psfs(photometer, header, result):
     """
-    PSFs of an image and of its prior, as stars have corrected them.
+    Return the PSFs of an image and of its prior, as stars have corrected them.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class PriorField:
 
     def psfs(self, result):
         """
-        PSFs of the image and of the prior, as stars have corrected them.
+        Return the PSFs of the image and of the prior, as stars have corrected them.
 
         Parameters
         ----------
@@ -144,7 +144,7 @@ class PriorField:
         return field_psfs(self.photometers[self.band], self.inputs.highres.header, result)
 
     def usable(self, image, prior):
-        """Pixels of the image that have data, in the prior too: bool, (ny, nx)."""
+        """Return the pixels of the image that have data, in the prior too: bool, (ny, nx)."""
         good = ~np.asarray(image.mask, bool)
         y, x = np.nonzero(good)
         xy = np.stack(prior.wcs.world_to_pixel(image.wcs.pixel_to_world(x, y)), axis=-1)
@@ -234,7 +234,7 @@ class PriorField:
         return segments, joined
 
     def shapes(self, pixels, segments, catalog, psfs):
-        """Fitted profiles of the sources (`~miricigale.injection.population.fitted_shapes`)."""
+        """Return the fitted profiles of the sources (`~miricigale.injection.population.fitted_shapes`)."""
         psf = self.photometers[self.band].mean_kernel.source
         return fitted_shapes(pixels.prior, segments, catalog, psf, self.n_threads)
 
@@ -317,11 +317,11 @@ class ImageField:
         )
 
     def psfs(self, result):
-        """The PSF of the image, and None."""
+        """Return the PSF of the image, and None."""
         return self.psf, None
 
     def usable(self, image, prior):
-        """Pixels of the image that have data: bool, (ny, nx)."""
+        """Return the pixels of the image that have data: bool, (ny, nx)."""
         return ~np.asarray(image.mask, bool)
 
     def measure(self, sources=None, psfs=None, former=None, image_file=None):
@@ -353,12 +353,12 @@ class ImageField:
         return fitted_shapes(image, segments, catalog, psf, self.n_threads)
 
     def shapes(self, pixels, segments, catalog, psfs):
-        """Fitted profiles of the sources, which are the catalog."""
+        """Return the fitted profiles of the sources, which are the catalog."""
         return catalog
 
 
 def with_shapes(former, sources):
-    """A catalog of Sersic profiles and points: those of the field, and after them what is injected."""
+    """Return a catalog of Sersic profiles and points: those of the field, and after them what is injected."""
     tables = [former, sources]
     if sources is None:
         tables = [former]
@@ -381,7 +381,7 @@ def with_shapes(former, sources):
 
 
 def image_field(file, inputs, preset, options, n_threads):
-    """The field of an image: a `PriorField` where there is a prior, or an `ImageField`."""
+    """Return the field of an image: a `PriorField` where there is a prior, or an `ImageField`."""
     if inputs is not None:
         return PriorField(inputs, n_threads)
     return ImageField(file, preset, options, n_threads)

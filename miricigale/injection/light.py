@@ -20,7 +20,7 @@ _CELLS = 6
 
 def psf_on_pixels(psf, wcs, shape):
     """
-    A PSF on the sky in cells that divide the pixels of an image.
+    Return a PSF on the sky in cells that divide the pixels of an image.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def psf_on_pixels(psf, wcs, shape):
 
 def light_on_image(sources, flux, wcs, shape, psf, n_threads=None):
     """
-    Surface brightness of sources on an image.
+    Return the surface brightness of sources on an image.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def light_on_image(sources, flux, wcs, shape, psf, n_threads=None):
 
 def light_on_file(file, sources, flux, psf, n_threads=None):
     """
-    Surface brightness of sources on the pixels of a file.
+    Return the surface brightness of sources on the pixels of a file.
 
     Parameters
     ----------
@@ -128,5 +128,5 @@ def light_on_file(file, sources, flux, psf, n_threads=None):
 
 
 def scene_light(rows, band, wcs, psf, n_threads):
-    """What a `~miricigale.scene.Scene` renders, as an array."""
+    """Return what a `~miricigale.scene.Scene` renders, as an array."""
     return np.asarray(Scene(rows, filter=band, wcs=wcs, psf=psf, n_threads=n_threads).render().data)

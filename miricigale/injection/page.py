@@ -94,7 +94,7 @@ def _headline(result):
 
 
 def _curves(result):
-    """Completeness of stars and galaxies."""
+    """Draw the completeness of stars and galaxies."""
     figure, axes = new_figure(1, 2, size=(5.0, 3.4), sharey=True)
     kinds = np.asarray(result.sources["kind"])
     for ax, kind in zip(axes[0], ("star", "galaxy"), strict=True):
@@ -120,7 +120,7 @@ def _curves(result):
 
 
 def _fluxes(result):
-    """Measured over true fluxes, and pulls."""
+    """Draw the measured over true fluxes, and pulls."""
     figure, [[bias_axes, right]] = new_figure(1, 2, size=(5.0, 3.4))
     sources = result.sources
     magnitude = np.asarray(sources["magnitude"])
@@ -144,7 +144,7 @@ def _fluxes(result):
 
 
 def _map(result):
-    """Where sources near the limit are found."""
+    """Draw where sources near the limit are found."""
     curve = result.curve("forced")
     if curve is None:
         return None

@@ -98,7 +98,7 @@ def fitted_shapes(image, segments, sources, psf, n_threads):
 
 
 def _position_angles(parameters, wcs):
-    """Position angles (deg) of the major axes of profiles, whose angles are from +x of the image."""
+    """Return the position angles (deg) of the major axes of profiles, whose angles are from +x of the image."""
     x, y = np.nan_to_num(parameters[:, :2]).T
     theta = 0.5 * np.arctan2(parameters[:, 5], parameters[:, 4])
     along = wcs.pixel_to_world(x + np.cos(theta), y + np.sin(theta))
@@ -106,7 +106,7 @@ def _position_angles(parameters, wcs):
 
 
 def _profile_fluxes(arrays, segments, labels, parameters, is_star, psf):
-    """Light (uJy) of the profiles, by a fit to the pixels of their segments; NaN without a profile."""
+    """Return the light (uJy) of the profiles, by a fit to the pixels of their segments; NaN without a profile."""
     models = ShapeModels(psf / psf.sum())
     places = find_objects(segments)
     flux = np.full(len(labels), np.nan)
@@ -128,7 +128,7 @@ def _profile_fluxes(arrays, segments, labels, parameters, is_star, psf):
 
 def measured_population(shapes, flux, snr, good):
     """
-    Well measured sources, whose magnitudes, sizes and colors are drawn.
+    Return the well measured sources, whose magnitudes, sizes and colors are drawn.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def _check_shapes(shapes, extended):
 
 def counts_slope(magnitude, limit):
     """
-    Slope of the logarithm of the counts with magnitude, by maximum likelihood.
+    Return the slope of the logarithm of the counts with magnitude, by maximum likelihood.
 
     Parameters
     ----------

@@ -125,7 +125,7 @@ class Exposures:
 
 
 def is_ramp(path):
-    """Whether a file holds the groups of an exposure (its SCI has four dimensions)."""
+    """Tell whether a file holds the groups of an exposure (its SCI has four dimensions)."""
     with open_fits(path, wanted="an image or a ramp") as hdus:
         return "SCI" in hdus and hdus["SCI"].header.get("NAXIS") == 4
 
@@ -217,7 +217,7 @@ def inject_ramp(ramp, sources, reducer, rng, n_threads=None):
 
 
 def _rate(light, ramp, reducer, maps):
-    """Slopes in DN/s of a surface brightness, (ny, nx); 0 where a slope has no brightness."""
+    """Return the slopes in DN/s of a surface brightness, (ny, nx); 0 where a slope has no brightness."""
     shape = light.shape
     plane = np.ones(shape, np.float32)
     none = np.zeros(shape, np.int16)
@@ -249,7 +249,7 @@ def _collected(mean, lit, y, x, kernel, n_group, n_frames, rng):
 
 
 def _with_charge(raw, added, maps, y, x, integration, rng):
-    """Raw counts (n, n_group) of pixels with linear DN added to them."""
+    """Return the raw counts (n, n_group) of pixels with linear DN added to them."""
 
     def at(values):
         values = np.asarray(values, float)
@@ -288,7 +288,7 @@ def _linear(measured, coefficients):
 
 
 def _measured(target, start, coefficients):
-    """Counts above the bias whose linear ones are ``target``, by Newton's method."""
+    """Return the counts above the bias whose linear ones are ``target``, by Newton's method."""
     slopes = [k * coefficient for k, coefficient in enumerate(coefficients)][1:]
     measured = start.copy()
     for _ in range(_STEPS):

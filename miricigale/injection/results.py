@@ -88,7 +88,7 @@ class InjectionResult(Interactive):
 
     def curve(self, question, *, kind=None):
         """
-        Completeness as a function of magnitude.
+        Return the completeness as a function of magnitude.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class InjectionResult(Interactive):
         return self._curve(question, self._of_kind(kind))
 
     def _of_kind(self, kind):
-        """Which sources are of a kind; all of None."""
+        """Tell which sources are of a kind; all of None."""
         check_choice(kind, "kind", (None, "star", "galaxy"))
         if kind is None:
             return np.ones(len(self.sources), bool)
@@ -126,7 +126,7 @@ class InjectionResult(Interactive):
 
     def recovery(self, by="magnitude", *, kind=None):
         """
-        Completeness, bias and error calibration.
+        Return the completeness, bias and error calibration.
 
         Parameters
         ----------
@@ -263,7 +263,7 @@ class InjectionResult(Interactive):
 
     def errors(self):
         """
-        Bias and error calibration of all injected sources.
+        Return the bias and error calibration of all injected sources.
 
         Returns
         -------
@@ -312,7 +312,7 @@ class InjectionResult(Interactive):
 
 
 def _steps(values, chosen):
-    """Bins of equal steps in magnitude."""
+    """Yield the bins of equal steps in magnitude."""
     if not chosen.any():
         return
     number = np.floor(np.where(chosen, values, 0.0) / _STEP).astype(int)
@@ -323,7 +323,7 @@ def _steps(values, chosen):
 
 
 def _classes(values, chosen):
-    """Classes of a size (arcsec) that have about as many members each."""
+    """Yield the classes of a size (arcsec) that have about as many members each."""
     if not chosen.any():
         return
     edges = np.unique(np.quantile(values[chosen], np.linspace(0, 1, _SIZES + 1)))
@@ -340,7 +340,7 @@ def _classes(values, chosen):
 
 
 def limit_columns(question, curve):
-    """The 50 % limit of a curve and its error; NaN without a curve."""
+    """Return the 50 % limit of a curve and its error; NaN without a curve."""
     limit = np.nan
     limit_err = np.nan
     if curve is not None:
@@ -350,7 +350,7 @@ def limit_columns(question, curve):
 
 
 def measured_values(sources):
-    """True fluxes, fluxes and errors (uJy) of a table, as arrays."""
+    """Return the true fluxes, fluxes and errors (uJy) of a table, as arrays."""
     return [np.asarray(sources[name].to_value(FNU)) for name in ("flux_true", "flux", "flux_err")]
 
 
@@ -373,7 +373,7 @@ def _share(values):
 
 
 def _errors(sources):
-    """Bias and calibration of errors of some sources."""
+    """Return the bias and calibration of errors of some sources."""
     true, flux, error = measured_values(sources)
     measured = np.isfinite(flux) & (error > 0)
     pull = (flux[measured] - true[measured]) / error[measured]
@@ -395,7 +395,7 @@ def _errors(sources):
 
 
 def _described(rows, kind):
-    """A table of rows (dicts), whose columns say what they are."""
+    """Return a table of rows (dicts), whose columns say what they are."""
     texts = declared("miricigale.injection", "columns.toml")[kind]
     counts = ("n", "n_measured", "n_positive", "n_negative")
     table = QTable()

@@ -131,11 +131,11 @@ class Task:
         return cls(inputs, image, options, InjectionSettings(**settings, seed=seed), exposures)
 
     def field(self, n_threads):
-        """The field that is measured."""
+        """Return the field that is measured."""
         return image_field(self.image, self.inputs, self.injection.preset, self.options, n_threads)
 
     def sources(self, field, wcs):
-        """The own catalog, or None."""
+        """Return the own catalog, or None."""
         catalog = self.injection.catalog
         if catalog is None:
             return None
@@ -164,7 +164,7 @@ def _states(config, unit):
 
 
 def _bytes(config, unit):
-    """About how many bytes a trial takes."""
+    """Estimate how many bytes a trial takes."""
     task = Task.of(config, config.run.seed)
     pixels = np.prod(task.image.header.shape, dtype=float)
     if task.inputs is None:
@@ -174,7 +174,7 @@ def _bytes(config, unit):
 
 
 def trial_names(config):
-    """Names of the trials."""
+    """Return the names of the trials."""
     return [f"trial-{k + 1:03d}" for k in range(config.injection.n_trials)]
 
 
@@ -206,7 +206,7 @@ def field_stage(context, _):
 
 
 def _detection_rows(table, model):
-    """Detections with what results are binned by."""
+    """Return the detections with what results are binned by."""
     xy = np.stack([table["x_centroid"], table["y_centroid"]], axis=-1).reshape(-1, 2)
     rows = QTable({"sky": table["sky"], "flux": table["flux"]})
     rows["magnitude"] = ab_magnitude(table["flux"])
@@ -217,7 +217,7 @@ def _detection_rows(table, model):
 
 
 def _read_base(context):
-    """What `field_stage` has written."""
+    """Return what `field_stage` has written."""
     psfs = [None, None]
     for k, name in enumerate(("psf", "prior_psf")):
         if context.products.path(f"field/{name}.fits").exists():
@@ -320,7 +320,7 @@ def _result(context, config, seed):
 
 
 def injection_stages():
-    """The stages of a run of injection."""
+    """Return the stages of a run of injection."""
     return field_stage, trial_stage, result_stage
 
 
@@ -388,7 +388,7 @@ def run_injection(
 
 
 def _plain_exposures(exposures):
-    """Ramps and settings as `as_text` takes them."""
+    """Return the ramps and settings as `as_text` takes them."""
     values = field_values(exposures)
     values["paths"] = [absolute(path) for path in exposures.paths]
     values["reducer"] = exposures.reducer.replace(n_threads=None)
@@ -396,7 +396,7 @@ def _plain_exposures(exposures):
 
 
 def _catalog_text(catalog):
-    """An own catalog as a path, or as text."""
+    """Return an own catalog as a path, or as text."""
     if catalog is None:
         return None
     if isinstance(catalog, (str, os.PathLike)):

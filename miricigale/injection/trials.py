@@ -151,7 +151,7 @@ def measure_base(field, injection):
 
 
 def _model(result):
-    """The fitted model without its background, with the noise and the mask of the image."""
+    """Return the fitted model without its background, with the noise and the mask of the image."""
     residual = result.residual_image
     light = np.array(result.model_image.data, float)
     if result.background is not None:
@@ -172,7 +172,7 @@ def _negative(image):
 
 
 def _empty_pulls(result, field, seed):
-    """Flux over error of points where the measurement left no light."""
+    """Return the flux over error of points where the measurement left no light."""
     from miricigale.photometry.commands.page import empty_pulls
     from miricigale.psf import MatchingKernel
 
@@ -347,7 +347,7 @@ def place_names(xy, shape):
 
 
 def _taken(values, rows):
-    """Values of rows; NaN for those of -1."""
+    """Return the values of rows; NaN for those of -1."""
     labels = np.full(len(rows), np.nan)
     labels[rows >= 0] = np.asarray(values)[rows[rows >= 0]]
     return labels

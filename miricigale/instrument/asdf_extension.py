@@ -76,7 +76,7 @@ def asdf_wcs(header, hdus):
 
 
 def bytes_table(text, column, name):
-    """Extension that holds bytes in one column."""
+    """Return the extension that holds bytes in one column."""
     array = np.frombuffer(text, np.uint8)[None]
     fields = [fits.Column(name=column, format=f"{array.size}B", array=array)]
     return fits.BinTableHDU.from_columns(fields, name=name)
@@ -84,7 +84,7 @@ def bytes_table(text, column, name):
 
 def asdf_extension(wcs=None, shape=None, header=None):
     """
-    The extension without which the official pipeline does not go on with a file.
+    Return the extension without which the official pipeline does not go on with a file.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def _extension_name(entry):
 
 def _asdf_bytes(tree):
     """
-    A tree as the bytes of an ASDF file, the same in every process.
+    Return a tree as the bytes of an ASDF file, the same in every process.
 
     asdf 6.0 lists the extensions that it used in the order of a set. Those that a tree names already keep their
     place, so that it is written once more with them in order.
@@ -133,7 +133,7 @@ def _asdf_bytes(tree):
 
 
 def _polynomials(begin, end, order):
-    """Model of positions by others, about the first of each."""
+    """Return the model of positions by others, about the first of each."""
     offsets = end - end[:, :1]
     models = []
     for table in scaled_fit(*(begin - begin[:, :1]), offsets.T, order):
@@ -145,7 +145,7 @@ def _polynomials(begin, end, order):
 
 def imager_gwcs(wcs, shape, header):
     """
-    World coordinates of the imager with the frames of JWST: detector, telescope (V2, V3), sky.
+    Return the world coordinates of the imager with the frames of JWST: detector, telescope (V2, V3), sky.
 
     Parameters
     ----------

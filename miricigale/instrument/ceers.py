@@ -12,7 +12,7 @@ CEERS_FILTERS = tuple(_COUNTS["whole"])
 
 def ceers_exposures(pointing, roll, *, filters=None, quick=False):
     """
-    The exposures of one CEERS/MIRI pointing.
+    Return the exposures of one CEERS/MIRI pointing.
 
     Parameters
     ----------

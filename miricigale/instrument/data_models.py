@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 def is_data_model(value):
-    """Whether something is a data model of ``jwst``, known without importing it."""
+    """Tell whether something is a data model of ``jwst``, known without importing it."""
     return callable(getattr(value, "save", None)) and hasattr(
         getattr(value, "meta", None), "instrument"
     )

@@ -192,7 +192,7 @@ class DetectorProperties:
 @cached
 def miri_detector():
     """
-    The imager's detector.
+    Return the imager's detector.
 
     Returns
     -------
@@ -236,7 +236,7 @@ def _full_flat(filter, seed):
 
 def flat_field(filter, *, subarray="FULL", seed=_SEED):
     """
-    Relative response of the pixels: the same for the simulated detector and the reduction.
+    Return the relative response of the pixels: the same for the simulated detector and the reduction.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def _full_bad_pixels():
 
 def bad_pixel_mask(*, subarray="FULL"):
     """
-    Pixels that never work, about 0.1 %.
+    Return the pixels that never work, about 0.1 %.
 
     ``subarray`` is as for `flat_field`.
 
@@ -301,7 +301,7 @@ def bad_pixel_mask(*, subarray="FULL"):
 
 def reference_pixel_mask(*, subarray="FULL"):
     """
-    Pixels that see no light: four columns on each side of the full frame.
+    Return the pixels that see no light: four columns on each side of the full frame.
 
     ``subarray`` is as for `flat_field`.
 
@@ -321,7 +321,7 @@ def reference_pixel_mask(*, subarray="FULL"):
 
 
 def _columns_mask(first, last, subarray):
-    """Columns of the full frame from the first to before the last, in a sub-array."""
+    """Return the columns of the full frame from the first to before the last, in a sub-array."""
     mask = np.zeros(aperture("FULL").shape, dtype=bool)
     mask[:, first:last] = True
     return mask[aperture(subarray).slices]
@@ -329,7 +329,7 @@ def _columns_mask(first, last, subarray):
 
 def field_mask(*, subarray="FULL"):
     """
-    Pixels that see the sky through the imaging filters.
+    Return the pixels that see the sky through the imaging filters.
 
     The others lie behind the masks of the coronagraphs (or are reference pixels). This
     is the rectangle of the aperture MIRIM_ILLUM.

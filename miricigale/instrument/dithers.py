@@ -59,7 +59,7 @@ def _points(pattern):
 
 def dither_patterns():
     """
-    Names of the patterns.
+    Return the names of the patterns.
 
     Examples
     --------
@@ -75,7 +75,7 @@ def dither_patterns():
 
 def dither_offsets(pattern, n=None, *, start=0):
     """
-    Offsets of the pointing.
+    Return the offsets of the pointing.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def dither_offsets(pattern, n=None, *, start=0):
 
 def tile_offsets(n_x, n_y, *, overlap=0.1):
     """
-    Offsets of the pointings of a mosaic of fields side by side.
+    Return the offsets of the pointings of a mosaic of fields side by side.
 
     Parameters
     ----------
@@ -313,7 +313,7 @@ def read_centers(path, roll):
 
 
 def _looks_at(ra, dec, x, y, pa):
-    """Position of the reference pixel that has a target at a place of the ideal frame (deg, arcsec)."""
+    """Return the position of the reference pixel that has a target at a place of the ideal frame (deg, arcsec)."""
     target = center = SkyCoord(ra, dec, unit="deg")
     # north turns on the way: each step leaves some 1e-3 of what is missing
     for _ in range(8):
@@ -323,7 +323,7 @@ def _looks_at(ra, dec, x, y, pa):
 
 
 def _read_pointings(path, observation, exposure):
-    """Offsets of the dithers of an exposure."""
+    """Return the offsets of the dithers of an exposure."""
     pointings = {}
     apertures = set()
     with reading(path, "a list of pointings"):
@@ -360,7 +360,7 @@ def _read_pointings(path, observation, exposure):
 
 
 def _alike(patterns):
-    """Whether patterns are the same, to the digits of the list."""
+    """Tell whether patterns are the same, to the digits of the list."""
     first = patterns[0]
     return all(
         pattern.shape == first.shape and np.allclose(pattern, first, atol=2e-3)
@@ -369,7 +369,7 @@ def _alike(patterns):
 
 
 def _chosen(name, value, available):
-    """The key that is asked for, or the only one."""
+    """Return the key that is asked for, or the only one."""
     if value is None and len(available) == 1:
         return next(iter(available))
     check_that(value in available, name, f"one of {sorted(available)}", value)

@@ -134,7 +134,7 @@ def dq_planes(flags):
 
 def with_own_bits(flags, hdus):
     """
-    Flags of a plane DQ with the bits above 31 that a file has in ``DQ_OWN``.
+    Return the flags of a plane DQ with the bits above 31 that a file has in ``DQ_OWN``.
 
     Examples
     --------

@@ -24,7 +24,7 @@ _PLANE = "MP_"
 
 def bad_pixels(values, header, get, path):
     """
-    Pixels of a mask that are not to be used.
+    Return the pixels of a mask that are not to be used.
 
     Parameters
     ----------

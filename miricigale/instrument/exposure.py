@@ -26,7 +26,7 @@ from miricigale.utils.values import value_class
 
 def readout_patterns():
     """
-    Names of the readout patterns.
+    Return the names of the readout patterns.
 
     Examples
     --------
@@ -39,7 +39,7 @@ def readout_patterns():
 
 def frames_per_group(readout="FASTR1"):
     """
-    Frames that are averaged on board to one group.
+    Return the frames that are averaged on board to one group.
 
     Parameters
     ----------
@@ -62,13 +62,13 @@ def frames_per_group(readout="FASTR1"):
 
 
 def frame_pattern(readout):
-    """The pattern in which the frames of a readout pattern are read: itself, or that which is averaged."""
+    """Return the pattern in which the frames of a readout pattern are read: itself, or that which is averaged."""
     return "FASTR1" if readout in table()["averaged"] else readout
 
 
 def frame_time(readout="FASTR1", subarray="FULL"):
     """
-    Time between two reads of a pixel.
+    Return the time between two reads of a pixel.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ class Exposure(Interactive):
 
     def of_frames(self):
         """
-        This exposure with each frame a group of its own.
+        Return this exposure with each frame a group of its own.
 
         Returns
         -------
@@ -400,7 +400,7 @@ class Exposure(Interactive):
 
     def pointing_keywords(self):
         """
-        Keywords of level-1b headers that say where the telescope looks.
+        Return the keywords of level-1b headers that say where the telescope looks.
 
         Returns
         -------
@@ -444,7 +444,7 @@ class Exposure(Interactive):
 
     def dithered(self, pattern="4-point", n=None, *, first=0, start=0):
         """
-        This exposure at ``n`` positions of a dither pattern.
+        Return this exposure at ``n`` positions of a dither pattern.
 
         Parameters
         ----------

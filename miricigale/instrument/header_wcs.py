@@ -24,7 +24,7 @@ _APART_AT_REFERENCE = 0.5
 
 def header_wcs(header, hdus=None, *, where):
     """
-    Celestial coordinates of a FITS header.
+    Return the celestial coordinates of a FITS header.
 
     SIP coefficients count only if CTYPE ends in ``-SIP``, as the convention says: headers of mosaics often keep
     those of an exposure. astropy applies them nevertheless.
@@ -92,7 +92,7 @@ def header_wcs(header, hdus=None, *, where):
 
 def as_wcs(given, argument="wcs"):
     """
-    World coordinates of whatever holds some.
+    Return the world coordinates of whatever holds some.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def as_wcs(given, argument="wcs"):
 
 def image_wcs(header, hdus):
     """
-    Celestial coordinates of an image in a file.
+    Return the celestial coordinates of an image in a file.
 
     Those of its header; those of the extension ASDF of JWST's pipeline (a gwcs), as polynomials good to 0.01
     pixels, if the header has none, or those of a single exposure without its distortion.
@@ -229,7 +229,7 @@ def check_kind_of_exposure(get, path):
 
 
 def is_exposure(get):
-    """Whether a header (``get(keyword)``) is that of a single exposure of JWST, not resampled."""
+    """Tell whether a header (``get(keyword)``) is that of a single exposure of JWST, not resampled."""
     return get("S_WCS") == "COMPLETE" and get("S_RESAMP") != "COMPLETE"
 
 

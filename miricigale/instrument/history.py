@@ -81,7 +81,7 @@ class ExposureHistory:
     @classmethod
     def from_header(cls, header, *, recorded=False):
         """
-        History that the keywords of a file tell.
+        Return the history that the keywords of a file tell.
 
         Parameters
         ----------
@@ -110,7 +110,7 @@ class ExposureHistory:
     @classmethod
     def of(cls, exposure):
         """
-        History of an exposure.
+        Return the history of an exposure.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class ExposureHistory:
         return cls(**values, references=references)
 
     def meta(self):
-        """Entries of the meta dictionary of an image, from which `of` makes it again."""
+        """Return the entries of the meta dictionary of an image, from which `of` makes it again."""
         values = {
             "simulated": self.simulated,
             "origin": self.origin if self.origin == "unrecorded" else None,
@@ -151,13 +151,13 @@ class ExposureHistory:
         return self.origin == "simulated"
 
     def done(self, reference):
-        """Whether the step of a reference was done; linear DN have their bias behind them."""
+        """Tell whether the step of a reference was done; linear DN have their bias behind them."""
         step = REFERENCES[reference]
         return step in self.steps or (reference == "bias" and "linearity" in self.steps)
 
 
 def _middle_of(header):
-    """Middle of an exposure (MJD), or its start where that is all that is known."""
+    """Return the middle of an exposure (MJD), or its start where that is all that is known."""
     for name in ("EXPMID", "EXPSTART"):
         if np.isfinite(day := float(header.get(name) or np.nan)):
             return day
@@ -173,7 +173,7 @@ _MIDDLES = ("MJD-AVG", "MJD-MID", "EXPMID", "EXPSTART", "MJD-OBS", "MJD-BEG")
 
 
 def keyword_values(meta):
-    """Values of the keywords that the meta dictionary of an image keeps, without their comments."""
+    """Return the values of the keywords that the meta dictionary of an image keeps, without their comments."""
     values = {}
     for name, card in meta.get("keywords", {}).items():
         values[name] = card[0] if isinstance(card, list) else card
@@ -182,7 +182,7 @@ def keyword_values(meta):
 
 def epoch_of(image):
     """
-    When an image was taken.
+    Tell when an image was taken.
 
     Parameters
     ----------

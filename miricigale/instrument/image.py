@@ -197,7 +197,7 @@ class Image(Interactive, CCDData):
         super().write(path, *args, **kwargs)
 
     def to_hdu(self, *args, **kwargs):
-        """The HDUs that ``write`` writes; see `astropy.nddata.CCDData.to_hdu`."""
+        """Return the HDUs that ``write`` writes; see `astropy.nddata.CCDData.to_hdu`."""
         ccd = CCDData(self, copy=False)
         ccd.flags = None
         if self.uncertainty is not None:

@@ -72,7 +72,7 @@ class ImageFacts:
     @classmethod
     def of(cls, image):
         """
-        Facts of an image.
+        Return the facts of an image.
 
         Parameters
         ----------

@@ -24,7 +24,7 @@ _STEPS = 2048
 
 def _packed(values, name, header=None, *, step=None):
     """
-    An image extension: compressed tiles (Rice), which FITS readers open as an image, where they can be.
+    Return an image extension: compressed tiles (Rice), which FITS readers open as an image, where they can be.
 
     Integers of up to 32 bits keep every bit; floats are rounded to ``step`` (SCI with subtractive
     dither of a fixed seed), but for NaN and 0, and stay as they are without one. Never gzip, whose
@@ -123,7 +123,7 @@ def write_planes(image, path, *, planes, rounded, overwrite=False):
 
 
 def _unit(header, path):
-    """Unit of the pixels, as a header states it."""
+    """Return the unit of the pixels, as a header states it."""
     text = str(header.get("BUNIT", "")).strip()
     try:
         if text:

@@ -40,7 +40,7 @@ _UTYPES = {
 
 def plane_shape(hdu):
     """
-    Rows and columns of an image extension.
+    Return the rows and columns of an image extension.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def plane_shape(hdu):
 
 def plane_data(hdu, section=None):
     """
-    Pixels of an image extension, or a part of them without reading the rest.
+    Return the pixels of an image extension, or a part of them without reading the rest.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _is_constant(hdu):
 
 def companion(hdus, index, name):
     """
-    Extension of a file that belongs to an image, by its name and EXTVER.
+    Return the extension of a file that belongs to an image, by its name and EXTVER.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def check_plane(hdu, shape, path, plane_name):
 
 def noise_kind(hdu):
     """
-    Kind of a map of the noise by what its extension says of itself.
+    Return the kind of a map of the noise by what its extension says of itself.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def noise_kind(hdu):
 
 def noise_planes(hdus, index):
     """
-    Extensions of a file that can be maps of the noise of an image, the best first.
+    Return the extensions of a file that can be maps of the noise of an image, the best first.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def noise_planes(hdus, index):
 
 def standard_deviation(image):
     """
-    Uncertainty of an image as a standard deviation, in the unit of the image.
+    Return the uncertainty of an image as a standard deviation, in the unit of the image.
 
     Parameters
     ----------

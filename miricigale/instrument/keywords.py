@@ -33,7 +33,7 @@ STEPS = _DECLARED["steps"]
 
 def steps_done(header):
     """
-    Steps that a file has behind it.
+    Return the steps that a file has behind it.
 
     Parameters
     ----------
@@ -66,13 +66,13 @@ def steps_done(header):
 
 
 def keyword_text(get, keyword):
-    """Value of a keyword (``get(keyword)``) as text in upper case; empty without one."""
+    """Return the value of a keyword (``get(keyword)``) as text in upper case; empty without one."""
     return str(get(keyword) or "").strip().upper()
 
 
 def joined_header(hdus, name="SCI"):
     """
-    Keywords of a file.
+    Return the keywords of a file.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def check_imager(path, header, *, kinds=None, own=None):
 
 def exposure_keywords(header):
     """
-    What was exposed, in the names of this package.
+    Return what was exposed, in the names of this package.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def exposure_keywords(header):
 
 def kept_keywords(header):
     """
-    Keywords of a file that its products keep: all but its layout and the package's own record.
+    Return the keywords of a file that its products keep: all but its layout and the package's own record.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def kept_keywords(header):
 
 def placed_keywords(keywords, *, wcs=True):
     """
-    Headers of keywords, in the extensions in which JWST has them.
+    Return the headers of keywords, in the extensions in which JWST has them.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ _ZODI = {"none": 0.0, "low": 1.0}
 
 def photmjsr(filter, *, gain=None):
     """
-    Surface brightness per count rate.
+    Return the surface brightness per count rate.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def _zodi_factor(zodi):
 
 def background_level(filter, *, zodi="low"):
     """
-    Sky and telescope background of a filter.
+    Return the sky and telescope background of a filter.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def _thermal():
 
 def background_spectrum(wave, *, zodi="low"):
     """
-    Spectrum of the background.
+    Return the spectrum of the background.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def background_spectrum(wave, *, zodi="low"):
 
 def psf_fwhm(filter):
     """
-    Full width at half maximum of the point-spread function in flight.
+    Return the full width at half maximum of the point-spread function in flight.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def psf_fwhm(filter):
 
 def electrons_per_brightness(filter, detector=None, *, subarray="FULL"):
     """
-    Electrons per second and pixel of 1 MJy/sr, where the flat field is 1.
+    Return the electrons per second and pixel of 1 MJy/sr, where the flat field is 1.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def electrons_per_brightness(filter, detector=None, *, subarray="FULL"):
 
 def electron_rate(filter, background=None, *, detector=None, subarray="FULL"):
     """
-    Charge that a pixel of the sky collects.
+    Return the charge that a pixel of the sky collects.
 
     Parameters
     ----------

@@ -188,7 +188,7 @@ def write_product(image, path, *, planes=None, wcs=None, overwrite=False):
 
 
 def _headers(image, filename):
-    """Keywords of the primary header and of SCI, without those of the sky."""
+    """Return the keywords of the primary header and of SCI, without those of the sky."""
     meta = image.meta
     primary, science = placed_keywords(meta.get("keywords", {}), wcs=False)
     keywords = {
@@ -232,7 +232,7 @@ def _add_sky(science, wcs, shape):
 
 
 def _flags(image, further):
-    """Flags of an image and further ones, with masked pixels as not to be used."""
+    """Return the flags of an image and further ones, with masked pixels as not to be used."""
     shape = image.data.shape
     further = np.asarray(further, np.int64)
     check_that(
@@ -247,7 +247,7 @@ def _flags(image, further):
 
 
 def _plane_hdu(name, plane, shape):
-    """Extension of a further plane."""
+    """Return the extension of a further plane."""
     plane = np.asarray(plane)
     if name not in PLANES or plane.shape[-2:] != shape[-2:]:
         raise argument_error(
@@ -264,7 +264,7 @@ def _plane_hdu(name, plane, shape):
 
 @cached
 def _nominal_area():
-    """Solid angle of the pixel at the reference point of the full frame, sr."""
+    """Return the solid angle of the pixel at the reference point of the full frame, sr."""
     part = aperture("FULL")
     x, y = map(round, part.reference)
     return float(pixel_area_map(imager_wcs("0 0", 0 * u.deg), part.shape)[y, x])

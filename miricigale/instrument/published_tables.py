@@ -9,13 +9,13 @@ from miricigale.utils.caching import cached
 
 @cached
 def table(name="imager"):
-    """A table of the instrument (``imager``, ``siaf``, ``etc``) as a dict."""
+    """Return a table of the instrument (``imager``, ``siaf``, ``etc``) as a dict."""
     return tomllib.loads(locate(f"instrument.{name}").read_text(encoding="utf-8"))
 
 
 def imager_filters():
     """
-    Names of the nine imaging filters, blue to red.
+    Return the names of the nine imaging filters, blue to red.
 
     Examples
     --------
@@ -28,7 +28,7 @@ def imager_filters():
 
 def imager_filter(filter):
     """
-    Our name of an imaging filter.
+    Return our name of an imaging filter.
 
     Parameters
     ----------
@@ -49,5 +49,5 @@ def imager_filter(filter):
 
 
 def filter_row(name):
-    """The figures of one filter; errors as of `imager_filter`."""
+    """Return the figures of one filter; errors as of `imager_filter`."""
     return table()["filters"][imager_filter(name).removeprefix("miri.")]

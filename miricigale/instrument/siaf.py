@@ -69,7 +69,7 @@ class Aperture:
 
 def subarrays():
     """
-    Names of the sub-arrays, ``"FULL"`` first.
+    Return the names of the sub-arrays, ``"FULL"`` first.
 
     Examples
     --------
@@ -82,7 +82,7 @@ def subarrays():
 
 def imager_columns():
     """
-    First and last (excluded) column of the full frame that sees the sky through the filters.
+    Return the first and last (excluded) column of the full frame that sees the sky through the filters.
 
     Examples
     --------
@@ -136,7 +136,7 @@ def aperture(name="FULL"):
 
 
 def _ideal(x, y):
-    """Ideal coordinates (arcsec) of pixel offsets to the reference of the full frame."""
+    """Return the ideal coordinates (arcsec) of pixel offsets to the reference of the full frame."""
     # row i: the coefficients of x^(i-j) y^j
     sums = []
     for axis in ("x_ideal", "y_ideal"):
@@ -150,7 +150,7 @@ def _ideal(x, y):
 
 def pixel_to_v2v3(x, y, *, subarray="FULL"):
     """
-    Telescope coordinates of pixels.
+    Return the telescope coordinates of pixels.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def pixel_to_v2v3(x, y, *, subarray="FULL"):
 
 def attitude_matrix(ra, dec, roll, *, v2, v3):
     """
-    Rotation from the telescope frame to the sky.
+    Return the rotation from the telescope frame to the sky.
 
     Parameters
     ----------
@@ -228,20 +228,20 @@ def attitude_matrix(ra, dec, roll, *, v2, v3):
 
 
 def unit_vector(longitude, latitude):
-    """Unit vectors of angles in radians, the three components first."""
+    """Return the unit vectors of angles in radians, the three components first."""
     cos = np.cos(latitude)
     return np.stack([cos * np.cos(longitude), cos * np.sin(longitude), np.sin(latitude)])
 
 
 def vector_angles(vector):
-    """Longitude and latitude (rad) of vectors, the three components first."""
+    """Return the longitude and latitude (rad) of vectors, the three components first."""
     x, y, z = vector
     return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
 
 
 def v2v3_to_sky(v2, v3, matrix):
     """
-    Sky positions of telescope coordinates.
+    Return the sky positions of telescope coordinates.
 
     Parameters
     ----------

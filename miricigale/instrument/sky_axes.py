@@ -8,7 +8,7 @@ from miricigale.utils.exceptions import argument_error
 
 def lon_lat(wcs, x, y):
     """
-    Longitude and latitude of pixels in the frame of a WCS.
+    Return the longitude and latitude of pixels in the frame of a WCS.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def lon_lat(wcs, x, y):
 
 def pixel_to_radec(wcs, x, y):
     """
-    Right ascension and declination (ICRS) of pixels.
+    Return the right ascension and declination (ICRS) of pixels.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def pixel_to_radec(wcs, x, y):
 
 def radec_axes(wcs, ra, dec):
     """
-    Values on the axes of a WCS, in their order and frame, of right ascension and declination.
+    Return the values on the axes of a WCS, in their order and frame, of right ascension and declination.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def radec_axes(wcs, ra, dec):
 
 def grid_angle(wcs, shape):
     """
-    Position angle of an image's +y axis at its middle.
+    Return the position angle of an image's +y axis at its middle.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def grid_angle(wcs, shape):
 
 
 def _frame(wcs):
-    """Celestial frame of a WCS; sets it up, so that its ``lng`` and ``lat`` are known."""
+    """Return the celestial frame of a WCS; sets it up, so that its ``lng`` and ``lat`` are known."""
     from astropy.wcs.utils import wcs_to_celestial_frame
 
     wcs.wcs.set()

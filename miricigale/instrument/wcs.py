@@ -23,14 +23,14 @@ _SIP_INVERSE_ORDER = 8
 
 
 def _radec(position, name):
-    """Right ascension and declination of one position (`as_position`), in deg."""
+    """Return the right ascension and declination of one position (`as_position`), in deg."""
     position = as_position(position, name)
     return float(position.ra.deg), float(position.dec.deg)
 
 
 def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
     """
-    Sky positions of pixels by the full spherical transformation, without a fit.
+    Return the sky positions of pixels by the full spherical transformation, without a fit.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
 
 
 def scaled_fit(x, y, values, order):
-    """Least-squares polynomial without a constant, as a (order+1)^2 table."""
+    """Return the least-squares polynomial without a constant, as a (order+1)^2 table."""
     sx = np.abs(x).max()
     sy = np.abs(y).max()
     powers = [(i, n - i) for n in range(1, order + 1) for i in range(n, -1, -1)]
@@ -90,7 +90,7 @@ def chebyshev_pixels(shape):
 @cached
 def _sip(subarray):
     """
-    CD matrix at roll 0 (deg / pixel) and SIP tables of a sub-array.
+    Return the CD matrix at roll 0 (deg / pixel) and SIP tables of a sub-array.
 
     In the tangent plane at the reference pixel the sky is a rotation of the telescope
     frame, so one fit serves every pointing and roll.
@@ -120,7 +120,7 @@ def _sip(subarray):
 
 def imager_wcs(pointing, roll, *, subarray="FULL"):
     """
-    World coordinates of an exposure, as TAN-SIP.
+    Return the world coordinates of an exposure, as TAN-SIP.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def imager_wcs(pointing, roll, *, subarray="FULL"):
 
 
 def _gnomonic(center, reference, shape, distortion=""):
-    """A tangential WCS of a shape about a position, (ra, dec) in deg, without its scale."""
+    """Return a tangential WCS of a shape about a position, (ra, dec) in deg, without its scale."""
     from astropy.wcs import WCS
 
     wcs = WCS(naxis=2)
@@ -232,7 +232,7 @@ def tangent_offset(pointing, x_offset, y_offset, pa):
 
 def pixel_area_map(wcs, shape, out=None):
     """
-    Solid angle of each pixel.
+    Return the solid angle of each pixel.
 
     Parameters
     ----------
@@ -293,7 +293,7 @@ def pixel_area_map(wcs, shape, out=None):
 
 def north_up_wcs(center, pixel_scale, shape):
     """
-    Undistorted gnomonic coordinates with north up and east left.
+    Return the undistorted gnomonic coordinates with north up and east left.
 
     Parameters
     ----------
@@ -332,7 +332,7 @@ def north_up_wcs(center, pixel_scale, shape):
 
 def mosaic_wcs(exposures, pixel_scale):
     """
-    The smallest north-up grid that holds every pixel of the exposures.
+    Return the smallest north-up grid that holds every pixel of the exposures.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ NUMBERS = {
 
 
 def columns_of(sources, agn_limit):
-    """What the numbers are made of, by source."""
+    """Return what the numbers are made of, by source."""
     z = floats(sources["redshift"])
     f = floats(sources["frac_agn"])
     dz = (floats(sources["redshift_mean"]) - z) / (1 + z)
@@ -57,7 +57,7 @@ def columns_of(sources, agn_limit):
 
 def accuracy(sources, *, agn_limit=0.4, seed=0):
     """
-    How well redshift, fracAGN and AGN are recovered.
+    Tell how well redshift, fracAGN and AGN are recovered.
 
     Parameters
     ----------

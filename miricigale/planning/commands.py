@@ -15,7 +15,7 @@ from miricigale.utils.table_files import write_table
 
 def plan_table(*, quick=False):
     """
-    The CEERS exposures: time, filling of the well by the sky, limits (5 sigma, AB).
+    Return the CEERS exposures: time, filling of the well by the sky, limits (5 sigma, AB).
 
     Parameters
     ----------

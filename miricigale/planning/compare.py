@@ -9,7 +9,7 @@ from miricigale.planning.accuracy import sky_weights
 
 
 def _row(planner, plan, numbers):
-    """One row of both tables."""
+    """Return one row of both tables."""
     row = {"plan": plan.name, "time": plan.time.to(u.h), "area": plan.area}
     row["n"] = numbers["z_scatter"].n
     for name, number in numbers.items():
@@ -30,7 +30,7 @@ def _row(planner, plan, numbers):
 
 def comparison_table(planner, plans):
     """
-    Plans with MIRI, the best for each hour first, after the existing bands alone.
+    Return the plans with MIRI, the best for each hour first, after the existing bands alone.
 
     All are compared on the same sources: those that one of them detects.
 
@@ -82,7 +82,7 @@ def comparison_table(planner, plans):
 
 def area_table(planner, plans):
     """
-    Depth against area.
+    Return the depth against area.
 
     Parameters
     ----------

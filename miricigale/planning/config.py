@@ -126,7 +126,7 @@ class ExposureSection(Section):
     pointings: int = option(1, "Pointings side by side.", low=1, high=10000)
 
     def by_band(self, key):
-        """``"time"``, ``"depth"`` or ``"dithers"`` of each band; the default for other bands is F770W's."""
+        """Return ``"time"``, ``"depth"`` or ``"dithers"`` of each band; the default for other bands is F770W's."""
         values = getattr(self, key)
         if not values:
             survey_value = _CEERS[key]
@@ -351,7 +351,7 @@ class PlanConfig(Configuration):
             self.check(good, "exposures.sets", wanted, repr(name))
 
     def set_bands(self, name):
-        """Bands of one of the ``sets``, in order of wavelength."""
+        """Return the bands of one of the ``sets``, in order of wavelength."""
         if name == "all":
             return self.exposures.bands
         labels = [label.strip() for label in name.split(",") if label.strip()]

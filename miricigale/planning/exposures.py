@@ -100,7 +100,7 @@ class BandPlan:
 
     def numbers(self):
         """
-        Time, frames, filling of the well and limits, as a row of a table.
+        Return the time, frames, filling of the well and limits, as a row of a table.
 
         ``limit_etc`` is the exposure time calculator's limit (low background), scaled by the root of the time.
         """
@@ -123,7 +123,7 @@ class BandPlan:
 
     def good_groups(self, flux, size=0.0 * u.arcsec):
         """
-        Groups of an integration before the brightest pixel of a source is full.
+        Return the groups of an integration before the brightest pixel of a source is full.
 
         Parameters
         ----------
@@ -145,12 +145,12 @@ class BandPlan:
         return np.clip(np.ceil(np.nan_to_num(n / filled, nan=np.inf)) - 1, 0, n).astype(int)
 
     def cut(self, n_groups):
-        """This plan with so many groups of each integration: what is left of one that saturates."""
+        """Return this plan with so many groups of each integration: what is left of one that saturates."""
         return dataclasses.replace(self, exposure=self.exposure.replace(n_groups=int(n_groups)))
 
     def errors(self, size=0.0 * u.arcsec):
         """
-        Errors of the fluxes.
+        Return the errors of the fluxes.
 
         Parameters
         ----------
@@ -176,7 +176,7 @@ class BandPlan:
 
 
 def background_options(config):
-    """Arguments of `band_background`, but for the filter, and of `background_text`."""
+    """Return the arguments of `band_background`, but for the filter, and of `background_text`."""
     options = config.background
     position = None
     if options.ra >= 0:
@@ -186,7 +186,7 @@ def background_options(config):
 
 
 def _band_plan(filter, time, n_dithers, config):
-    """The exposures of one band that last a time."""
+    """Return the exposures of one band that last a time."""
     options = config.exposures
     background = band_background(filter, **background_options(config))
     # the time for which Exposure.from_time allows is of the low background
@@ -205,7 +205,7 @@ def _band_plan(filter, time, n_dithers, config):
 
 @cached(maxsize=8)
 def _detector(photom, date):
-    """The imager's detector, with the response of a day where one is given."""
+    """Return the imager's detector, with the response of a day where one is given."""
     response = ()
     if photom or date:
         with of_option("[exposures] photom, date:", ValueError):
@@ -214,7 +214,7 @@ def _detector(photom, date):
 
 
 def _time_to(depth, filter, n_dithers, config):
-    """Time in which the errors of point sources reach a 5-sigma depth."""
+    """Return the time in which the errors of point sources reach a 5-sigma depth."""
 
     def excess(log_time):
         plan = _band_plan(filter, 10**log_time * u.s, n_dithers, config)
@@ -233,7 +233,7 @@ def _time_to(depth, filter, n_dithers, config):
 
 def band_plans(config, *, share=1.0, bands=None):
     """
-    The exposures of bands of a configuration.
+    Return the exposures of bands of a configuration.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ def band_plans(config, *, share=1.0, bands=None):
 
 def wall_clock(plans, options, *, pointings=1):
     """
-    Time that the observatory charges.
+    Return the time that the observatory charges.
 
     Parameters
     ----------

@@ -76,7 +76,7 @@ def write_page(path, planner, plans, comparison, areas=None, *, overwrite=False)
 
 
 def answer(planner, plans, comparison):
-    """What the best set reaches and finds, in one sentence."""
+    """Return what the best set reaches and finds, in one sentence."""
     row = comparison[1]
     plan = next(plan for plan in plans if plan.name == row["plan"])
     bands = plan.bands.values()
@@ -123,7 +123,7 @@ def _bands_in_words(name, plans):
 
 
 def _entries(table):
-    """Rows of a table as dictionaries of plain values, with what bands and frames are called."""
+    """Yield the rows of a table as dictionaries of plain values, with what bands and frames are called."""
     for entry in plain_rows(table):
         if "filter" in entry:
             entry["band"] = entry["filter"].removeprefix("miri.")

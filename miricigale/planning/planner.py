@@ -78,7 +78,7 @@ class Plan:
 
     def band_table(self):
         """
-        The exposures, band by band.
+        Return the exposures, band by band.
 
         Returns
         -------
@@ -176,7 +176,7 @@ class Planner:
 
     def share(self, bands, pointings=None):
         """
-        Factor on all exposure times with which a set of bands takes the hours of the configuration.
+        Return the factor on all exposure times with which a set of bands takes the hours of the configuration.
 
         Parameters
         ----------
@@ -244,7 +244,7 @@ class Planner:
 
     def photometry(self, plans, measured=None):
         """
-        Mock photometry of the sample.
+        Return the mock photometry of the sample.
 
         Parameters
         ----------
@@ -270,7 +270,7 @@ class Planner:
 
     def _mock(self, plan):
         """
-        Fluxes of one band with the errors of each source's size, in the order of the sample.
+        Return the fluxes of one band with the errors of each source's size, in the order of the sample.
 
         Sources that saturate have the errors of the groups before, NaN where there is no slope.
         """
@@ -304,7 +304,7 @@ class Planner:
         return np.zeros(len(self.sources))
 
     def _good_groups(self, plan):
-        """Groups before the sources of the sample saturate in a band."""
+        """Return the groups before the sources of the sample saturate in a band."""
         return plan.good_groups(self.sources[plan.filter], self._size * u.arcsec)
 
     def evaluate(self, bands=None, *, name=None, share=1.0, pointings=None, measured=None):
@@ -357,7 +357,7 @@ class Planner:
         return Plan(name, plans, table, time, area)
 
     def _results(self, results, photometry, plans):
-        """The table of sources of a `Plan`."""
+        """Return the table of sources of a `Plan`."""
         agn = self.config.agn
         columns = ["id", "redshift", "frac_agn"]
         if "sky" in self.sources.colnames:
@@ -465,7 +465,7 @@ class Planner:
 
     def accuracy(self, plan, chosen=None):
         """
-        Numbers of one plan; see `~miricigale.planning.accuracy.accuracy`.
+        Return the numbers of one plan; see `~miricigale.planning.accuracy.accuracy`.
 
         Parameters
         ----------

@@ -31,7 +31,7 @@ _AGE_SHARE = 0.95
 
 
 def catalog_area(config, catalog):
-    """Area of the catalog in square arcmin; None where neither it nor the configuration states it."""
+    """Return the area of the catalog in square arcmin; None where neither it nor the configuration states it."""
     if config.sample.area:
         return config.sample.area * u.arcmin**2
     if config.catalog.source in resources() and "radius_arcsec" in catalog.meta:
@@ -42,7 +42,7 @@ def catalog_area(config, catalog):
 
 def make_sample(config, bands, *, executor=None):
     """
-    Sources with their true parameters and fluxes.
+    Return the sources with their true parameters and fluxes.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def _cut(table, chosen, reason):
 
 
 def agn_mix(options, n, rng):
-    """AGN fractions in the shares of the configuration, in random order."""
+    """Return the AGN fractions in the shares of the configuration, in random order."""
     shares = np.asarray(options.shares or np.ones(len(options.frac_agn)), float)
     edges = np.round(np.cumsum(shares / shares.sum()) * n).astype(int)
     counts = np.diff(np.concatenate([[0], edges]))
@@ -199,7 +199,7 @@ def _luminosity_function(options):
 
 def _by_luminosity(sources, options, rng):
     """
-    Sources drawn after a luminosity function, and their number per square arcmin.
+    Return the sources drawn after a luminosity function, and their number per square arcmin.
 
     Each cell of the function is taken by draws of redshift and luminosity in proportion to phi and the
     comoving volume; a draw has the SED of the nearest source of the catalog, scaled to its luminosity

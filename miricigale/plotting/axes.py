@@ -52,7 +52,7 @@ def panel_columns(n):
 
 def new_figure(n_rows=1, n_columns=1, *, size=(4.2, 3.4), **kwargs):
     """
-    A figure that belongs to no window, with a grid of axes.
+    Return a figure that belongs to no window, with a grid of axes.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def new_figure(n_rows=1, n_columns=1, *, size=(4.2, 3.4), **kwargs):
 
 def panels(labels, *, height=2.7, **share):
     """
-    A figure with a panel for each label, in rows of `panel_columns`.
+    Return a figure with a panel for each label, in rows of `panel_columns`.
 
     Parameters
     ----------
@@ -199,14 +199,14 @@ def add_borders(ax, labels, x, y, **kwargs):
 
 
 def row_mask(rows, n, default):
-    """Truth values of ``n`` points, shape (n,): those of the caller, or ``default`` for all without."""
+    """Return the truth values of ``n`` points, shape (n,): those of the caller, or ``default`` for all without."""
     if rows is None:
         return np.full(n, default)
     return np.asarray(rows, bool)
 
 
 def resolve_axes(ax):
-    """The given axes, or those of pyplot's current figure."""
+    """Return the given axes, or those of pyplot's current figure."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt

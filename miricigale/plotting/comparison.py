@@ -10,7 +10,7 @@ _OUTLIER = 0.15
 
 def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0):
     """
-    Difference against true magnitude with its running median.
+    Draw the difference against true magnitude with its running median.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0):
 
 def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
     """
-    Error against flux for several bands.
+    Draw the error against flux for several bands.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
 
 def plot_redshifts(z_true, z_fit, *, z_err=None, ax=None, title=None):
     """
-    Fitted against true redshift on a scale of log(1 + z), with the outlier limits.
+    Draw the fitted against true redshift on a scale of log(1 + z), with the outlier limits.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def plot_redshifts(z_true, z_fit, *, z_err=None, ax=None, title=None):
 
 def plot_relation(x, y, *, lines=(), ax=None, labels=("", "")):
     """
-    A cloud of points with published relations over it, on logarithmic axes.
+    Draw a cloud of points with published relations over it, on logarithmic axes.
 
     Parameters
     ----------

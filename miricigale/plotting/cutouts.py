@@ -63,7 +63,7 @@ class _Panels:
         )
 
     def squares(self, sky):
-        """Pictures about positions, north up: array of shape (n_positions, n_planes, n, n)."""
+        """Return the pictures about positions, north up: array of shape (n_positions, n_planes, n, n)."""
         half = self.n // 2
         parts = []
         for value, size in zip(self.wcs.world_to_pixel(sky), self.shape[::-1], strict=True):
@@ -76,7 +76,7 @@ class _Panels:
 
     def shades(self, sky):
         """
-        Pictures as shades of gray, dark where bright, and where their stretch ends.
+        Return the pictures as shades of gray, dark where bright, and where their stretch ends.
 
         Returns
         -------
@@ -113,7 +113,7 @@ class Cutouts:
         }
 
     def describe(self):
-        """Where the pictures are in a sheet, in pixels, and their stretch: plain values."""
+        """Tell where the pictures are in a sheet, in pixels, and their stretch: plain values."""
         side = max(panels.n for panels in self.bands.values())
         return {
             "box": BOX,
@@ -127,7 +127,7 @@ class Cutouts:
         }
 
     def on_image(self, sky):
-        """Whether a picture about each position has data in any band: bool, shape (n,)."""
+        """Tell whether a picture about each position has data in any band: bool, shape (n,)."""
         is_covered = np.zeros(len(sky), bool)
         # pictures of all sources of a large catalog would not fit in memory
         for part in chunks(len(sky), _AT_ONCE):
@@ -137,7 +137,7 @@ class Cutouts:
 
     def sheet(self, sky):
         """
-        One picture of all positions: a strip for each, with the prior at its left.
+        Return one picture of all positions: a strip for each, with the prior at its left.
 
         At the right of it each band has a column of mosaic, model and residual, north up, east left.
 

@@ -10,7 +10,7 @@ _LINES = "#c2410c"
 
 
 def filled(image):
-    """Values of an image (`~astropy.nddata.NDData`) with NaN where it is masked."""
+    """Return the values of an image (`~astropy.nddata.NDData`) with NaN where it is masked."""
     data = np.array(image.data, float)
     if image.mask is not None:
         data[np.asarray(image.mask, bool)] = np.nan
@@ -18,7 +18,7 @@ def filled(image):
 
 
 def _robust(image):
-    """Median and robust standard deviation of the finite pixels, (0, 1) without any."""
+    """Return the median and robust standard deviation of the finite pixels, (0, 1) without any."""
     values = image[np.isfinite(image)]
     if values.size == 0:
         return 0.0, 1.0
@@ -32,7 +32,7 @@ def _robust(image):
 
 
 def _limits(image):
-    """Values of the ends of the colors: from two sigma below the median to what is bright."""
+    """Return the values of the ends of the colors: from two sigma below the median to what is bright."""
     middle, sigma = _robust(image)
     finite = image[np.isfinite(image)]
     high = 1.0
@@ -73,7 +73,7 @@ def asinh_norm(low, high, softening):
 
 
 def _extent(shape, pixel_scale, center):
-    """Edges in arcsec, zero in the middle of the image or at a pixel."""
+    """Return the edges in arcsec, zero in the middle of the image or at a pixel."""
     ny, nx = shape
     if center is None:
         x = (nx - 1) / 2

@@ -231,7 +231,7 @@ def plot_sed_fit(
 
 
 def _flux_range(flux, model):
-    """Limits of the axis of fluxes: a factor 4 beyond those that are positive."""
+    """Return the limits of the axis of fluxes: a factor 4 beyond those that are positive."""
     flux = flux[flux > 0]
     model = model[np.isfinite(model) & (model > 0)]
     shown = np.concatenate([flux, model])
@@ -274,7 +274,7 @@ def _draw_residuals(ax, wave, pull, points, limit):
 
 
 def _points(groups, is_used, limit):
-    """Rows, label and style of the measured bands of each group, fitted (full) and not (open)."""
+    """Return the rows, label and style of the measured bands of each group, fitted (full) and not (open)."""
     if groups is None:
         names = np.full(is_used.size, "")
     else:

@@ -32,7 +32,7 @@ def _instrument(filter_name):
 
 def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE, position=None):
     """
-    PSFs of the MIRI imager over the field, from stpsf.
+    Return the PSFs of the MIRI imager over the field, from stpsf.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE, position=N
 
 def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
     """
-    PSF of the MIRI imager at one position of the detector, from stpsf.
+    Return the PSF of the MIRI imager at one position of the detector, from stpsf.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ _SIGNIFICANT = 5.0
 
 def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampling="drizzle"):
     """
-    Model PSF of an image in a filter: MIRI, NIRCam's wide filters, WFC3/IR.
+    Return the model PSF of an image in a filter: MIRI, NIRCam's wide filters, WFC3/IR.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampli
 
 
 def exposure_psf(filter, scale=None):
-    """The model of a single exposure, in the detector's axes; WFC3/IR is drizzled to ``scale``."""
+    """Return the model of a single exposure, in the detector's axes; WFC3/IR is drizzled to ``scale``."""
     filter = known_filter(filter, MODEL_FILTERS, "model PSF for the filter")
     if filter in WFC3_FILTERS:
         if scale is None:
@@ -233,7 +233,7 @@ def _check_turn(psf, center, stamps, model_facts, argument):
 
 
 def _scaled(psf, expected, filter_, argument):
-    """The PSF with the fraction of the light that it holds: its own or the model's."""
+    """Return the PSF with the fraction of the light that it holds: its own or the model's."""
     if psf.total_known:
         return psf
     held = psf.enclosed

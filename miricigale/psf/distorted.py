@@ -13,7 +13,7 @@ from miricigale.utils.units import ANGLE
 
 def undistorted_psf(psf):
     """
-    The PSF of a place on the imager's array, on square cells.
+    Return the PSF of a place on the imager's array, on square cells.
 
     PSFs with a position (`miri_psf`) are sampled by the pixel that the distortion makes there, a parallelogram.
     Templates that are put on an exposure through its coordinates need the same light on the sky.
@@ -63,7 +63,7 @@ def imager_kernels(
     hi, filter, wcs, pa, *, pixel_scale, grid_angle, subarray="FULL", n_psfs=9, **options
 ):
     """
-    Kernels to the PSF of one MIRI exposure, by place on its array.
+    Return the kernels to the PSF of one MIRI exposure, by place on its array.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def imager_kernels(
 
 def moved_kernels(kernels, old, new):
     """
-    Kernels of one exposure for another one of the same roll: the same at the same pixels.
+    Return the kernels of one exposure for another one of the same roll: the same at the same pixels.
 
     ``old`` and ``new`` are the coordinates of the two exposures.
     """

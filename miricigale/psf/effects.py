@@ -33,7 +33,7 @@ _CENTRAL_CELL = 4 * math.log(1 + math.sqrt(2))
 
 
 def _amplitude(filter_name, calibration):
-    """Light scattered along each axis per pixel of distance, beyond the inner radius."""
+    """Return the light scattered along each axis per pixel of distance, beyond the inner radius."""
     check_choice(calibration, "calibration", ("flight", "stpsf"))
     # the tabulated kernel holds at an oversampling of 4: one pixel is 4 cells of A / 4^2
     amplitude = jwst_constants()["cruciform"].get(filter_name, 0.0) / 4
@@ -49,7 +49,7 @@ def _profile(distance, filter_name, calibration):
 
 def cruciform_fraction(filter_name, *, calibration="flight"):
     """
-    Light that the detector scatters out of the image's core, into the cross and its halo.
+    Return the light that the detector scatters out of the image's core, into the cross and its halo.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def halo_share(filter_name, *, calibration):
 
 def cruciform_shift(x, y):
     """
-    Offset of the cruciform's center from the source, which leads to the array's middle.
+    Return the offset of the cruciform's center from the source, which leads to the array's middle.
 
     At 0-based pixels x, y of the full frame: the offset of the arm along the columns in x and of that along
     the rows in y, pixels; nothing at about (598, 511).

@@ -26,7 +26,7 @@ def _psf_or_model(psf):
 
 def encircled_energy(psf, radius, *, pixel_scale=None):
     """
-    Fraction of a point source's light inside circles around the center.
+    Return the fraction of a point source's light inside circles around the center.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
 
 def radius_of_encircled_energy(psf, fraction):
     """
-    Radius of the circle that holds a fraction of the light.
+    Return the radius of the circle that holds a fraction of the light.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def radius_of_encircled_energy(psf, fraction):
 
 def fwhm(psf, *, method="half_maximum"):
     """
-    Full width at half maximum.
+    Return the full width at half maximum.
 
     Parameters
     ----------

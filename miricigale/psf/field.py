@@ -64,7 +64,7 @@ def psf_grid(psfs, positions):
 
 def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", **options):
     """
-    PSFs of the MIRI imager over the field.
+    Return the PSFs of the MIRI imager over the field.
 
     What varies from place to place: the pixel, by the distortion of the SIAF (its sides,
     0.107 to 0.1114 arcsec, its turn by -0.7 to 0.5 deg, its shear), and the center of the
@@ -119,7 +119,7 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", **options):
 
 def grid_weights(grid, x, y):
     """
-    Weights with which the PSFs of a grid make up the PSF at positions.
+    Return the weights with which the PSFs of a grid make up the PSF at positions.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def grid_weights(grid, x, y):
 
 def psf_at(grid, x, y):
     """
-    The PSF of a grid at a position.
+    Return the PSF of a grid at a position.
 
     Parameters
     ----------

@@ -115,7 +115,7 @@ class PSFFile:
 
     def pixel_scale(self, user_scale, *, oversampling=1, argument="pixel_scale"):
         """
-        Side of a pixel: that of the header, with which a stated one must agree.
+        Return the side of a pixel: that of the header, with which a stated one must agree.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class PSFFile:
 
     def angle(self, user_angle, *, argument="angle"):
         """
-        Position angle of +y: that of the header, with which a stated one must agree.
+        Return the position angle of +y: that of the header, with which a stated one must agree.
 
         Parameters
         ----------
@@ -225,7 +225,7 @@ class PSFFile:
 
 
 def _planes(hdu, path, wanted, plane):
-    """The image of an extension, or the planes of its cube, shape (n, ny, nx)."""
+    """Return the image of an extension, or the planes of its cube, shape (n, ny, nx)."""
     data = None
     if hdu.is_image:
         data = hdu.data
@@ -249,7 +249,7 @@ def _planes(hdu, path, wanted, plane):
 
 
 def _shifted(data, offset):
-    """An image moved by x, y in cells; 0 comes in at its edges."""
+    """Return an image moved by x, y in cells; 0 comes in at its edges."""
     if np.hypot(offset[0], offset[1]) < 1e-6:
         return data
     y, x = np.indices(data.shape)
@@ -310,7 +310,7 @@ def core_position(data):
 
 def header_grid(header):
     """
-    Side of a pixel (arcsec) and position angle of +y (deg) that the header of a PSF or kernel states.
+    Return the side of a pixel (arcsec) and position angle of +y (deg) that the header of a PSF or kernel states.
 
     By world coordinates, or PIXELSCL or PIXSCALE (arcsec); None for what is not stated.
 
@@ -478,7 +478,7 @@ def _stated_oversampling(path, header):
 
 
 def is_written(path):
-    """Whether `InstrumentPSF.write` made a file."""
+    """Tell whether `InstrumentPSF.write` made a file."""
     with open_fits(path, wanted="a PSF") as hdus:
         return hdus[0].header.get("FORMAT") == _LAYOUT
 

@@ -42,7 +42,7 @@ def _hst_blurred(data, oversampling, scale, sigma):
 
 @cached(maxsize=16)
 def _hst_blur(scale):
-    """Gaussian sigma in arcsec with which the mosaic's PSF has its width at F160W."""
+    """Return the Gaussian sigma in arcsec with which the mosaic's PSF has its width at F160W."""
     oversampling = max(1, math.ceil(scale / 0.015))
     cell = scale / oversampling
     middle = odd_cells(2.4, cell) // 2
@@ -61,7 +61,7 @@ def hst_psf(
     filter="wfc3.f160w", *, pixel_scale=0.06 * u.arcsec, oversampling=4, fov=None, angle=0.0 * u.deg
 ):
     """
-    PSF of a north-up WFC3/IR mosaic.
+    Return the PSF of a north-up WFC3/IR mosaic.
 
     The annular pupil with its vanes over the band, the detector's pixel (0.128 arcsec),
     the drop (0.8 of it), the mosaic's pixel, and a Gaussian for all else (interpixel

@@ -14,7 +14,7 @@ from miricigale.utils.exceptions import argument_error
 
 def as_kernel(kernel, argument="kernel"):
     """
-    Kernel of anything that is one.
+    Return the kernel of anything that is one.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from miricigale.utils.options import check_that
 
 
 def convolved(image, array):
-    """Image of the same shape, convolved with an array and zero outside of it."""
+    """Return the image of the same shape, convolved with an array and zero outside of it."""
     image = floats(image)
     check_that(image.ndim == 2, "image", "2D", f"shape {image.shape}")
     bad = int(np.count_nonzero(~np.isfinite(image)))

@@ -139,7 +139,7 @@ class KernelField:
 
     def weights(self, sky):
         """
-        What each kernel counts at positions.
+        Return what each kernel counts at positions.
 
         Parameters
         ----------
@@ -187,13 +187,13 @@ class KernelField:
         return weights / weights.sum(axis=1, keepdims=True)
 
     def at(self, sky):
-        """The `MatchingKernel` at one position."""
+        """Return the `MatchingKernel` at one position."""
         weights = self.weights(sky.reshape(1))[0]
         nodes = np.flatnonzero(weights)
         return MatchingKernel.blend([self.kernels[k] for k in nodes], weights[nodes])
 
     def _plane(self, sky):
-        """Positions in the tangent plane about the first place, shape (n, 2)."""
+        """Return the positions in the tangent plane about the first place, shape (n, 2)."""
         local = sky.transform_to(SkyOffsetFrame(origin=self.sky[0].icrs))
         x, y, z = local.cartesian.xyz.value
         # nothing of a field is on the other side of the sky; what is goes to its rim

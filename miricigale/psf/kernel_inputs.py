@@ -97,7 +97,7 @@ def psf_pair(
 
 
 def _missing(psf):
-    """Light beyond the grid: what the sum leaves, or where it leaves nothing what wings say."""
+    """Return the light beyond the grid: what the sum leaves, or where it leaves nothing what wings say."""
     claimed = 1 - psf.enclosed
     if psf.total_known or claimed > 0.01:
         return claimed
@@ -112,7 +112,7 @@ def _missing(psf):
 
 
 def _from_array(array, name, scale, angle, grid_angle, normalize):
-    """An array on the image's pixels as a PSF."""
+    """Return an array on the image's pixels as a PSF."""
     array = checked_square(array, name, odd=False)
     total = array.sum()
     wanted = "a PSF whose sum is the fraction of light it holds (or 'normalize' True)"
@@ -130,7 +130,7 @@ def _from_array(array, name, scale, angle, grid_angle, normalize):
 
 
 def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
-    """One PSF on n x n pixels of the image, its sum the enclosed fraction."""
+    """Return one PSF on n x n pixels of the image, its sum the enclosed fraction."""
     if psf.frame == "detector" and angle is None:
         wanted = "the position angle of the detector's +y (the PSF is in the detector frame)"
         check_that(psf.pa_aper is not None, name + "_angle", wanted, "None")
@@ -157,7 +157,7 @@ def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
 
 def ready_arrays(array, scale, **psfs):
     """
-    A kernel that came ready, of unit sum, its PSFs that are not None, of unit sum, and what it summed to.
+    Return a kernel that came ready, of unit sum, its PSFs that are not None, of unit sum, and what it summed to.
 
     Parameters are those of `~miricigale.psf.MatchingKernel.from_array`, ``scale`` the pixel in arcsec. There is a
     target also if only the source is given.

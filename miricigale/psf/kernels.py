@@ -293,7 +293,7 @@ class MatchingKernel(Interactive):
     @classmethod
     def blend(cls, kernels, weights=None):
         """
-        The mean of kernels, such as those of several regions at a place between them.
+        Return the mean of kernels, such as those of several regions at a place between them.
 
         Parameters
         ----------
@@ -434,7 +434,7 @@ class MatchingKernel(Interactive):
 
     def encircled_energy_error(self, radii=None):
         """
-        Encircled energy of the convolved sharp PSF minus that of the wide one.
+        Return the encircled energy of the convolved sharp PSF minus that of the wide one.
 
         Parameters
         ----------

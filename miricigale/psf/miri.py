@@ -37,7 +37,7 @@ _IN_FLIGHT_BLUR = {"miri.f560w": 0.03 / math.sqrt(2)}
 
 def local_pixel(x, y, *, subarray="FULL"):
     """
-    The pixel at a 0-based position of a sub-array, as the distortion has it.
+    Return the pixel at a 0-based position of a sub-array, as the distortion has it.
 
     The Jacobian, (2, 2), in arcsec along the axes of the ideal plane (parity of an image of the sky, +y at
     V3IdlYAngle from V3) per pixel: its columns are the sides of the pixel.
@@ -60,7 +60,7 @@ def local_pixel(x, y, *, subarray="FULL"):
 
 
 def _distorted_optics(telescope, map_, oversampling, n, cell):
-    """The optics' image on cells that are parallelograms: ``map_`` of the nominal cell."""
+    """Return the optics' image on cells that are parallelograms: ``map_`` of the nominal cell."""
     # fine enough for splines between the samples at the shortest wavelength
     finer = math.ceil(4 / oversampling)
     # in coarse steps, so that places share one image of the optics
@@ -76,7 +76,7 @@ def _distorted_optics(telescope, map_, oversampling, n, cell):
 
 @cached(maxsize=24)
 def _miri_data(telescope, oversampling, fov, includes, calibration, position=None):
-    """Data and pixel (arcsec) of a PSF; ``position`` is (x, y, sub-array)."""
+    """Return the data and pixel (arcsec) of a PSF; ``position`` is (x, y, sub-array)."""
     name = telescope.filter
     scale = MIRI_PIXEL_SCALE.value
     cell = scale / oversampling
@@ -129,7 +129,7 @@ def miri_psf(
     subarray="FULL",
 ):
     """
-    PSF of the MIRI imager, from the telescope's pupil.
+    Return the PSF of the MIRI imager, from the telescope's pupil.
 
     Matrix Fourier transforms of the segmented pupil with a random wavefront error, summed
     over the filter's band (nine wavelengths of equal photon rate of a source of constant F_nu), then

@@ -141,7 +141,7 @@ class InstrumentPSF(ImagePSF):
 
     def encircled_energy(self, radius):
         """
-        Fraction of all light within radii; see `~miricigale.psf.encircled_energy`.
+        Return the fraction of all light within radii; see `~miricigale.psf.encircled_energy`.
 
         Parameters
         ----------
@@ -449,7 +449,7 @@ def make_psf(data, pixel_scale, *, frame="sky", oversampling=1, enclosed=None, *
 
 def as_psf(psf, argument="psf"):
     """
-    PSF of whatever a user has for one.
+    Return the PSF of whatever a user has for one.
 
     Parameters
     ----------
@@ -557,14 +557,14 @@ def from_photutils(model, pixel_scale, *, x=None, y=None, **options):
 
 
 def _half_width(data, origin):
-    """Cells from the center to the nearest edge."""
+    """Return the cells from the center to the nearest edge."""
     x, y = map(float, origin)
     return min(x, data.shape[1] - 1 - x, y, data.shape[0] - 1 - y) + 0.5
 
 
 def enclosed_light(psf, data, radius):
     """
-    Light of an image on the cells of a PSF inside circles around its center.
+    Return the light of an image on the cells of a PSF inside circles around its center.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ NIRCAM_FILTERS = tuple(_PIXELS)
 
 def nircam_psf(filter, *, oversampling=4, fov=None, wavefront_error=75 * u.nm, seed=1):
     """
-    PSF of a wide filter of NIRCam, by the optics of `miri_psf`.
+    Return the PSF of a wide filter of NIRCam, by the optics of `miri_psf`.
 
     Telescope, jitter and the pixel's response: no interpixel capacitance, no charge
     diffusion, no aberrations of NIRCam itself beyond the wavefront error of the whole, no

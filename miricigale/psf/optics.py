@@ -136,7 +136,7 @@ def _to_image(vertices, angle):
 @cached(maxsize=8)
 def jwst_pupil(n=384, *, angle=4.83544897):
     """
-    The entrance pupil of JWST as an image-plane axis sees it.
+    Return the entrance pupil of JWST as an image-plane axis sees it.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def _circle(radius, x=0.0, y=0.0, corners=720):
 @cached(maxsize=8)
 def hst_pupil(n=256, *, angle=45.0):
     """
-    The pupil of HST with its central obscuration, four vanes and three pads.
+    Return the pupil of HST with its central obscuration, four vanes and three pads.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def hst_pupil(n=256, *, angle=45.0):
 
 
 def _center(pupil, opd, wavelength):
-    """Offset of the image's core from the axis in rad (Gaussian-weighted centroid)."""
+    """Return the offset of the image's core from the axis in rad (Gaussian-weighted centroid)."""
     scale = wavelength / pupil.diameter
     grid = np.linspace(-4, 4, 65) * scale
     function = pupil.amplitude * np.exp(2j * np.pi * opd / wavelength)
@@ -271,7 +271,7 @@ def _center(pupil, opd, wavelength):
 
 def polychromatic_psf(pupil, opd, wavelengths, *, step, n):
     """
-    Light of a point source summed over a band, before any detector, as a fraction in each cell, (n, n).
+    Return the light of a point source summed over a band, before any detector, as a fraction in each cell, (n, n).
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ def _degrees(angle, argument):
 
 
 def _turn_by(psf, angle, grid_angle, argument):
-    """Counter-clockwise turn in deg that brings the PSF to the grid."""
+    """Return the counter-clockwise turn in deg that brings the PSF to the grid."""
     if psf.frame == "sky":
         check_that(
             angle is None, argument, "left out for a PSF that stands on the sky already", angle
@@ -139,7 +139,7 @@ def average_psf(psfs):
 
 
 def alike(psfs, names):
-    """PSFs, checked: of one shape, and with the same ``names`` among their facts."""
+    """Return the PSFs, checked: of one shape, and with the same ``names`` among their facts."""
     psfs = [instrument_psf(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
     first = psfs[0].facts
     for i, psf in enumerate(psfs[1:], start=1):
@@ -216,7 +216,7 @@ def psf_mosaic(
     oversampling=None,
 ):
     """
-    The PSF of a mosaic made from many dithered exposures.
+    Return the PSF of a mosaic made from many dithered exposures.
 
     Parameters
     ----------

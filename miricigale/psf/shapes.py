@@ -11,7 +11,7 @@ from miricigale.utils.units import ANGLE, scalar
 
 def gaussian_psf(fwhm, *, pixel_scale, oversampling=4, fov):
     """
-    A round Gaussian.
+    Return a round Gaussian.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ class Star:
     area: float = 1.0
 
     def halves(self):
-        """Two stars, each with every other octant about its position."""
+        """Return two stars, each with every other octant about its position."""
         odd = np.floor(np.arctan2(self.v, self.u) * (4 / np.pi)).astype(int) % 2 == 1
         sigmas = [np.where(part, np.inf, self.sigma) for part in (odd, ~odd)]
         return [dataclasses.replace(self, sigma=sigma) for sigma in sigmas]
@@ -136,11 +136,11 @@ class FittedStar:
         return self.right[0] / power, power**-0.5
 
     def _without_own(self, values):
-        """What the star's own parameters leave of weighted pixels."""
+        """Return what the star's own parameters leave of weighted pixels."""
         return values - self._basis @ (self._basis.T @ values)
 
     def misfit(self, change=0.0):
-        """Chi-square if the weighted pixels of the model change by this."""
+        """Return the chi-square if the weighted pixels of the model change by this."""
         return float(np.sum(self._without_own(self._open_residual - change) ** 2))
 
 
@@ -272,7 +272,7 @@ class StarPSF:
 
     def at(self, place=(0.0, 0.0), model=None):
         """
-        The corrected PSF at a place of the field, shape (n, n).
+        Return the corrected PSF at a place of the field, shape (n, n).
 
         Parameters
         ----------
@@ -331,7 +331,7 @@ class StarPSF:
         return fits, without, inverse[: len(TERMS), : len(TERMS)].copy()
 
     def _better(self, kind, chi2):
-        """Whether a kind of correction is confirmed, which is then the kind."""
+        """Tell whether a kind of correction is confirmed, which is then the kind."""
         self.chi2[kind] = chi2
         chi2_before = self.chi2[self.kind]
         better = chi2 < chi2_before - max(_EVIDENCE, _PART * chi2_before)
@@ -340,7 +340,7 @@ class StarPSF:
         return better
 
     def _common_cells(self, fits, image):
-        """What the residuals have in common by cell, and that without each of the stars."""
+        """Return what the residuals have in common by cell, and that without each of the stars."""
         shape = image.shape
         sums = []
         for fit in fits:
@@ -362,7 +362,7 @@ class StarPSF:
         total = np.sum(sums, axis=0)
 
         def mean_change(values, weight):
-            """Weighted mean of the residuals by cell, at constant light."""
+            """Return the weighted mean of the residuals by cell, at constant light."""
             mean = values / (weight + prior)
             return mean - mean.sum() * image
 

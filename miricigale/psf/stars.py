@@ -118,7 +118,7 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
 
 
 def _places(image, stars):
-    """Pixels x, y of stars on an image."""
+    """Return the pixels x, y of stars on an image."""
     if not isinstance(stars, SkyCoord) and "sky" not in stars.colnames:
         wanted = "tables with 'x' and 'y', or 'sky'"
         check_that({"x", "y"} <= set(stars.colnames), "stars", wanted, stars.colnames)

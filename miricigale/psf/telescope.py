@@ -15,7 +15,7 @@ from miricigale.utils.units import ANGLE, WAVE, check_count, positive, scalar, t
 @cached(maxsize=64)
 def band_quantiles(name, n=9):
     """
-    Wavelengths (um, ascending) of equal weight that stand for a band.
+    Return the wavelengths (um, ascending) of equal weight that stand for a band.
 
     The photon rate of a source of constant ``F_nu`` is cut into ``n`` equal parts; each is represented by
     its median.
@@ -31,12 +31,12 @@ def band_quantiles(name, n=9):
 
 
 def odd_cells(width, cell):
-    """Odd number of cells that covers a width, nearest to it."""
+    """Return the odd number of cells that covers a width, nearest to it."""
     return 2 * round(0.5 * width / cell - 0.5) + 1
 
 
 def checked_grid(oversampling, fov, default):
-    """Cells per pixel and width in arcsec of a PSF's grid."""
+    """Return the cells per pixel and width in arcsec of a PSF's grid."""
     width = default
     if fov is not None:
         width = positive(fov, ANGLE, "fov")
@@ -73,7 +73,7 @@ class Telescope:
 
     @classmethod
     def of(cls, filter, angle, wavefront_error, seed):
-        """The telescope of the options of `~miricigale.psf.miri_psf`, checked."""
+        """Return the telescope of the options of `~miricigale.psf.miri_psf`, checked."""
         error = scalar(wavefront_error, u.nm, "wavefront_error")
         return cls(filter, angle, error, int(seed))
 
@@ -88,7 +88,7 @@ class Telescope:
 
     @cached(maxsize=8)
     def image(self, cell, n):
-        """Fraction of the light in each of n x n cells of ``cell`` arcsec, read-only."""
+        """Return the fraction of the light in each of n x n cells of ``cell`` arcsec, read-only."""
         pupil = jwst_pupil(self.n_pupil, angle=self.angle)
         opd = pupil.wavefront_error(self.wavefront_error, seed=self.seed)
         waves = band_quantiles(self.filter, self.n_wavelengths)

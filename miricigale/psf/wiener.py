@@ -33,7 +33,7 @@ _ERROR = 0.02
 
 
 def checked_square(value, name, *, odd=True):
-    """An array as floats, checked: square, odd, finite; ``name`` is the argument's."""
+    """Return an array as floats, checked: square, odd, finite; ``name`` is the argument's."""
     value = floats(value)
     if value.ndim != 2 or value.shape[0] != value.shape[1] or (odd and value.shape[0] % 2 == 0):
         wanted = "square"
@@ -46,7 +46,7 @@ def checked_square(value, name, *, odd=True):
 
 def wiener(source, target):
     """
-    The matching kernel, (n, n), of the sum of the wide PSF, as a function of the Wiener parameter.
+    Return the matching kernel, (n, n), of the sum of the wide PSF, as a function of the Wiener parameter.
 
     That of `photutils.psf_matching.make_wiener_kernel`; but what does not depend on the parameter
     is computed once for all that are tried.
@@ -65,19 +65,19 @@ def wiener(source, target):
 
 
 def energy_radii(image):
-    """Radii in pixels at which encircled energies are compared."""
+    """Return the radii in pixels at which encircled energies are compared."""
     return np.arange(1.0, image.shape[0] // 2 + 0.25, 0.5)
 
 
 def energy_error(image, target, radii):
-    """Encircled energy of an image minus that of another, both centered, at radii in pixels."""
+    """Return the encircled energy of an image minus that of another, both centered, at radii in pixels."""
     c = target.shape[0] // 2
     return _core.radial_sums(image - target, c, c, radii)
 
 
 def gaussian_gain(source, target, names="hi, lo"):
     """
-    Noise gain of the Gaussian kernel between two Gaussians as wide as the PSFs' cores, at most 1.
+    Return the noise gain of the Gaussian kernel between two Gaussians as wide as the PSFs' cores, at most 1.
 
     Raises
     ------

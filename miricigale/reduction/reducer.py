@@ -508,7 +508,7 @@ class Reducer(Interactive):
 
     def mosaic_scale(self, pixel_scale=None):
         """
-        Pixel of mosaics without a WCS of their own.
+        Return the pixel of mosaics without a WCS of their own.
 
         Parameters
         ----------

@@ -133,7 +133,7 @@ class ReductionResult(Interactive):
 
 def rate_image(reducer, ramp, maps, fit):
     """
-    The slopes of a ramp as an image.
+    Return the slopes of a ramp as an image.
 
     Parameters
     ----------

@@ -23,13 +23,13 @@ def _folder(configured, default):
 
 
 def data_folder():
-    """The user's folder for reference data: ``conf.data_folder``, or one in astropy's cache folder."""
+    """Return the user's folder for reference data: ``conf.data_folder``, or one in astropy's cache folder."""
     return _folder(conf.data_folder, "miricigale")
 
 
 def cache_folder():
     """
-    The user's folder for what the package can make again, such as model grids.
+    Return the user's folder for what the package can make again, such as model grids.
 
     Returns
     -------
@@ -52,7 +52,7 @@ _kept_sha256 = cached_by_file(256)(file_sha256)
 
 
 def record_path(path):
-    """Path of the record that is kept beside a file that was added: ``<file>.json``."""
+    """Return the path of the record that is kept beside a file that was added: ``<file>.json``."""
     return path.with_name(path.name + ".json")
 
 
@@ -92,7 +92,7 @@ def _places(record):
 
 def find_place(record):
     """
-    Where the file of a record is found first: label and path.
+    Tell where the file of a record is found first: label and path.
 
     The label is ``"MIRICIGALE_DATA"``, ``"the data folder"``, ``"the package"`` or, with no path, ``""``.
     """
@@ -183,7 +183,7 @@ def locate(name):
 
 def fingerprint(name):
     """
-    What identifies the data that a resource stands for now.
+    Return what identifies the data that a resource stands for now.
 
     The sha256 of the file that `locate` finds, or the version of the package that it comes from.
     """
@@ -196,7 +196,7 @@ def fingerprint(name):
 
 def fingerprint_of(path):
     """
-    The sha256 of a file.
+    Return the sha256 of a file.
 
     It is not read where its size and time are those of the record beside it, or of an earlier call.
     """

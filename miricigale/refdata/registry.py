@@ -62,7 +62,7 @@ class Resource:
 @cached
 def resources():
     """
-    All records of ``resources.toml``.
+    Return all records of ``resources.toml``.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def resources():
 
 def resource(name):
     """
-    The record of one resource.
+    Return the record of one resource.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def resource(name):
 
 def citations(*names):
     """
-    What to cite for the named resources, as a sorted list without repeats.
+    Return what to cite for the named resources, as a sorted list without repeats.
 
     Examples
     --------
@@ -146,11 +146,11 @@ class Registry:
         self._loaders[name] = (loader, metadata)
 
     def names(self):
-        """All names, sorted."""
+        """Return all names, sorted."""
         return sorted(self._loaders)
 
     def metadata(self, name):
-        """The metadata given at registration; nothing is loaded."""
+        """Return the metadata given at registration; nothing is loaded."""
         return dict(self._entry(name)[1])
 
     def get(self, name):

@@ -9,7 +9,7 @@ SOLAR_LUMINOSITY = 3.828e26  # W, IAU 2015
 
 def read_images(path, names, *, wanted):
     """
-    Images of a FITS file by the names of their extensions: dict of read-only arrays of float.
+    Return the images of a FITS file by the names of their extensions: dict of read-only arrays of float.
 
     What ``wanted`` says that the file should be stands in the `DataError` if it is something else.
     """

@@ -63,7 +63,7 @@ class Background:
     @classmethod
     def low_zodi(cls, filter, *, center=None):
         """
-        The background of a MIRI filter at low zodiacal light, with a gradient of 5 % per arcmin.
+        Return the background of a MIRI filter at low zodiacal light, with a gradient of 5 % per arcmin.
 
         Parameters
         ----------
@@ -82,7 +82,7 @@ class Background:
 
     def image(self, wcs, shape):
         """
-        The background in each pixel.
+        Return the background in each pixel.
 
         Parameters
         ----------

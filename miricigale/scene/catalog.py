@@ -59,12 +59,12 @@ class CatalogFlags(Flags):
 
     @classmethod
     def unusable_profile(cls):
-        """The bits that make a Sersic profile be drawn as a point."""
+        """Return the bits that make a Sersic profile be drawn as a point."""
         return cls.BAD_RADIUS | cls.BAD_INDEX | cls.BAD_AXIS_RATIO | cls.BAD_ANGLE
 
 
 def _plain_column(table, name, unit, argument):
-    """A column as numbers in ``unit``, NaN where it has none or one that stands for no value."""
+    """Return a column as numbers in ``unit``, NaN where it has none or one that stands for no value."""
     values = plain_floats(table[name], name, argument)
     wanted = f"a table with one number a row in {name!r}"
     got = f"a column of shape {values.shape} (column[:, 0] is its first number)"
@@ -79,7 +79,7 @@ def _plain_column(table, name, unit, argument):
 
 def as_sources(data, filter, argument="catalog"):
     """
-    Table of sources with our names of columns, of any table.
+    Return the table of sources with our names of columns, of any table.
 
     Parameters
     ----------
@@ -262,6 +262,6 @@ def _flags(catalog):
 
 
 def _usable(catalog, name):
-    """Which sources have a positive flux in a band, with a positive error if it has errors."""
+    """Tell which sources have a positive flux in a band, with a positive error if it has errors."""
     names = [n for n in (name, error_column(name)) if n in catalog.colnames]
     return np.all([(catalog[n].value > 0) & np.isfinite(catalog[n].value) for n in names], axis=0)

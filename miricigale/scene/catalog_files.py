@@ -108,7 +108,7 @@ def _flags_of_stars(table):
 
 
 def _missing_fluxes(catalog):
-    """Warnings about sources without a flux."""
+    """Yield the warnings about sources without a flux."""
     lost = (catalog["flags"] & CatalogFlags.NO_FLUX) > 0
     if np.any(lost):
         first = ", ".join(map(str, catalog["id"][lost][:5].tolist()))
@@ -122,7 +122,7 @@ def _missing_fluxes(catalog):
 
 
 def _hours(table, catalog):
-    """Warnings about right ascensions in degrees that look like hours."""
+    """Yield the warnings about right ascensions in degrees that look like hours."""
     if "ra" not in table.colnames or table["ra"].unit != u.deg or len(catalog) < 3:
         return
     ra = catalog["sky"].ra.deg
@@ -136,7 +136,7 @@ def _hours(table, catalog):
 
 
 def _odd_units(catalog):
-    """Warnings about units of fluxes, by their number on the sky and their colors."""
+    """Yield the warnings about units of fluxes, by their number on the sky and their colors."""
     pivots = {name: Filter.from_name(name).pivot.value for name in flux_bands(catalog.colnames)}
     galaxies = ~np.asarray(catalog["star"])
     mags = {name: np.where(galaxies, ab_magnitude(catalog[name]), np.nan) for name in pivots}
@@ -156,7 +156,7 @@ def _odd_units(catalog):
 
 
 def _odd_counts(catalog, magnitudes, name):
-    """Warnings about the unit of a band, by the density of its sources."""
+    """Yield the warnings about the unit of a band, by the density of its sources."""
     median = float(np.nanmedian(magnitudes))
     sky = catalog["sky"][np.isfinite(magnitudes)]
     ra = sky.ra.wrap_at(sky.ra[0] + 180 * u.deg).deg
@@ -173,7 +173,7 @@ def _odd_counts(catalog, magnitudes, name):
 
 
 def _expected(magnitude):
-    """Galaxies in a square degree that are brighter than a magnitude, in the near infrared."""
+    """Return the galaxies in a square degree that are brighter than a magnitude, in the near infrared."""
     x = np.arange(5.0, magnitude, 0.02) + 0.01
     ends = np.minimum(x - _COUNTS_MAG[0], 0.0), np.maximum(x - _COUNTS_MAG[-1], 0.0)
     log = np.interp(x, _COUNTS_MAG, _COUNTS) + sum(

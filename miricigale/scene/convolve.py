@@ -33,7 +33,7 @@ class Places:
         self._n_nodes = (n_pixels + 2 * margin) * oversampling
 
     def weights(self):
-        """For each node the place below it, and the weight of the next one."""
+        """Return for each node the place below it, and the weight of the next one."""
         if self._at.size == 1:
             return np.zeros(self._n_nodes, dtype=np.int64), np.zeros(self._n_nodes)
         node = np.arange(self._n_nodes) / self._oversampling - self._margin
@@ -62,7 +62,7 @@ class Places:
 
 
 def _window(first, stop, n_pixels, margin, oversampling):
-    """Pixels of a tile and of the image that it reaches, and the length of the transform."""
+    """Return the pixels of a tile and of the image that it reaches, and the length of the transform."""
     start = first // oversampling
     end = -(-stop // oversampling)
     low = max(start - margin, margin)
@@ -73,13 +73,13 @@ def _window(first, stop, n_pixels, margin, oversampling):
 
 
 def _spectrum(part, size, n_threads):
-    """Half of the transform of an image padded with zeros, without work on empty rows."""
+    """Return the half of the transform of an image padded with zeros, without work on empty rows."""
     rows = rfft(part, size[1], axis=1, workers=n_threads)
     return fft(rows, size[0], axis=0, workers=n_threads, overwrite_x=True)
 
 
 def _kernel_spectrum(kernel, size, n_threads):
-    """The same for a kernel whose middle is the origin."""
+    """Return the same for a kernel whose middle is the origin."""
     half = kernel.shape[0] // 2
     taps = np.arange(-half, half + 1)
     wrapped = np.zeros((kernel.shape[0], size[1]))
@@ -91,7 +91,7 @@ def _kernel_spectrum(kernel, size, n_threads):
 
 def phases(data, origin, oversampling):
     """
-    Cubic spline coefficients of a PSF by sub-pixel phase.
+    Return the cubic spline coefficients of a PSF by sub-pixel phase.
 
     ``data`` are its values on the nodes, ``origin`` the node x, y of its center. Shape of the
     result: (oversampling, oversampling, 2 L + 1, 2 L + 1), coefficients at the offsets of whole
@@ -137,7 +137,7 @@ def add_nodes(image, i, j, light, phases, *, margin):
 
 
 def _kernels(data, origin, oversampling, order, y, x):
-    """Phases of the kernels of 1, x, y and xy of the pixel, as far as they are not zero."""
+    """Return the phases of the kernels of 1, x, y and xy of the pixel, as far as they are not zero."""
     k_y, length_y = y
     k_x, length_x = x
     corner = data[order[k_y, k_x]]

@@ -162,7 +162,7 @@ class Cutout(Frozen):
 
     def pieces(self, jacobian):
         """
-        The stamp as many small points on the pixels of an image.
+        Return the stamp as many small points on the pixels of an image.
 
         Parameters
         ----------

@@ -24,7 +24,7 @@ SLOPE_ACROSS = 0.12
 
 def smooth_from(rows, w_zone, w_cut):
     """
-    Squared elliptical radius (N,) beyond which profiles are smooth for ``_core._add_smooth``.
+    Return the squared elliptical radius (N,) beyond which profiles are smooth for ``_core._add_smooth``.
 
     Infinite where they never are; parameters as of ``_core.fill_outskirts``.
     """

@@ -52,7 +52,7 @@ class ExampleField:
 
 def example_field(filters=("wfc3.f160w", "miri.f770w"), *, size=30 * u.arcsec, seed=1):
     """
-    Simulated images of a part of GOODS-S, with noise, for examples and first tries.
+    Return the simulated images of a part of GOODS-S, with noise, for examples and first tries.
 
     Positions, redshifts, shapes and F160W fluxes are those of real galaxies (the bundled catalog);
     the other bands follow from one model of a star-forming galaxy at each redshift. The noise is

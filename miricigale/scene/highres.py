@@ -21,7 +21,7 @@ _N_SIGMA = 5
 
 def depth_to_rms(depth, *, pixel_area):
     """
-    Noise of a pixel that belongs to a depth in an aperture of 0.2" in radius.
+    Return the noise of a pixel that belongs to a depth in an aperture of 0.2" in radius.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def highres_image(
     catalog, *, filter="wfc3.f160w", wcs, psf, depth=_DEPTH, seed=None, noise=None, **options
 ):
     """
-    A high-resolution image with Gaussian noise.
+    Return a high-resolution image with Gaussian noise.
 
     Parameters
     ----------

@@ -118,13 +118,13 @@ class Painter:
         return float(self._data.sum(axis=(1, 2)).min()) / self._oversampling**2
 
     def _axes(self):
-        """Places of the PSFs along y and along x."""
+        """Return the places of the PSFs along y and along x."""
         options = {"margin": self.margin, "oversampling": self._oversampling}
         pairs = zip(self._places, self.shape, strict=True)
         return tuple(Places(at, n_pixels=n, **options) for at, n in pairs)
 
     def _landing(self):
-        """Which part of the light on each node lands on the image."""
+        """Tell which part of the light on each node lands on the image."""
         shape = self._phases.shape
         sums = np.zeros(shape[:3] + (shape[3] + 1, shape[4] + 1))
         sums[..., 1:, 1:] = self._phases.cumsum(axis=3).cumsum(axis=4)
@@ -135,7 +135,7 @@ class Painter:
         return _core.Landing(sums, self._oversampling, self._order, *y, *x)
 
     def _ranges(self, n):
-        """For each node along an axis the range of the phase tables that lies on the image."""
+        """Return for each node along an axis the range of the phase tables that lies on the image."""
         margin = half = self.margin
         k = np.arange((n + 2 * margin) * self._oversampling) // self._oversampling
         low = np.clip(margin - k, -half, half + 1) + half

@@ -420,7 +420,7 @@ class Scene(WithTable):
         return BandTable(self._painted[1], copy=True)
 
     def to_table(self):
-        """What is in the image: `truth`."""
+        """Return what is in the image: `truth`."""
         return self.truth
 
     def write(self, path, *, overwrite=False):

@@ -7,7 +7,7 @@ from miricigale.instrument.sky_axes import pixel_to_radec, radec_axes
 
 def local_jacobian(wcs, x, y):
     """
-    Local linear map from the sky to the pixels at positions ``x``, ``y``, (N,).
+    Return the local linear map from the sky to the pixels at positions ``x``, ``y``, (N,).
 
     Shape (N, 2, 2), in pixels per arcsec: ``[dx, dy] = jacobian @ [east, north]``.
     """
@@ -26,7 +26,7 @@ def local_jacobian(wcs, x, y):
 
 def pixel_positions(wcs, sky, shape):
     """
-    Pixels of a SkyCoord, by the distortion where it is defined and linear far from the image.
+    Return the pixels of a SkyCoord, by the distortion where it is defined and linear far from the image.
 
     Returns x, y (NaN on the other side of the sky), and which of them lie within half an image of
     the image, whose ``shape`` is (ny, nx).

@@ -65,7 +65,7 @@ class Stars:
 
 
 def distinct(items):
-    """Different items in the order of their first appearance, and which of them each one is."""
+    """Return the different items in the order of their first appearance, and which of them each one is."""
     row_of_value = {}
     index = [row_of_value.setdefault(item, len(row_of_value)) for item in items]
     return list(row_of_value), np.array(index, dtype=np.int64)
@@ -140,34 +140,34 @@ class Chain:
         return np.concatenate([[infrared, visual], windows, bands])
 
     def _light_in(self, span):
-        """Weights of the integral of L_lambda over a range of wavelengths."""
+        """Return the weights of the integral of L_lambda over a range of wavelengths."""
         weights = np.zeros(self.wave.size)
         part = slice(self.at[span[0]], self.at[span[1]] + 1)
         weights[part] = _core.trapezoid_weights(self.wave[part])
         return weights
 
     def names(self, roles):
-        """Names of the parameters of a role, or of several."""
+        """Return the names of the parameters of a role, or of several."""
         if isinstance(roles, str):
             return self._names[roles]
         return tuple(itertools.chain.from_iterable(map(self._names.get, roles)))
 
     def key(self, values, roles):
-        """Values of all parameters of a role, or of several, as a tuple."""
+        """Return the values of all parameters of a role, or of several, as a tuple."""
         return tuple(map(values.get, self.names(roles)))
 
     def keys(self, rows, roles):
-        """The `key` of each of some rows, dicts of all parameters."""
+        """Return the `key` of each of some rows, dicts of all parameters."""
         return [self.key(row, roles) for row in rows]
 
     def _dict(self, key, roles):
-        """Values of a `key` by the names of the parameters."""
+        """Return the values of a `key` by the names of the parameters."""
         return dict(zip(self.names(roles), key, strict=True))
 
     # ------------------------------------------------------------------ stars
 
     def _hat(self, role):
-        """Matrix that interpolates spectra at a component's nodes on our grid."""
+        """Return the matrix that interpolates spectra at a component's nodes on our grid."""
         return _core.hat_matrix(np.asarray(self.by_role[role].nodes()), self.wave)
 
     def _populations(self, metallicity):
@@ -192,7 +192,7 @@ class Chain:
 
     def stars(self, keys):
         """
-        `Stars` of the different histories among keys, and which of them each key has.
+        Return the `Stars` of the different histories among keys, and which of them each key has.
 
         Sums are made row by row: what a history gives does not depend on what is asked for with it.
         """
@@ -257,7 +257,7 @@ class Chain:
     # ------------------------------------------------------- attenuation and dust
 
     def factors(self, key):
-        """Transmissions for young stars, old stars and gas; None for gas that is as the stars."""
+        """Return the transmissions for young stars, old stars and gas; None for gas that is as the stars."""
         attenuation = self.by_role["attenuation"]
         values = self._dict(key, "attenuation")
         if attenuation is None:
@@ -272,7 +272,7 @@ class Chain:
 
     def attenuated(self, stars, rows, keys, dust_keys=None, out=None):
         """
-        Starlight of n galaxies behind dust, and the power that dust took.
+        Return the starlight of n galaxies behind dust, and the power that dust took.
 
         Parameters
         ----------
@@ -316,7 +316,7 @@ class Chain:
         return out, absorbed
 
     def dusts(self, keys):
-        """Dust spectra in W/um for one watt, by keys of ``dust``; zeros without the component."""
+        """Return the dust spectra in W/um for one watt, by keys of ``dust``; zeros without the component."""
         component = self.by_role["dust"]
         if component is None:
             return np.zeros((len(keys), self.wave.size))
@@ -327,13 +327,13 @@ class Chain:
         return spectra
 
     def dust(self, key):
-        """One of `dusts`."""
+        """Return one of `dusts`."""
         return self.dusts([key])[0]
 
     # ------------------------------------------------------------- AGN and the sky
 
     def agn_key(self, values):
-        """Values of the AGN's parameters, those without effect at their defaults."""
+        """Return the values of the AGN's parameters, those without effect at their defaults."""
         agn = self.by_role["agn"]
         changed = values | {"frac_agn": 0.0}
         for name in agn.inert(changed):
@@ -341,16 +341,16 @@ class Chain:
         return self.key(changed, "agn")
 
     def agn_templates(self, key):
-        """`~miricigale.sed.components.AGNTemplates` by a key of `agn_key`."""
+        """Return the `~miricigale.sed.components.AGNTemplates` by a key of `agn_key`."""
         return self.by_role["agn"].templates(self.wave, self._dict(key, "agn"))
 
     def agn(self, values):
-        """`~miricigale.sed.components.AGNTemplates` for a dict of values, whatever its fraction."""
+        """Return the `~miricigale.sed.components.AGNTemplates` for a dict of values, whatever its fraction."""
         return self.agn_templates(self.agn_key(values))
 
     def sky_transmission(self, redshift, key, first=0, last=None):
         """
-        Transmission between the source and us, by the key of ``igm`` and ``foreground``.
+        Return the transmission between the source and us, by the key of ``igm`` and ``foreground``.
 
         Given at the rest wavelengths from number ``first`` to ``last``, that one not included.
         """
@@ -367,20 +367,20 @@ class Chain:
         return out
 
     def sky(self, values):
-        """Transmission between the source and us at every rest wavelength, for a dict of values."""
+        """Return the transmission between the source and us at every rest wavelength, for a dict of values."""
         return self.sky_transmission(values["redshift"], self.key(values, SKY))
 
     # --------------------------------------------------------------- derived values
 
     def reference(self, spectrum):
-        """Integral of L_lambda over the range that AGN fractions refer to, along the last axis."""
+        """Return the integral of L_lambda over the range that AGN fractions refer to, along the last axis."""
         return spectrum @ self.functionals[self.reference_row]
 
     def functional_sums(self, spectra):
-        """Sums over spectra L_lambda, (n, n_wave), with ``functionals``: (n, n_functional)."""
+        """Return the sums over spectra L_lambda, (n, n_wave), with ``functionals``: (n, n_functional)."""
         # most weights are 0; and threads of the linear algebra would cost more than they gain
         return (self._sparse_functionals @ np.ascontiguousarray(spectra.T)).T
 
     def lnu(self, spectrum):
-        """L_nu in W/Hz from L_lambda in W/um."""
+        """Return the L_nu in W/Hz from L_lambda in W/um."""
         return spectrum * self.to_lnu

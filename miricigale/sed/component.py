@@ -196,13 +196,13 @@ class Component:
     @classmethod
     @cached
     def declared(cls):
-        """Parameters as declared in the class bodies, base classes first."""
+        """Return the parameters as declared in the class bodies, base classes first."""
         bodies = [vars(base).items() for base in reversed(cls.__mro__)]
         return {k: v for body in bodies for k, v in body if isinstance(v, Parameter)}
 
     @classmethod
     def all_options(cls):
-        """Options as declared in the class bodies: dict of name to the values allowed."""
+        """Return the options as declared in the class bodies: dict of name to the values allowed."""
         bodies = [vars(base).get("options", {}) for base in reversed(cls.__mro__)]
         return {name: values for body in bodies for name, values in body.items()}
 
@@ -228,11 +228,11 @@ class Component:
         return out
 
     def nodes(self):
-        """Wavelengths in um between which the component's spectra are straight lines."""
+        """Return the wavelengths in um between which the component's spectra are straight lines."""
         return ()
 
     def inert(self, values):
-        """Names of parameters of an AGN that make no difference, given the values of all."""
+        """Return the names of parameters of an AGN that make no difference, given the values of all."""
         return ()
 
     def invalid(self, values):
@@ -276,7 +276,7 @@ class Component:
 
 
 def in_order(components):
-    """Components of a model in the order of their roles: what is lacking or there twice is refused."""
+    """Return the components of a model in the order of their roles: what is lacking or there twice is refused."""
     if isinstance(components, (str, Mapping)):
         wanted = "a list of components or names (SEDModel.from_dict takes tables of them)"
         raise argument_error("components", wanted, type(components).__name__)
@@ -302,7 +302,7 @@ def in_order(components):
 
 
 def read_config(config):
-    """Components and other options of a model from plain values; see `SEDModel.from_dict`."""
+    """Return the components and other options of a model from plain values; see `SEDModel.from_dict`."""
     if not isinstance(config, Mapping):
         raise config_error("[sed]", f"must be a table of keys, got {type(config).__name__}")
     sections = ["components", "frac_agn_definition"]

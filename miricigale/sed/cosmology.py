@@ -12,7 +12,7 @@ COSMOLOGY = FlatLambdaCDM(H0=70.4, Om0=0.272, name="yang2021")
 
 def distance(redshift, cosmology):
     """
-    Luminosity distance in meters; 10 pc at redshift 0, as for absolute magnitudes.
+    Return the luminosity distance in meters; 10 pc at redshift 0, as for absolute magnitudes.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ _BAND = {name: i for i, name in enumerate(COLOR_BANDS)}
 
 def galaxy_quantities(stars, rows, absorbed, sums, reference_row):
     """
-    Derived quantities of n galaxies for one solar mass formed, in the units of `DERIVED`.
+    Return the derived quantities of n galaxies for one solar mass formed, in the units of `DERIVED`.
 
     ``stars`` are `~miricigale.sed.chain.Stars`, of which each galaxy has one of ``rows``, shape (n,);
     ``absorbed``, shape (n,), is the power in W that dust took, ``sums``, shape (n, n_functional), their light
@@ -73,7 +73,7 @@ def galaxy_quantities(stars, rows, absorbed, sums, reference_row):
 
 def agn_quantities(definition, ratio, galaxy, observed):
     """
-    Derived quantities of AGN, and ``ir_luminosity`` of galaxies with them: arrays of shape (n,).
+    Return the derived quantities of AGN, and ``ir_luminosity`` of galaxies with them: arrays of shape (n,).
 
     ``definition`` says what the fraction f refers to, ``ratio`` is f / (1 - f), ``galaxy`` comes from
     `galaxy_quantities`; ``observed`` holds, for one watt of torus and polar emission, ``infrared``,
@@ -101,7 +101,7 @@ def _fraction(part, total):
 
 def scaled_quantities(model, values, mass, redshift, far, parameters):
     """
-    Derived quantities of galaxies of given masses (Msun formed), from those for one solar mass.
+    Return the derived quantities of galaxies of given masses (Msun formed), from those for one solar mass.
 
     ``far`` is the luminosity distance in m, ``parameters`` holds values of all parameters.
     """

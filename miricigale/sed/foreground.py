@@ -31,7 +31,7 @@ _KEY = "galactic_extinction"
 
 
 def _law(law):
-    """The class of a law."""
+    """Return the class of a law."""
     check_that(law in LAWS, "law", f"one of {', '.join(LAWS)}", repr(law))
     from dust_extinction import parameter_averages
 
@@ -39,7 +39,7 @@ def _law(law):
 
 
 def coverage(law):
-    """Shortest and longest wavelength of a law in um."""
+    """Return the shortest and longest wavelength of a law in um."""
     low, high = _law(law).x_range
     return 1.0 / high, 1.0 / low
 
@@ -54,7 +54,7 @@ def _outside(law, r_v):
 
 @cached(maxsize=64)
 def _table(law, r_v):
-    """ln(first wavelength), steps per unit of ln, and A(lambda) / E(B-V) at the steps."""
+    """Return the ln(first wavelength), steps per unit of ln, and A(lambda) / E(B-V) at the steps."""
     import astropy.units as u
 
     low, high = coverage(law)
@@ -69,7 +69,7 @@ def _table(law, r_v):
 
 def extinction_curve(wave, law="G23", r_v=3.1):
     """
-    Extinction for one magnitude of color excess, A(lambda) / E(B-V), at wavelengths in um.
+    Return the extinction for one magnitude of color excess, A(lambda) / E(B-V), at wavelengths in um.
 
     NaN outside the `coverage` of the law. Interpolated in a table of 8192 steps in ln(lambda).
 
@@ -168,7 +168,7 @@ class GalacticExtinction(Component):
 
     def transmission(self, wave, values):
         """
-        Transmission of what lies in front of all, whatever the redshift.
+        Return the transmission of what lies in front of all, whatever the redshift.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class GalacticExtinction(Component):
 
 
 def _color_excess(ebv):
-    """Color excesses in mag as an array of one dimension, and whether it was one number."""
+    """Return the color excesses in mag as an array of one dimension, and whether it was one number."""
     flat = GalacticExtinction.ebv_galactic.replace(0.0, name="ebv").array(ebv)
     wrong = np.flatnonzero(~(np.isfinite(flat) & (flat >= 0)))
     if wrong.size:
@@ -221,7 +221,7 @@ def _color_excess(ebv):
 
 
 def _band_grid(band, low, high, sed):
-    """Wavelengths in um where the law is defined, weights of the light there, their whole sum."""
+    """Return the wavelengths in um where the law is defined, weights of the light there, their whole sum."""
     first, last = band.wave.value[[0, -1]]
     wave = np.geomspace(first, last, max(int(_RESOLUTION * np.log(last / first)), 2) + 1)
     wave[0] = first
@@ -238,7 +238,7 @@ def _band_grid(band, low, high, sed):
 
 def color_excess(sky, dust_map, *, scale=1.0):
     """
-    Color excess E(B-V) at positions, by a map.
+    Return the color excess E(B-V) at positions, by a map.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def color_excess(sky, dust_map, *, scale=1.0):
 
 def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refuse"):
     """
-    Galactic extinction in bands.
+    Return the Galactic extinction in bands.
 
     Parameters
     ----------

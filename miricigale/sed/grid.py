@@ -44,7 +44,7 @@ _FACTS = ("axes", "inert", "bounds", "frac_agn_definition", "recipe")
 
 def fraction_span(definition):
     """
-    Range of wavelengths in um of whose light an AGN fraction is a share; None for ``"dust"``.
+    Return the range of wavelengths in um of whose light an AGN fraction is a share; None for ``"dust"``.
 
     ``definition`` is ``"dust"`` or a range such as ``"3-1000um"`` or ``"5-20um"`` in 0.1-1000 um; anything else
     is a ValueError.
@@ -247,7 +247,7 @@ class ModelGrid(Frozen):
 
     def flux(self, z, galaxy, agn=0, frac=0):
         """
-        Fluxes of single models by index.
+        Return the fluxes of single models by index.
 
         Parameters
         ----------

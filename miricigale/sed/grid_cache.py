@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 def grid_key(model, axes, filters):
     """
-    Checksum of everything that a grid depends on: components, data, cosmology, axes, curves of bands.
+    Return the checksum of everything that a grid depends on: components, data, cosmology, axes, curves of bands.
 
     Code is known by the versions that it states, ``Component.version`` of a component and its
     bases and ``VERSION`` of what all share: a change of numbers raises one of them.
@@ -51,12 +51,12 @@ def grid_key(model, axes, filters):
 
 
 def is_own(model):
-    """Whether all components are of this package: the code of others may change under the same name."""
+    """Tell whether all components are of this package: the code of others may change under the same name."""
     return all(type(c).__module__.startswith("miricigale.") for c in model.components)
 
 
 def _unchanged(model):
-    """Whether the files that were read are those that are there now."""
+    """Tell whether the files that were read are those that are there now."""
     return all(
         c.fingerprint == fingerprint_of(Path(c.path)) for c in model.components if c.resource
     )
@@ -64,7 +64,7 @@ def _unchanged(model):
 
 def cached_grid(model, axes, filters, make):
     """
-    A grid from the cache folder, or one of ``make(model, axes, filters)`` that is then kept there.
+    Return a grid from the cache folder, or one of ``make(model, axes, filters)`` that is then kept there.
 
     The least recently used grids go when all together are larger than
     ``miricigale.conf.grid_cache_size`` (MB; 0: nothing is kept). A cache that cannot be

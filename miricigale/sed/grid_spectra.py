@@ -50,7 +50,7 @@ def check_model(model, grid):
 
 
 def plain_index(grid, index):
-    """Indices of models with those that make no difference set to 0: shape (..., 4)."""
+    """Return the indices of models with those that make no difference set to 0: shape (..., 4)."""
     index = np.array(index)
     # without AGN light all AGN models are the same
     dark = grid.frac_agn[index[..., 3]] == 0.0
@@ -60,7 +60,7 @@ def plain_index(grid, index):
 
 def band_names(grid, filters):
     """
-    Names of the bands asked for (None: those of the grid), and those that the grid has not.
+    Return the names of the bands asked for (None: those of the grid), and those that the grid has not.
 
     The latter as a dict of name to `~miricigale.filters.Filter`, or to the name where only that was given.
     """
@@ -86,7 +86,7 @@ def band_names(grid, filters):
 
 def draw_fluxes(grid, index, scale, names, extra, model):
     """
-    Fluxes of drawn models in uJy, shape (n, n_draws, n_filters).
+    Return the fluxes of drawn models in uJy, shape (n, n_draws, n_filters).
 
     ``index``, shape (n, n_draws, 4), numbers redshift, galaxy, AGN model and AGN fraction of each,
     none of them missing but AGN models at no fraction; ``scale``, shape (n, n_draws), is in Msun
@@ -109,7 +109,7 @@ def draw_fluxes(grid, index, scale, names, extra, model):
 
 def model_fluxes(model, grid, index, filters):
     """
-    Fluxes in any bands of models of a grid, each different one evaluated once.
+    Return the fluxes in any bands of models of a grid, each different one evaluated once.
 
     In uJy for each solar mass formed, shape (..., n_filters), for ``index`` of shape (..., 4).
     """
@@ -137,7 +137,7 @@ def model_fluxes(model, grid, index, filters):
 
 def _factors(model, grid, index):
     """
-    L_nu in W/Hz of different galaxies (per solar mass) and AGN (per W), and their places.
+    Return the L_nu in W/Hz of different galaxies (per solar mass) and AGN (per W), and their places.
 
     Last comes what AGN fractions refer to, in W for each solar mass, of the galaxies.
     """
@@ -168,7 +168,7 @@ def _factors(model, grid, index):
 
 
 def row_values(model, table, row):
-    """Parameters of one row as plain numbers in the model's units, with defaults for the others."""
+    """Return the parameters of one row as plain numbers in the model's units, with defaults for the others."""
     return model.defaults | {
         name: float(model.parameters[name].convert(table[name][row]))
         for name in table.colnames
@@ -179,7 +179,7 @@ def row_values(model, table, row):
 
 def rest_spectra(model, grid, index, scale):
     """
-    Rest-frame spectra of models of a grid, without absorption outside of the galaxy.
+    Return the rest-frame spectra of models of a grid, without absorption outside of the galaxy.
 
     For ``index`` of shape (n, 4) and ``scale``, shape (n,), in Msun formed: wavelengths in um, and L_nu
     in W/Hz, shape (n, n_wave).
@@ -194,7 +194,7 @@ def rest_spectra(model, grid, index, scale):
 
 def observed_spectra(model, grid, index, scale):
     """
-    Observed spectra of models of a grid, with absorption between the galaxies and in the Milky Way.
+    Return the observed spectra of models of a grid, with absorption between the galaxies and in the Milky Way.
 
     As `rest_spectra`, but observed wavelengths that all models cover, in the steps of the median redshift, and
     F_nu in uJy. Spectra of other redshifts are means around these wavelengths, so that bands keep the light of

@@ -60,7 +60,7 @@ def _names(model, roles):
 
 
 def _products(parameters, axes):
-    """All combinations of parameters, the last one fastest: list of dicts."""
+    """Return all combinations of parameters, the last one fastest: list of dicts."""
     values = [axes.get(name, [parameter.default]) for name, parameter in parameters.items()]
     rows = itertools.product(*values)
     return [dict(zip(parameters, map(float, row), strict=True)) for row in rows]
@@ -178,7 +178,7 @@ class BandSums:
         self.weights = vstack(weights, format="csr")
 
     def __call__(self, spectra):
-        """Fluxes in uJy, shape (n, nz, nb), of spectra L_lambda in W/um, shape (n, n_wave)."""
+        """Return the fluxes in uJy, shape (n, nz, nb), of spectra L_lambda in W/um, shape (n, n_wave)."""
         flux = np.empty((len(spectra),) + self.shape[::-1])
         for first in range(0, len(spectra), BLOCK):
             part = slice(first, first + BLOCK)
@@ -225,7 +225,7 @@ class Galaxies:
 
 
 def _galaxy_tables(quantities):
-    """What scales with mass, and what does not."""
+    """Return what scales with mass, and what does not."""
     texts = {"ir_luminosity": "3-1000 um light of stars and dust, without AGN"}
     scaling = {}
     shape = {}
@@ -242,7 +242,7 @@ def _galaxy_tables(quantities):
 
 
 def agn_table(model, parts):
-    """L_nu and properties of AGN for one watt of what the fraction refers to."""
+    """Return the L_nu and properties of AGN for one watt of what the fraction refers to."""
     spectra, observed = seen_agn(model.chain, parts)
     dusty = model.frac_agn_definition == "dust"
     if dusty:
@@ -266,7 +266,7 @@ def agn_table(model, parts):
 
 
 def model_grid(model, axes, filters):
-    """The factorised grid of `SEDModel.grid`, for axes that `check_axes` gave."""
+    """Return the factorised grid of `SEDModel.grid`, for axes that `check_axes` gave."""
     chain = model.chain
     redshift = axes["redshift"]
     agn_component = model.component("agn")
@@ -315,7 +315,7 @@ def model_grid(model, axes, filters):
 
 
 def _nuclei(model, axes, frac_agn):
-    """Spectra of all distinct AGN, L_nu for one watt, and the columns of a grid about them."""
+    """Return the spectra of all distinct AGN, L_nu for one watt, and the columns of a grid about them."""
     component = model.component("agn")
     parameters = without(component.parameters, ["frac_agn"])
     models = [row | {"frac_agn": 0.0} for row in _products(parameters, axes)]

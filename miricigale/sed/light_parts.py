@@ -79,7 +79,7 @@ class LightParts:
 
     def starlight(self, rows):
         """
-        Starlight behind dust, for one solar mass formed.
+        Return the starlight behind dust, for one solar mass formed.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ class LightParts:
         return PartTable(flux, np.concatenate(parts, axis=1))
 
     def absorbed(self, rows):
-        """Power in W that dust takes from the starlight of one solar mass formed, shape (n,)."""
+        """Return the power in W that dust takes from the starlight of one solar mass formed, shape (n,)."""
         _, absorbed = Starlight(self.model.chain, self._rows(rows)).sums([])
         return absorbed
 
@@ -138,7 +138,7 @@ class LightParts:
 
 def quantities_of_parts(starlight, absorbed, dust, age, reference_row):
     """
-    Derived quantities of galaxies for one solar mass formed, from columns of their parts.
+    Return the derived quantities of galaxies for one solar mass formed, from columns of their parts.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def quantities_of_parts(starlight, absorbed, dust, age, reference_row):
 
 def part_parameters(model):
     """
-    Names of the parameters that shape each part.
+    Return the names of the parameters that shape each part.
 
     Returns
     -------

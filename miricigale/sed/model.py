@@ -121,7 +121,7 @@ class SEDModel(Interactive):
     @classmethod
     def yang2021(cls, *, agn=True, xray=False, igm="meiksin2006", libraries="best", **options):
         """
-        The chain of Yang et al. 2021, from the best libraries at hand; ``meta`` names them.
+        Return the chain of Yang et al. 2021, from the best libraries at hand; ``meta`` names them.
 
         Delayed history, BC03 at solar metallicity, Calzetti-Leitherer attenuation, dust in a
         sequence of alpha, torus with SMC polar dust (oa 40 deg, i 70 deg, p 1, R 20,
@@ -158,7 +158,7 @@ class SEDModel(Interactive):
     @classmethod
     def survey(cls, *, agn=True, igm="meiksin2006", libraries="best", **options):
         """
-        A chain for real galaxies of a survey, to be fitted with `survey_axes`.
+        Return a chain for real galaxies of a survey, to be fitted with `survey_axes`.
 
         The chain of `yang2021` with lines and continuum of the gas (log U -2.5), a burst of 30 Myr ago,
         old stars with 0.44 of the color excess of young ones and of the gas (Calzetti et al. 2000), and the
@@ -190,7 +190,7 @@ class SEDModel(Interactive):
     @classmethod
     def for_axes(cls, name="survey"):
         """
-        The model that a grid of ours is made of.
+        Return the model that a grid of ours is made of.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class SEDModel(Interactive):
 
     def with_components(self, *components):
         """
-        Model of the same chain with more components, such as dust of the Milky Way.
+        Return the model of the same chain with more components, such as dust of the Milky Way.
 
         Parameters
         ----------
@@ -232,7 +232,7 @@ class SEDModel(Interactive):
 
     def replace(self, *components):
         """
-        Model with other components, each in the place of the one of its role.
+        Return the model with other components, each in the place of the one of its role.
 
         Parameters
         ----------
@@ -261,14 +261,14 @@ class SEDModel(Interactive):
         return self._of_components([*unchanged, *new.values()])
 
     def _of_components(self, components):
-        """Model of other components, with the cosmology and the AGN fractions of this one."""
+        """Return the model of other components, with the cosmology and the AGN fractions of this one."""
         return type(self)(
             components, cosmology=self.cosmology, frac_agn_definition=self.frac_agn_definition
         )
 
     def named_axes(self, name=None):
         """
-        Axes of a grid of this model by name.
+        Return the axes of a grid of this model by name.
 
         Parameters
         ----------
@@ -322,11 +322,11 @@ class SEDModel(Interactive):
         return parameter_table(self._parameters)
 
     def component(self, role):
-        """The component of a role (one of `~miricigale.sed.ROLES`), or None."""
+        """Return the component of a role (one of `~miricigale.sed.ROLES`), or None."""
         return next((c for c in self.components if c.role == role), None)
 
     def __getitem__(self, name):
-        """The component of a name, role or number."""
+        """Return the component of a name, role or number."""
         if isinstance(name, (int, np.integer)):
             return self.components[name]
         component = next((c for c in self.components if name in (c.name, c.role)), None)
@@ -384,7 +384,7 @@ class SEDModel(Interactive):
 
     def derived_columns(self):
         """
-        Derived quantities that come with every evaluation.
+        Return the derived quantities that come with every evaluation.
 
         Returns
         -------
@@ -450,7 +450,7 @@ class SEDModel(Interactive):
 
     def evaluate(self, values=None, /, **parameters):
         """
-        The spectrum of one model.
+        Return the spectrum of one model.
 
         Parameters
         ----------
@@ -496,7 +496,7 @@ class SEDModel(Interactive):
     __call__ = evaluate
 
     def derived(self, **parameters):
-        """Derived quantities of one model: dict of name to `~astropy.units.Quantity`."""
+        """Return the derived quantities of one model: dict of name to `~astropy.units.Quantity`."""
         return tables.spectra(self, self.values(parameters)).derived
 
     def plot(self, ax=None, **parameters):
@@ -505,7 +505,7 @@ class SEDModel(Interactive):
 
     def fluxes(self, table=None, filters=None, **parameters):
         """
-        Band fluxes of any list of models, at their own redshifts.
+        Return the band fluxes of any list of models, at their own redshifts.
 
         Parameters
         ----------
@@ -557,7 +557,7 @@ class SEDModel(Interactive):
 
     def grid(self, axes=None, filters=None, *, cache=True, **values):
         """
-        Factorised band fluxes of a grid of models.
+        Return the factorised band fluxes of a grid of models.
 
         Parameters
         ----------

@@ -33,7 +33,7 @@ _LOG_MASSES = ("log_mass", "logmass", "lmass", "log_m", "massformed", "log_massf
 
 def by_our_names(values, parameters=(), *, short=False):
     """
-    Values of parameters by our names, with the mass for its logarithm.
+    Return the values of parameters by our names, with the mass for its logarithm.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def named_first(values, filters, named, argument):
 
 
 def parameter_table(parameters):
-    """Table of a row for each model, of numbers or arrays of one shape by parameter."""
+    """Return the table of a row for each model, of numbers or arrays of one shape by parameter."""
     values = {}
     for name, value in parameters.items():
         # numbers without a unit are in that of the parameter; a list may hold quantities
@@ -207,7 +207,7 @@ def parameter_table(parameters):
 
 def plain_mass(values):
     """
-    Values of parameters by name in which a logarithm of the mass is the mass.
+    Return the values of parameters by name in which a logarithm of the mass is the mass.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def plain_mass(values):
 
 
 def single_models(parameters):
-    """Parameters of each model, of parameters some of which are arrays of one length."""
+    """Yield the parameters of each model, of parameters some of which are arrays of one length."""
     arrays = {name: value for name, value in parameters.items() if np.ndim(value) == 1}
     lengths = {name: len(value) for name, value in arrays.items()}
     got = ", ".join(f"{length} of {name!r}" for name, length in lengths.items())

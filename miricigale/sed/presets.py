@@ -39,7 +39,7 @@ PAH_33 = 0.2
 
 def yang2021_components(*, agn, xray, igm, libraries):
     """
-    Components of the chain of Yang et al. 2021, and which library each part comes from.
+    Return the components of the chain of Yang et al. 2021, and which library each part comes from.
 
     Parameters are those of `SEDModel.yang2021`. Of the paper are the libraries' kinds and the values
     of its table 1; ``q`` and one color excess for stars of all ages are inferred.
@@ -62,7 +62,7 @@ def yang2021_components(*, agn, xray, igm, libraries):
 
 def survey_components(*, agn, igm, libraries):
     """
-    Components of the chain for galaxies of a survey, and which library each part comes from.
+    Return the components of the chain for galaxies of a survey, and which library each part comes from.
 
     Parameters are those of `SEDModel.survey`. Against `yang2021_components` there are the gas's lines and
     continuum, a burst, two metallicities, old stars with 0.44 of the color excess of young ones, and dust
@@ -85,7 +85,7 @@ def survey_components(*, agn, igm, libraries):
 
 
 def _chooser(libraries):
-    """Function that takes the better of two libraries if it is at hand, and notes on what it took."""
+    """Return the function that takes the better of two libraries if it is at hand, and notes on what it took."""
     check_that(libraries in LIBRARIES, "libraries", f"one of {LIBRARIES}", repr(libraries))
     notes = []
 
@@ -119,7 +119,7 @@ def _stars(choose, metallicities):
 
 
 def _torus(choose, axes):
-    """Torus of the paper's shape with the optical depths of some axes."""
+    """Return the torus of the paper's shape with the optical depths of some axes."""
 
     def covers(library):
         points = [TORUS | {"tau97": t, "inclination": 70.0} for t in axes["tau97"]]
@@ -131,7 +131,7 @@ def _torus(choose, axes):
 
 def yang2021_axes(kind="fit"):
     """
-    Axes after the grids of Yang et al. 2021 (tables 1 and 3).
+    Return the axes after the grids of Yang et al. 2021 (tables 1 and 3).
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def yang2021_axes(kind="fit"):
 
 def survey_axes(kind="survey"):
     """
-    Axes for galaxies of a survey: what redshifts, masses and AGN fractions of real galaxies need.
+    Return the axes for galaxies of a survey: what redshifts, masses and AGN fractions of real galaxies need.
 
     Histories of three time scales and seven ages from 50 Myr, without a burst or with one of 30 Myr ago that
     made 3 or 30 % of the stars; 0.2 solar and solar metallicity of stars and gas; two slopes of attenuation;
@@ -197,7 +197,7 @@ def survey_axes(kind="survey"):
 
 def quasar_axes():
     """
-    Axes of type-1 AGN that outshine their galaxies, for the chain of `SEDModel.survey`.
+    Return the axes of type-1 AGN that outshine their galaxies, for the chain of `SEDModel.survey`.
 
     Disks seen at 30 deg, three slopes of them (L_lambda ~ wave^-1.8 to wave^-1.2), behind polar dust of E(B-V) 0
     to 0.4, and tori of three depths; AGN fractions from 0.7, of two young hosts with E(B-V) 0.2; the redshifts of
@@ -244,7 +244,7 @@ def grid_name(name, argument="axes"):
 
 def axes_of_preset(preset, name=None, *, agn):
     """
-    Axes of a grid of a model of a preset; see `SEDModel.named_axes`.
+    Return the axes of a grid of a model of a preset; see `SEDModel.named_axes`.
 
     ``preset`` is None of a model that has no grid of its own, and ``name`` that of the grid, by default that of
     the preset.
@@ -263,7 +263,7 @@ def axes_of_preset(preset, name=None, *, agn):
 
 
 def grid_axes(name, *, agn):
-    """Axes of a grid in `GRIDS`: new arrays by parameter; without those of AGN if ``agn`` is false."""
+    """Return the axes of a grid in `GRIDS`: new arrays by parameter; without those of AGN if ``agn`` is false."""
     axes = _values(GRIDS[name][1])
     if agn:
         return axes
@@ -295,7 +295,7 @@ def red_dot_axes():
 
 
 def _values(name):
-    """New arrays of a table of ``presets.toml``; redshifts are even in ln(1 + z)."""
+    """Return the new arrays of a table of ``presets.toml``; redshifts are even in ln(1 + z)."""
     table = dict(declared("miricigale.sed", "presets.toml")[name])
     step = table.pop("redshift", None)
     out = convert_values(np.array, table)

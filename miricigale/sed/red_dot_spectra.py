@@ -55,7 +55,7 @@ _OF_BLACK_BODY = ("temperature", "balmer_depth", "covering")
 
 
 def _wavelengths():
-    """Rest wavelengths in um: finely where bands of surveys are, and over the lines."""
+    """Return the rest wavelengths in um: finely where bands of surveys are, and over the lines."""
     across = np.linspace(-0.02, 0.02, 61)
     lines = [line * (1.0 + across) for line in (_H_ALPHA, _H_BETA) + _OIII]
     optical = np.geomspace(_LYMAN, 1.5, 1200)
@@ -71,7 +71,7 @@ _WAVE_UM = _wavelengths()
 
 def red_dot(*, atmosphere=None, **parameters):
     r"""
-    Spectrum of a little red dot.
+    Return the spectrum of a little red dot.
 
     Two parts whose shapes are simple and whose numbers are published:
 
@@ -167,7 +167,7 @@ def red_dot(*, atmosphere=None, **parameters):
 
 def red_dots(axes=None, *, atmospheres=None):
     """
-    Spectra of little red dots of all values of some axes, for `template_grid` at redshifts.
+    Return the spectra of little red dots of all values of some axes, for `template_grid` at redshifts.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def red_dots(axes=None, *, atmospheres=None):
 
 
 def _planck(temperature, wave):
-    """Planck's law of F_nu at wavelengths in um, but for a factor."""
+    """Return Planck's law of F_nu at wavelengths in um, but for a factor."""
     x = _SECOND_RADIATION / (temperature * wave)
     # below 0.0912 um it would overflow
     return wave**-3.0 / np.expm1(np.minimum(x, 600.0))
@@ -236,7 +236,7 @@ def _line(center, width):
 
 
 def _black_body(values):
-    """F_nu of the envelope as a black body that hydrogen absorbs, 1 at 0.51 um."""
+    """Return the F_nu of the envelope as a black body that hydrogen absorbs, 1 at 0.51 um."""
     depth = values["balmer_depth"] * (_WAVE_UM / _BALMER) ** 3
     transmission = 1.0 - values["covering"] * -np.expm1(-np.where(_WAVE_UM < _BALMER, depth, 0.0))
     planck = _planck(values["temperature"], _WAVE_UM)
@@ -244,7 +244,7 @@ def _black_body(values):
 
 
 def _photosphere(atmosphere):
-    """F_nu of the envelope as a spectrum, 1 at 0.51 um: means around the points of `_WAVE_UM`."""
+    """Return the F_nu of the envelope as a spectrum, 1 at 0.51 um: means around the points of `_WAVE_UM`."""
     check_type(atmosphere, "atmosphere", SED, "an SED")
     wave = atmosphere.rest_wavelength.to_value(WAVE)
     fnu = atmosphere.fnu.to_value(FNU)
@@ -265,7 +265,7 @@ def _photosphere(atmosphere):
 
 
 def _envelope(continuum, values):
-    """F_nu of the envelope with its lines and the hot dust, of its continuum at `_WAVE_UM`."""
+    """Return the F_nu of the envelope with its lines and the hot dust, of its continuum at `_WAVE_UM`."""
     # F_lambda of the continuum under H alpha, in F_nu / wave^2
     under = np.interp(_H_ALPHA, _WAVE_UM, continuum) / _H_ALPHA**2
     flux = under * (values["halpha_width"] * u.AA).to_value(WAVE)
@@ -277,7 +277,7 @@ def _envelope(continuum, values):
 
 
 def _galaxy(values):
-    """F_nu of the galaxy with its lines."""
+    """Return the F_nu of the galaxy with its lines."""
     slope = values["uv_slope"] + 2.0
     fnu = values["uv_to_optical"] * (np.minimum(_WAVE_UM, _FLAT) / _UV) ** slope
     fnu *= np.maximum(_WAVE_UM / _FLAT, 1.0) ** min(slope, 0.0)

@@ -44,7 +44,7 @@ class _Flux(u.Quantity):
 
     @classmethod
     def of(cls, sed):
-        """The flux densities of an SED."""
+        """Return the flux densities of an SED."""
         flux = sed.fnu.view(cls)
         flux._sed = sed
         return flux
@@ -235,7 +235,7 @@ class SED(Frozen, WithTable):
 
     def fnu_at(self, wave):
         """
-        Flux density at observed wavelengths, by straight lines.
+        Return the flux density at observed wavelengths, by straight lines.
 
         Raises
         ------
@@ -252,7 +252,7 @@ class SED(Frozen, WithTable):
 
     def redshifted(self, redshift, *, cosmology=COSMOLOGY):
         """
-        The same source at another redshift.
+        Return the same source at another redshift.
 
         Wavelengths move by the ratio of (1 + z), F_nu by that ratio and the inverse square
         of the luminosity distance (10 pc at redshift 0). Absorption between the galaxies
@@ -289,11 +289,11 @@ class SED(Frozen, WithTable):
         return self.redshifted(0.0, cosmology=cosmology)
 
     def synthetic_flux(self, band):
-        """Mean flux density in a band; see `~miricigale.filters.Filter.synthetic_flux`."""
+        """Return the mean flux density in a band; see `~miricigale.filters.Filter.synthetic_flux`."""
         return as_filter(band).synthetic_flux(self)
 
     def synthetic_magnitude(self, band):
-        """AB magnitude in a band."""
+        """Return the AB magnitude in a band."""
         return self.synthetic_flux(band).to(u.ABmag)
 
     def fluxes(self, bands):
@@ -341,12 +341,12 @@ class SED(Frozen, WithTable):
         return self * float(to_array(flux, FNU, "flux", ndim=0) / flux_before.to_value(FNU))
 
     def color(self, blue, red):
-        """AB magnitude in one band less that in another."""
+        """Return the AB magnitude in one band less that in another."""
         return self.synthetic_magnitude(blue) - self.synthetic_magnitude(red)
 
     def absolute_magnitude(self, band, *, cosmology=COSMOLOGY):
         """
-        Absolute AB magnitude in a band at rest.
+        Return the absolute AB magnitude in a band at rest.
 
         Parameters
         ----------
@@ -451,7 +451,7 @@ class SED(Frozen, WithTable):
         return cls._of_table(table, "the table")
 
     def to_table(self):
-        """The spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""
+        """Return the spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""
         return spectrum_table(self)
 
     def write(self, path, *, overwrite=False):
@@ -562,7 +562,7 @@ class SED(Frozen, WithTable):
         return synphot_spectrum(self)
 
     def to_specutils(self):
-        """This spectrum for specutils (``Spectrum``, or ``Spectrum1D`` before its version 2)."""
+        """Return this spectrum for specutils (``Spectrum``, or ``Spectrum1D`` before its version 2)."""
         return specutils_spectrum(self)
 
     def plot(

@@ -6,7 +6,7 @@ from miricigale.utils.optional_packages import require
 
 
 def synphot_spectrum(sed):
-    """A spectrum as a `synphot.SourceSpectrum`, as observed."""
+    """Return a spectrum as a `synphot.SourceSpectrum`, as observed."""
     from synphot import SourceSpectrum
     from synphot.models import Empirical1D
 
@@ -16,7 +16,7 @@ def synphot_spectrum(sed):
 
 
 def specutils_spectrum(sed):
-    """A spectrum as one of specutils: ``Spectrum``, or ``Spectrum1D`` before its version 2."""
+    """Return a spectrum as one of specutils: ``Spectrum``, or ``Spectrum1D`` before its version 2."""
     specutils = require("specutils", extra="specutils")
     kind = getattr(specutils, "Spectrum", None) or specutils.Spectrum1D
     return kind(spectral_axis=sed.wave, flux=sed.fnu, meta=dict(sed.meta))

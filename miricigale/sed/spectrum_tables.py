@@ -57,7 +57,7 @@ def spectrum_columns(table, path):
 
 
 def spectrum_table(sed):
-    """A spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""
+    """Return a spectrum as a `~astropy.table.QTable` of ``wave`` (um), ``fnu`` (uJy) and the parts."""
     table = QTable({"wave": sed.wave, "fnu": sed.fnu})
     for name, part in sed.components.items():
         table[name] = part.fnu
@@ -69,7 +69,7 @@ def spectrum_table(sed):
 
 
 def _with_unit(column, parse):
-    """A column as a quantity, its unit read by ``parse``; None without one."""
+    """Return a column as a quantity, its unit read by ``parse``; None without one."""
     unit = getattr(column, "unit", None)
     if unit is None:
         return None

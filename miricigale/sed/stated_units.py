@@ -68,7 +68,7 @@ def stated_units(path, colnames):
 
 
 def _wave_unit(texts, path):
-    """Unit of the wavelengths; the words of the line of the columns count first."""
+    """Return the unit of the wavelengths; the words of the line of the columns count first."""
     try:
         return unit_of_comments(texts, path)
     except DataError as err:
@@ -78,7 +78,7 @@ def _wave_unit(texts, path):
 
 
 def _flux_unit(texts, path):
-    """Unit of the fluxes in brackets behind their name."""
+    """Return the unit of the fluxes in brackets behind their name."""
     for text in texts:
         match = _FLUX.search(text) or _ENDING.search(text)
         if match is not None:

@@ -49,7 +49,7 @@ class ModelFlags(Flags):
 
 
 def dilution(redshift, far):
-    """Factor from rest-frame L_nu in W/Hz to observed F_nu in uJy; distance in m."""
+    """Return the factor from rest-frame L_nu in W/Hz to observed F_nu in uJy; distance in m."""
     return (1.0 + redshift) / (4.0 * np.pi * np.square(far)) * 1e32
 
 
@@ -66,7 +66,7 @@ def seen_agn(chain, parts):
 
 
 def _columns(model, table):
-    """Values of every parameter for every row, in the declared units."""
+    """Return the values of every parameter for every row, in the declared units."""
     check_that(
         "redshift" in table.colnames, "table", "a table with a column 'redshift'", table.colnames
     )
@@ -90,7 +90,7 @@ def _warn_of_slips(model, names):
 
 
 def _keys(columns, names, rows):
-    """Values of some columns as a tuple for each row."""
+    """Return the values of some columns as a tuple for each row."""
     if not names:
         return [()] * len(rows)
     return list(zip(*(columns[name][rows].tolist() for name in names), strict=True))
@@ -122,7 +122,7 @@ def _row_flags(model, values, n):
 
 @cached(maxsize=16)
 def _stack(filters):
-    """Integrals over all passbands, as `_core.band_means` takes them."""
+    """Return the integrals over all passbands, as `_core.band_means` takes them."""
     waves = [band.wave.to_value(WAVE) for band in filters]
     curves = [np.asarray(band.throughput, dtype=float) for band in filters]
     start = np.append(0, np.cumsum(list(map(len, waves))))
@@ -131,7 +131,7 @@ def _stack(filters):
 
 def with_mass_formed(model, parameters):
     """
-    Parameters of one model with the mass formed in place of that of living stars.
+    Return the parameters of one model with the mass formed in place of that of living stars.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def with_mass_formed(model, parameters):
 
 
 def _with_masses_formed(model, table, filters):
-    """Table with the masses formed of rows in place of those of living stars."""
+    """Return the table with the masses formed of rows in place of those of living stars."""
     if LIVING_MASS not in table.colnames or "mass" in table.colnames:
         return table
     out = table.copy()
@@ -171,7 +171,7 @@ def _with_masses_formed(model, table, filters):
 
 
 def spectra(model, values):
-    """The spectrum of one model with its parts and derived quantities; see `SEDModel.evaluate`."""
+    """Return the spectrum of one model with its parts and derived quantities; see `SEDModel.evaluate`."""
     chain = model.chain
     z = values["redshift"]
     stars, rows = chain.stars([chain.key(values, STELLAR)])
@@ -233,7 +233,7 @@ class _Blocks:
         return _keys(self.values, self.chain.names(roles), rows)
 
     def galaxies(self, rows):
-        """Light of galaxies, and their derived quantities."""
+        """Return the light of galaxies, and their derived quantities."""
         chain = self.chain
         stars, history_of_row = chain.stars(self._keys(rows, STELLAR))
         dims = self._keys(rows, "attenuation")
@@ -250,7 +250,7 @@ class _Blocks:
         return light, galaxy_quantities(stars, history_of_row, absorbed, sums, chain.reference_row)
 
     def agn(self, rows):
-        """Spectra of AGN for one watt, which of them each row has, and their sums."""
+        """Return the spectra of AGN for one watt, which of them each row has, and their sums."""
         chain = self.chain
         n = len(rows)
         model_of_row = np.zeros(n, dtype=np.int64)
@@ -273,7 +273,7 @@ class _Blocks:
         )
 
     def run(self, rows):
-        """Fluxes in uJy and derived quantities of rows, masses included."""
+        """Return the fluxes in uJy and derived quantities of rows, masses included."""
         chain = self.chain
         values = self.values
         n = len(rows)
@@ -308,7 +308,7 @@ class _Blocks:
 
 
 def flux_table(model, table, filters):
-    """Fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
+    """Return the fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
     table = by_our_names(quantity_table(as_table(table, "table"), copy=False), model.parameters)
     _warn_of_slips(model, table.colnames)
     return _evaluate_rows(model, _with_masses_formed(model, table, filters), filters)

@@ -128,7 +128,7 @@ def _stated(file, table):
 
 def template_grid(spectra, filters, *, beyond="error", redshift=None):
     """
-    A grid of given spectra, for `~miricigale.fitting.BayesFitter`: at redshift 0, or at redshifts.
+    Return a grid of given spectra, for `~miricigale.fitting.BayesFitter`: at redshift 0, or at redshifts.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def template_grid(spectra, filters, *, beyond="error", redshift=None):
 
 def _columns(seds):
     """
-    Parameters of templates, with meanings: their own, where these are a full grid, or their numbers.
+    Return the parameters of templates, with meanings: their own, where these are a full grid, or their numbers.
 
     Templates have their own parameters if all have the same, none is what a grid has itself, and each combination
     of the values is there once.
@@ -240,7 +240,7 @@ def _columns(seds):
 
 
 def _observed_fluxes(seds, redshifts, filters):
-    """Fluxes of spectra at redshifts, of any scale: shape (n_z, n, n_filters)."""
+    """Return the fluxes of spectra at redshifts, of any scale: shape (n_z, n, n_filters)."""
     igm = Meiksin2006()
     alike = {}
     # spectra often have the same wavelengths
@@ -258,7 +258,7 @@ def _observed_fluxes(seds, redshifts, filters):
 
 
 def _continued(sed):
-    """A spectrum with F_nu ~ wave^-2 from its end on."""
+    """Return a spectrum with F_nu ~ wave^-2 from its end on."""
     wave = sed.wave.to_value(WAVE)
     fnu = sed.fnu.to_value(FNU)
     end = wave > _END * wave[-1]

@@ -22,7 +22,7 @@ _LAWS = {"stern2015": _core.stern2015}
 
 def stern2015(l_6um):
     r"""
-    Rest-frame 2-10 keV luminosity of an AGN from its light at 6 um.
+    Return the rest-frame 2-10 keV luminosity of an AGN from its light at 6 um.
 
     .. math:: \log L_{2-10\,\mathrm{keV}} = 40.981 + 1.024\,x - 0.047\,x^2, \quad
         x = \log(\nu L_\nu(6\,\mu\mathrm{m}) / 10^{41}\,\mathrm{erg/s})
@@ -68,7 +68,7 @@ def stern2015(l_6um):
 
 def stern2015_6um(l_x):
     """
-    Light of an AGN at 6 um from its 2-10 keV luminosity: `stern2015` solved for its argument.
+    Return the light of an AGN at 6 um from its 2-10 keV luminosity: `stern2015` solved for its argument.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def stern2015_6um(l_x):
 
 def band_luminosity(l_x, *, from_band, to_band, photon_index=1.8):
     """
-    Luminosity of a power law in another band of the same frame.
+    Return the luminosity of a power law in another band of the same frame.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def band_luminosity(l_x, *, from_band, to_band, photon_index=1.8):
 
 def xray_flux(l_x_2_10, redshift, *, band=(0.5, 7.0) * u.keV, photon_index=1.8, transmission=1.0):
     r"""
-    Observed X-ray flux of a power law.
+    Return the observed X-ray flux of a power law.
 
     .. math:: F = \frac{L_{2-10}}{4\pi d_L^2}
         \frac{\int_\mathrm{band} E^{1-\Gamma} dE}{\int_2^{10} E^{1-\Gamma} dE}
@@ -196,7 +196,7 @@ def xray_flux(l_x_2_10, redshift, *, band=(0.5, 7.0) * u.keV, photon_index=1.8, 
 
 
 def check_band(band, name):
-    """Ends of a band in keV; a ValueError unless these are two ascending positive energies."""
+    """Return the ends of a band in keV; a ValueError unless these are two ascending positive energies."""
     ends = to_array(band, u.keV, name, ndim=1, finite=True)
     if ends.shape != (2,) or not 0 < ends[0] < ends[1]:
         raise argument_error(name, "two ascending positive energies", band)
@@ -256,7 +256,7 @@ class XRay(Component):
 
     def derived(self, l_6um, redshift, far, values):
         """
-        X-ray luminosity and flux.
+        Return the X-ray luminosity and flux.
 
         Parameters
         ----------

@@ -52,12 +52,12 @@ class Source(NamedTuple):
     band: tuple
 
     def spectrum(self, energy):
-        """L_E in W/keV."""
+        """Return the L_E in W/keV."""
         shape = _shape(energy, self.index, self.cutoff)
         return self.power * shape / _energy(self.band, self.index, self.cutoff)
 
     def dimming(self, band, redshift, far):
-        """F_nu in uJy, the mean of an observed band (keV), over the power; distances in m."""
+        """Return the F_nu in uJy, the mean of an observed band (keV), over the power; distances in m."""
         low, high = band
         share = [
             _energy((low * (1 + z), high * (1 + z)), self.index, self.cutoff) for z in redshift
@@ -79,7 +79,7 @@ class XRays:
     hmxb_index: float = 2.0
 
     def galaxy(self, rate, mass, age, metallicity):
-        """Sources of galaxies by name, of SFR in Msun/yr, surviving mass in Msun, age in Gyr and Z."""
+        """Return the sources of galaxies by name, of SFR in Msun/yr, surviving mass in Msun, age in Gyr and Z."""
         low = 1e-10 * mass * 10.0 ** (np.polyval(_LOW_MASS[::-1], np.log10(age)) + self.lmxb)
         high = rate * 10.0 ** (np.polyval(_HIGH_MASS[::-1], metallicity) + self.hmxb)
         return {
@@ -89,7 +89,7 @@ class XRays:
         }
 
     def corona(self, disk, alpha_ox, inclination):
-        """The corona of disks of L_nu in W/Hz at 2500 A and 30 deg, as seen at inclinations in deg."""
+        """Return the corona of disks of L_nu in W/Hz at 2500 A and 30 deg, as seen at inclinations in deg."""
         cut = positive(self.cutoff, u.keV, "cutoff")
         a1, a2 = self.angle_coefficients
         mu = np.cos(np.radians([np.broadcast_to(_ANGLE, np.shape(inclination)), inclination]))
@@ -175,7 +175,7 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
     far = distance(grid.redshift, model.cosmology)
 
     def observed(*sources):
-        """Fluxes in uJy, (nz, n, n_bands)."""
+        """Return the fluxes in uJy, (nz, n, n_bands)."""
         ends = energies.values()
         fluxes = [[s.dimming(two, z, far)[:, None] * s.power for s in sources] for two in ends]
         return np.moveaxis(np.sum(fluxes, axis=1), 0, -1)
@@ -199,7 +199,7 @@ def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
 
 
 def _agn_rows(grid, slopes, disk, hard):
-    """What a grid says of its AGN, each of them repeated for every slope."""
+    """Return what a grid says of its AGN, each of them repeated for every slope."""
     rows = np.repeat(np.arange(grid.n_agn), slopes.size)
     parameters = grid.agn_parameters[rows]
     properties = grid.agn_properties[rows]
@@ -219,7 +219,7 @@ def _agn_rows(grid, slopes, disk, hard):
 
 
 def _disks(grid, model):
-    """L_nu at 2500 A and 30 deg, W/Hz for each W of AGN power, and inclinations in deg."""
+    """Return the L_nu at 2500 A and 30 deg, W/Hz for each W of AGN power, and inclinations in deg."""
     rows = [row_values(model, grid.agn_parameters, k) for k in range(grid.n_agn)]
     agn = model.component("agn")
     light = np.array([disk_2500(model.chain, agn, row) for row in rows])
@@ -237,7 +237,7 @@ def disk_2500(chain, agn, values):
 
 
 def xray_filter(name, band):
-    """A `~miricigale.filters.Filter` of an X-ray band, for drawings: flat between two energies."""
+    """Return a `~miricigale.filters.Filter` of an X-ray band, for drawings: flat between two energies."""
     low, high = check_band(band, "band")
     wave = (const.h * const.c / ([high, low] * u.keV)).to(u.um)
     return Filter(wave, np.ones(2), name=name)
@@ -248,7 +248,7 @@ def _shape(energy, index, cut):
 
 
 def _energy(band, index, cut):
-    """Integral of E^(1 - Gamma) exp(-E / cut) over the energies of a band."""
+    """Return the integral of E^(1 - Gamma) exp(-E / cut) over the energies of a band."""
     low, high = band
     middle = 0.5 * np.log(high * low)
     half = 0.5 * np.log(high / low)

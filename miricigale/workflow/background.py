@@ -37,7 +37,7 @@ def check_levels(section, key, levels, n, date=""):
 
 
 def _read(level):
-    """The surface brightness that a text says."""
+    """Return the surface brightness that a text says."""
     return u.Quantity(level).to(SURFACE_BRIGHTNESS)
 
 

@@ -17,7 +17,7 @@ from miricigale.workflow.truths import study_truths
 
 def disk_use(config):
     """
-    About how many bytes the products of a run take, as `study_cost` has them by stage.
+    Estimate how many bytes the products of a run take, as `study_cost` has them by stage.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ class _Size:
         self.pictured = min(self.n_imaged, config.report.pictures)
 
     def disk(self):
-        """Bytes by stage, as they were measured; stages of small tables only are left out."""
+        """Return the bytes by stage, as they were measured; stages of small tables only are left out."""
         config = self.config
         pixels = self.pixels
         exposed = 3.5 * sum(pixels.values())
@@ -165,7 +165,7 @@ class _Size:
         }
 
     def seconds(self):
-        """Processor time by stage; small and optional stages have none."""
+        """Return the processor time by stage; small and optional stages have none."""
         config = self.config
         truths = self.truths
         bands = self.n_bands

@@ -62,7 +62,7 @@ _LAYOUT = "miricigale stamps 1"
 
 
 def _sersic(catalog):
-    """Which sources of a checked catalog are painted as Sersic profiles."""
+    """Tell which sources of a checked catalog are painted as Sersic profiles."""
     unusable = np.asarray(catalog["flags"]) & int(CatalogFlags.unusable_profile())
     return (np.asarray(catalog["profile"]) == "sersic") & (unusable == 0)
 

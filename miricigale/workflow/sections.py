@@ -23,7 +23,7 @@ class RunBasics(Section):
 
 
 def memory_of(work):
-    """The option of a run that limits the memory of pieces of its work."""
+    """Return the option of a run that limits the memory of pieces of its work."""
     text = f"Memory (GB) of {work} side by side on a machine; 0 for half of all."
     return option(0.0, text, low=0.0, high=1e5)
 
@@ -125,7 +125,7 @@ class PointingSection(Section):
 
 
 def _is_position(text):
-    """Whether a text is right ascension and declination in degrees."""
+    """Tell whether a text is right ascension and declination in degrees."""
     try:
         ra, dec = map(float, text.split())
     except ValueError:

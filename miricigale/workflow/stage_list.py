@@ -3,7 +3,7 @@
 
 def study_stages():
     """
-    The stages, each after what it needs.
+    Return the stages, each after what it needs.
 
     Returns
     -------

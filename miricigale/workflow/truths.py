@@ -58,7 +58,7 @@ class Truth:
     base: str = ""
 
     def values(self):
-        """Plain values, for hashing; perturbations are listed only where there are some."""
+        """Return the plain values, for hashing; perturbations are listed only where there are some."""
         values = {"name": self.name, "frac_agn": self.frac_agn}
         if self.perturbations:
             values["perturbations"] = dict(self.perturbations)

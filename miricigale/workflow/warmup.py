@@ -215,7 +215,7 @@ def compile_apart(name):
 
 
 def is_compiled(name):
-    """Whether the kernels of a job were compiled by this installation, on this machine."""
+    """Tell whether the kernels of a job were compiled by this installation, on this machine."""
     marker = _marker(name)
     # the cache may have been emptied without removing the marker
     folder = _PACKAGE
@@ -229,7 +229,7 @@ def _marker(name):
 
 
 def _cache_folder():
-    """Where numba keeps compiled code, or near it."""
+    """Tell where numba keeps compiled code, or near it."""
     if "NUMBA_CACHE_DIR" not in os.environ and os.access(_PACKAGE, os.W_OK):
         return _PACKAGE / "__pycache__"
     return _numba_folder()

@@ -92,7 +92,7 @@ def key_words(*key):
 
 
 def stream_key(seed, exposure, name):
-    """Key words of the streams of the effect ``name`` in an exposure, uint64 (4,)."""
+    """Return the key words of the streams of the effect ``name`` in an exposure, uint64 (4,)."""
     return key_words(seed, "detector", exposure.filter, exposure.dither, name)
 
 
@@ -196,7 +196,7 @@ class Effect:
 
     def limit(self, properties):
         """
-        Charge from which the effect flags a group as saturated.
+        Return the charge from which the effect flags a group as saturated.
 
         Parameters
         ----------

@@ -157,7 +157,7 @@ class Persistence(Effect):
 
     def released(self, exposure, gap):
         """
-        Charge that comes free in each group for a former rate of one electron per second.
+        Return the charge that comes free in each group for a former rate of one electron per second.
 
         Parameters
         ----------
@@ -345,5 +345,5 @@ class Saturation(Effect):
         return ramp
 
     def limit(self, properties):
-        """The full well in electrons."""
+        """Return the full well in electrons."""
         return float(properties.full_well if self.full_well is None else self.full_well)

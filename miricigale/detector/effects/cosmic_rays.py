@@ -108,7 +108,7 @@ class CosmicRays(Effect):
         return places, electrons
 
     def _arguments(self, block):
-        """Arguments of the kernels."""
+        """Return the arguments of the kernels."""
         properties = block.properties
         if self.flux is None:
             flux = properties.cosmic_ray_flux

@@ -120,7 +120,7 @@ class Photons(Effect):
         return ramp
 
     def expected(self, array, block):
-        """Electrons per second of the brightness (MJy/sr)."""
+        """Return the electrons per second of the brightness (MJy/sr)."""
         exposure = block.exposure
         part = {"subarray": exposure.subarray}
         rate = array * electrons_per_brightness(exposure.filter, block.properties, **part)

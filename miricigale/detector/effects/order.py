@@ -44,7 +44,7 @@ ORDER = (
 
 def effect_from_record(record):
     """
-    Effect that `Effect.record` described.
+    Return the effect that `Effect.record` described.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def effect_from_record(record):
 
 
 def checked_effects(effects):
-    """Effects as a tuple; anything that is not an effect is refused."""
+    """Return the effects as a tuple; anything that is not an effect is refused."""
     if isinstance(effects, str):
         wanted = "a tuple of effects (Detector() and Detector.miri_imager('flight') have theirs)"
         raise argument_error("effects", wanted, repr(effects))

@@ -53,13 +53,13 @@ class Nonlinearity(Effect):
         return ramp
 
     def response(self, dn, properties):
-        """Measured DN of linear ones."""
+        """Return the measured DN of linear ones."""
         if self.linear:
             return dn
         return properties.delinearize(dn)
 
     def linear_dn(self, dn, properties):
-        """Linear DN of measured ones."""
+        """Return the linear DN of measured ones."""
         if self.linear:
             return dn
         return properties.linearize(dn)
@@ -107,7 +107,7 @@ class Bias(Effect):
         return ramp
 
     def mean(self, properties):
-        """Mean level in DN."""
+        """Return the mean level in DN."""
         if self.level is None:
             return properties.bias
         return self.level
@@ -172,7 +172,7 @@ class ReadNoise(Effect):
         return ramp
 
     def deviation(self, properties):
-        """Standard deviation of one read in DN, without the 1/f part."""
+        """Return the standard deviation of one read in DN, without the 1/f part."""
         if self.sigma is None:
             return properties.read_noise
         return self.sigma
@@ -195,7 +195,7 @@ class ADConversion(Effect):
     """
 
     def limit(self, properties):
-        """Charge that reads the highest number; infinite where the full well reads less."""
+        """Return the charge that reads the highest number; infinite where the full well reads less."""
         highest = 65535.5 - properties.bias
         if highest >= properties.saturation_dn:
             return np.inf

@@ -65,7 +65,7 @@ class ResetAnomaly(Effect):
 
     def offsets(self, n_integrations, n_groups):
         """
-        Offset of each group.
+        Return the offset of each group.
 
         Parameters
         ----------

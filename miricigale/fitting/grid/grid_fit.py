@@ -353,7 +353,7 @@ class GridFit:
         return FitResults.concatenate(parts)
 
     def _between_nodes(self, data, log_prior, pairs):
-        """Results between nodes, and on nodes of objects that no model between them is possible for."""
+        """Return the results between nodes, and on nodes of objects that no model between them is possible for."""
         posteriors = self.between_posteriors(data, log_prior)
         parts = []
         rows = np.array(sorted(posteriors), int)
@@ -371,7 +371,7 @@ class GridFit:
         return FitResults.concatenate(parts)[order]
 
     def between_posteriors(self, data, log_prior):
-        """`BetweenPosterior` of the objects that a model between nodes is possible for: dict by row."""
+        """Return the `BetweenPosterior` of the objects that a model between nodes is possible for: dict by row."""
         posteriors = {}
         fitted = np.isfinite(log_prior).any(axis=1)
         scanned = fitted & ~data.limit.any(axis=1)
@@ -385,7 +385,7 @@ class GridFit:
         return {i: posterior for i, posterior in posteriors.items() if posterior is not None}
 
     def at_own_redshift(self, data):
-        """Whether objects are fitted at redshifts of their own, which are not those of nodes."""
+        """Tell whether objects are fitted at redshifts of their own, which are not those of nodes."""
         return data.redshift is not None and self.grid.redshift.size > 1
 
     def _scan(self, posteriors, data, log_prior, rows):
@@ -424,7 +424,7 @@ class GridFit:
             posteriors[i] = self._posterior_at_redshift(data[row], log_prior[row])
 
     def _posterior_at_redshift(self, data, log_prior):
-        """`BetweenPosterior` of an object at its own redshift; None if no model is possible."""
+        """Return the `BetweenPosterior` of an object at its own redshift; None if no model is possible."""
         z = float(data.redshift[0])
         node = int(np.argmax(log_prior[0]))
         engine = self.between.at_redshift(z, node)

@@ -158,7 +158,7 @@ class ModelTables:
         )
 
     def _refuses(self, name, row):
-        """Whether a component that a parameter concerns refuses the values of a row."""
+        """Tell whether a component that a parameter concerns refuses the values of a row."""
         values = self.model.defaults | self.constants | row
         for component in self.model.components:
             concerned = name in component.parameters or name in component.others
@@ -364,7 +364,7 @@ class ModelTables:
 
 
 def _nearly_equal(values, expected):
-    """Whether arrays agree, to a part of the largest value along the last axis."""
+    """Tell whether arrays agree, to a part of the largest value along the last axis."""
     if values.shape != expected.shape:
         return False
     return bool(np.all(np.abs(values - expected) <= 1e-6 * expected.max(axis=-1, keepdims=True)))

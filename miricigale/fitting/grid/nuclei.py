@@ -118,7 +118,7 @@ class ObjectNuclei:
     @classmethod
     def of_values(cls, bands, values, data, stars, agn_error):
         """
-        Nuclei of an object.
+        Return the nuclei of an object.
 
         Parameters
         ----------

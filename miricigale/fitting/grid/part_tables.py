@@ -136,7 +136,7 @@ def _single(table):
 
 
 def _units(offset):
-    """Exponentials of offsets of columns, infinite of those that are no logarithms."""
+    """Return the exponentials of offsets of columns, infinite of those that are no logarithms."""
     with np.errstate(over="ignore"):
         return np.exp(offset)
 

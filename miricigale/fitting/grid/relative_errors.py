@@ -85,7 +85,7 @@ class RelativeErrors(Frozen):
         return data._changed(sigma=np.hypot(data.sigma, self.part * size))
 
     def _expected(self, data, log_prior, is_other):
-        """Fluxes that all bands say together, shape (n, nb); NaN of objects that no model fits."""
+        """Return the fluxes that all bands say together, shape (n, nb); NaN of objects that no model fits."""
         others = data._changed(
             sigma=np.where(is_other, data.sigma, np.inf), limit=np.zeros_like(data.limit)
         )
@@ -109,7 +109,7 @@ class RelativeErrors(Frozen):
         return self._weighted(data, moments)
 
     def _weighted(self, data, moments):
-        """Means of predicted and measured fluxes, weighted with their variances."""
+        """Return the means of predicted and measured fluxes, weighted with their variances."""
         predicted = moments.model_flux
         z = np.nan_to_num(moments.redshift)
         node = np.abs(self.engine.grid.redshift - z[:, None]).argmin(axis=1)

@@ -218,14 +218,14 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
 
 
 def visit_of(image):
-    """The visit of an image, of the keyword VISIT_ID of its observation."""
+    """Return the visit of an image, of the keyword VISIT_ID of its observation."""
     visit = image.meta.get("keywords", {}).get("VISIT_ID", [None])[0]
     check_that(visit is not None, "images", "ones with the keyword VISIT_ID", "one without")
     return visit
 
 
 def _positions(catalog, images):
-    """Places of a catalog at the mean time of images that are moved together."""
+    """Return the places of a catalog at the mean time of images that are moved together."""
     if not isinstance(catalog, SkyCoord) or catalog.isscalar:
         raise argument_error("catalog", "a SkyCoord of several positions", repr(catalog)[:60])
     unknown = int(np.count_nonzero(~np.isfinite(catalog.cartesian.norm())))
@@ -243,7 +243,7 @@ def _positions(catalog, images):
 
 
 def _sources(image, argument):
-    """Windowed positions of the sources of an image, in pixels."""
+    """Return the windowed positions of the sources of an image, in pixels."""
     if image.wcs is None or image.uncertainty is None:
         raise argument_error(argument, "one with uncertainty and WCS", "one without")
     if not str(image.wcs.wcs.ctype[0]).startswith("RA"):
@@ -300,7 +300,7 @@ def _aligned(detected, catalog, radius, argument):
 
 
 def _tangent_plane(center):
-    """Coordinates east and north of a position (deg), in deg: "pixels" of the plane are degrees."""
+    """Return the coordinates east and north of a position (deg), in deg: "pixels" of the plane are degrees."""
     plane = WCS(naxis=2)
     plane.wcs.ctype = "RA---TAN", "DEC--TAN"
     plane.wcs.crval = center
@@ -339,7 +339,7 @@ def _pairs(detected, catalog, radius, plane):
 
 
 def _agreeing(shift):
-    """Which pairs agree with the most frequent shift, of shifts in arcsec, shape (n, 2)."""
+    """Tell which pairs agree with the most frequent shift, of shifts in arcsec, shape (n, 2)."""
     if not len(shift):
         return np.zeros(0, bool)
     tree = KDTree(shift)
@@ -350,7 +350,7 @@ def _agreeing(shift):
 
 
 def _moved_wcs(wcs, plane, matrix, move):
-    """World coordinates turned by a matrix and moved by arcsec (east, north) in a tangent plane."""
+    """Return the world coordinates turned by a matrix and moved by arcsec (east, north) in a tangent plane."""
     wcs = wcs.deepcopy()
     if wcs.wcs.has_cd():
         wcs.wcs.cd = matrix @ wcs.wcs.cd
@@ -365,7 +365,7 @@ def _moved_wcs(wcs, plane, matrix, move):
 
 
 def _rotation(turn):
-    """Matrix of a turn from north to east, of places (east, north)."""
+    """Return the matrix of a turn from north to east, of places (east, north)."""
     cos = np.cos(turn)
     sin = np.sin(turn)
     return np.array([[cos, sin], [-sin, cos]])

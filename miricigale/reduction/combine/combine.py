@@ -158,6 +158,6 @@ def _removed_light(settings, images, with_background, wcs):
 
 
 def _reasons(backgrounds):
-    """Why backgrounds cannot be trusted."""
+    """Tell why backgrounds cannot be trusted."""
     names = {name for background in backgrounds for name in BackgroundFlags.names(background.flags)}
     return ", ".join(sorted(names)).replace("_", " ")

@@ -170,7 +170,7 @@ def _stem(path):
 
 
 def _product_names(path, integrations):
-    """Names of the products of a file, as far as its name and its header tell."""
+    """Return the names of the products of a file, as far as its name and its header tell."""
     stem, stage = _name_parts(path)
     kinds = ["cal"]
     if stage not in _CALIBRATED:
@@ -207,7 +207,7 @@ def _failed(file, band="", *, reason=""):
 
 
 def _settings(reducer):
-    """What the products depend on: settings, and the content of reference files."""
+    """Return what the products depend on: settings, and the content of reference files."""
     values = {}
     for name, value in without(field_values(reducer), ["n_threads"]).items():
         values[name] = repr(value)
@@ -358,7 +358,7 @@ def _levels(members):
 
 
 def _references(meta):
-    """The references that all exposures share."""
+    """Return the references that all exposures share."""
     names = {}
     for key, text in meta.items():
         if key.startswith("reference_"):

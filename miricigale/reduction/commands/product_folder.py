@@ -73,7 +73,7 @@ class ProductFolder(RecordFolder):
             raise argument_error("folder", wanted, f"{self.folder} with {', '.join(reasons)}")
 
     def is_kept(self, name, key, *, resume=True):
-        """Whether a product of this key stands, with the content that was written."""
+        """Tell whether a product of this key stands, with the content that was written."""
         return resume and self.is_current(name, key)
 
     def write(self, name, key, writer):

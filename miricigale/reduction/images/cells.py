@@ -41,7 +41,7 @@ def smoothed_cells(cells, share, width):
 
 
 def _added(values, size):
-    """Sums over cells; what is beyond the edge is zero."""
+    """Return the sums over cells; what is beyond the edge is zero."""
     padding = [(0, -n % size) for n in values.shape]
     if any(end for _, end in padding):
         values = np.pad(values, padding)
@@ -54,6 +54,6 @@ def _added(values, size):
 
 
 def pixels_of(cells, shape, size=CELL):
-    """Pixels of cells."""
+    """Return the pixels of cells."""
     wide = np.repeat(np.repeat(cells, size, axis=0), size, axis=1)
     return wide[: shape[0], : shape[1]]

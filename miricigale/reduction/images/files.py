@@ -193,7 +193,7 @@ def _image_file(data, unit, error, flags, wcs, meta, planes, header):
 
 
 def _integrations(data, unit, error, flags, wcs, meta, planes, header):
-    """`ImageFile` of each integration of arrays whose first axis has these."""
+    """Return the `ImageFile` of each integration of arrays whose first axis has these."""
     files = []
     for number in range(len(data)):
         error_of = None
@@ -254,7 +254,7 @@ def open_file(path):
 
 
 def _mean(files):
-    """Mean of the integrations of an exposure; its flags are those of any, DO_NOT_USE those of all."""
+    """Return the mean of the integrations of an exposure; its flags are those of any, DO_NOT_USE those of all."""
     images = [file.image for file in files]
     error = None
     first = images[0]
@@ -286,7 +286,7 @@ def _mean(files):
 
 
 def scaled_planes(planes, before, after):
-    """Variances and areas of an image, after it was multiplied as its errors say."""
+    """Return the variances and areas of an image, after it was multiplied as its errors say."""
     scaled = {}
     if "AREA" in planes:
         scaled = {"AREA": planes["AREA"]}
@@ -298,12 +298,12 @@ def scaled_planes(planes, before, after):
 
 
 def shared_meta(entry):
-    """The meta dictionary of an exposure, of an image of one of its integrations."""
+    """Return the meta dictionary of an exposure, of an image of one of its integrations."""
     return without(entry.meta, ["integration"])
 
 
 def _unit(header, path):
-    """Unit of an image; DN is what astropy's CCDData and this package call adu."""
+    """Return the unit of an image; DN is what astropy's CCDData and this package call adu."""
     text = str(header.get("BUNIT", "")).strip()
     try:
         unit = None
@@ -342,7 +342,7 @@ def _plane(hdus, name, shape, path):
 
 
 def _error(hdus, shape, path):
-    """Standard deviation in ERR; a variance or its inverse if UTYPE says so; None without data."""
+    """Return the standard deviation in ERR; a variance or its inverse if UTYPE says so; None without data."""
     if "ERR" in hdus and hdus["ERR"].shape == ():
         if plane_shape(hdus["ERR"]) != shape:
             return None
@@ -375,7 +375,7 @@ def _flags(hdus, shape, path):
 
 
 def _meta(header, path):
-    """Facts of an image from the keywords of JWST."""
+    """Return the facts of an image from the keywords of JWST."""
     meta = {name: header[key] for key, name in _META.items() if header.get(key) is not None}
     name, readout, part, meta["dither"] = exposure_keywords(header)
     if part not in subarrays():
@@ -388,7 +388,7 @@ def _meta(header, path):
 
 
 def _wcs(hdus, header, meta):
-    """World coordinates of an image; None without any."""
+    """Return the world coordinates of an image; None without any."""
     pointed = all(name in meta for name in ("ra", "dec", "roll", "subarray"))
     done = keyword_text(header.get, "S_WCS") == "COMPLETE"
     if pointed and not done and "META" not in header:
@@ -407,7 +407,7 @@ def _wcs(hdus, header, meta):
 
 
 def as_exposure(exposure):
-    """An exposure of its file or data model; anything else itself."""
+    """Return an exposure of its file or data model; anything else itself."""
     if is_data_model(exposure):
         return read_data_model(exposure, open_exposure)
     if isinstance(exposure, (str, os.PathLike)):
@@ -416,7 +416,7 @@ def as_exposure(exposure):
 
 
 def exposure_list(exposures):
-    """Exposures of one, of a pattern of files, or of several."""
+    """Return the exposures of one, of a pattern of files, or of several."""
     if isinstance(exposures, str) and glob.has_magic(exposures) and not os.path.exists(exposures):
         paths = sorted(glob.glob(os.path.expanduser(exposures)))
         if not paths:

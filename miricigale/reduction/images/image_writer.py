@@ -56,7 +56,7 @@ def write_image(image, path, *, planes=None, overwrite=False):
 
 
 def _joined(image, planes):
-    """Image, planes and WCS that are written of an image, of one with planes, or of integrations."""
+    """Return the image, planes and WCS that are written of an image, of one with planes, or of integrations."""
     is_cube = isinstance(image, (list, tuple))
     files = []
     for part in image if is_cube else [image]:

@@ -36,7 +36,7 @@ def plain_mask(image):
 
 
 def plain_flags(image):
-    """Flags of an image as a new int64 array; zeros where it has none."""
+    """Return the flags of an image as a new int64 array; zeros where it has none."""
     if image.flags is None:
         return np.zeros(image.data.shape, np.int64)
     return np.array(image.flags, np.int64)
@@ -79,7 +79,7 @@ def flag_pixels(source, selected, flag):
 
 
 def exposure_values(exposure):
-    """Fields of an exposure in values that fit a header."""
+    """Return the fields of an exposure in values that fit a header."""
     names = ("filter", "readout", "subarray", "n_groups", "n_integrations", "dither")
     values = attributes(exposure, names)
     for name in ("group_time", "exposure_time"):
@@ -95,7 +95,7 @@ def exposure_values(exposure):
 
 
 def seen_wcs(im):
-    """WCS of the part of an image that holds its unmasked pixels, with its shape."""
+    """Return the WCS of the part of an image that holds its unmasked pixels, with its shape."""
     good = ~plain_mask(im)
     rows = np.flatnonzero(good.any(axis=1))
     columns = np.flatnonzero(good.any(axis=0))
@@ -108,7 +108,7 @@ def seen_wcs(im):
 
 
 def own_grid(images, pixel_scale):
-    """The smallest north-up grid that holds every unmasked pixel of images that can be put together."""
+    """Return the smallest north-up grid that holds every unmasked pixel of images that can be put together."""
     check_alike(images)
     return mosaic_wcs([seen_wcs(im) for im in images], pixel_scale)
 
@@ -144,7 +144,7 @@ def check_overlap(pixel_maps, shape):
 
 
 def overlaps(pixel_map, shape):
-    """Whether an image's pixels come within half a pixel of a grid (NaN does not)."""
+    """Tell whether an image's pixels come within half a pixel of a grid (NaN does not)."""
     x, y = pixel_map
     ny, nx = shape
     return bool(np.any((x > -1) & (x < nx) & (y > -1) & (y < ny)))

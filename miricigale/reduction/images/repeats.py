@@ -102,7 +102,7 @@ class ExposureRecord:
 
 
 def _is_simulated(header):
-    """Whether a header is that of a simulation of the package, or of what was made of one."""
+    """Tell whether a header is that of a simulation of the package, or of what was made of one."""
     if header.get("ORIGIN") == ORIGIN:
         return True
     meta = {}

@@ -95,7 +95,7 @@ def pixel_maps_of(images, wcs):
 
 def pixel_map(wcs_in, wcs_out, shape):
     """
-    Where the pixels of one image lie in another.
+    Tell where the pixels of one image lie in another.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def pixel_map(wcs_in, wcs_out, shape):
 
 def weight_map(source):
     """
-    Inverse variance of an image that does not follow the data of single pixels.
+    Return the inverse variance of an image that does not follow the data of single pixels.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def weight_map(source):
 
 def noise_correction(pixfrac, ratio):
     """
-    Noise of large areas of a drizzled image over what its pixels' noise says.
+    Return the noise of large areas of a drizzled image over what its pixels' noise says.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
 
 
 def _typical_weight(weights):
-    """Median weight of images: drizzle works in float32, with weights that are near one."""
+    """Return the median weight of images: drizzle works in float32, with weights that are near one."""
     medians = []
     for weight in weights:
         is_used = weight > 0
@@ -425,7 +425,7 @@ class _DrizzledGrid:
 
 
 def _drizzled_meta(images, weights, wcs, pixfrac):
-    """What the images say of themselves, put together, and what drizzling does to their noise."""
+    """Return what the images say of themselves, put together, and what drizzling does to their noise."""
     usable = []
     for im, weight in zip(images, weights, strict=True):
         # the time of an exposure without any usable pixel does not count
@@ -464,7 +464,7 @@ def _check_covered(touched, pixel_map, weighted, shape, pixfrac):
 
 
 def _pixel_area(x, y):
-    """Typical area of a pixel of an image in pixels of the grid, by its map."""
+    """Return the typical area of a pixel of an image in pixels of the grid, by its map."""
     rows = np.arange(0, x.shape[0] - 1, 16)[:, None]
     columns = np.arange(0, x.shape[1] - 1, 16)
     along = x[rows, columns + 1] - x[rows, columns], y[rows, columns + 1] - y[rows, columns]
@@ -474,7 +474,7 @@ def _pixel_area(x, y):
 
 def _filled(values, nowhere):
     """
-    Coordinates with finite ones where there are none.
+    Return the coordinates with finite ones where there are none.
 
     drizzle leaves out far more than the pixels of a map that are NaN, and takes corners of pixels from their
     neighbors: they are filled by a plane through the others and what the nearest of these is off it.
@@ -503,7 +503,7 @@ def add_image(sink, im, weight, pixel_map, wcs, pixfrac=1.0, **planes):
 
 
 def extent_of(pixel_map, shape):
-    """Rows and columns of a grid that an image reaches, or None: it lies beside the grid."""
+    """Return the rows and columns of a grid that an image reaches, or None: it lies beside the grid."""
     if not overlaps(pixel_map, shape):
         return None
     x, y = pixel_map
@@ -511,19 +511,19 @@ def extent_of(pixel_map, shape):
 
 
 def _reached(values, n):
-    """Rows or columns out of ``n`` around coordinates, with a margin for the sides of pixels."""
+    """Return the rows or columns out of ``n`` around coordinates, with a margin for the sides of pixels."""
     low = np.nanmin(values) - 2
     high = np.nanmax(values) + 3
     return slice(max(0, int(low)), min(n, int(high) + 1))
 
 
 def _scale(wcs):
-    """Side of a pixel at the reference position, deg."""
+    """Return the side of a pixel at the reference position, deg."""
     return float(np.sqrt(proj_plane_pixel_area(wcs)))
 
 
 def _meta(images):
-    """What the inputs say of themselves, put together."""
+    """Return what the inputs say of themselves, put together."""
     metas = [im.meta for im in images]
     meta = {"n_exposures": len(images)}
     common = set(metas[0]).intersection(*metas)
@@ -545,7 +545,7 @@ def _meta(images):
 
 
 def _shared_keywords(of_images):
-    """Cards that all images have alike, without the area of their pixels; None if none has any."""
+    """Return the cards that all images have alike, without the area of their pixels; None if none has any."""
     if not any(of_images):
         return None
     shared = {}

@@ -193,7 +193,7 @@ class _MosaicMedian:
 
 
 def _afterglow(extended, image, images):
-    """Which of the places that one image has alone were bright on the detector in an image before it."""
+    """Tell which of the places that one image has alone were bright on the detector in an image before it."""
     epoch = epoch_of(image)
     bright = np.zeros(extended.shape, bool)
     if epoch is None or not extended.any():
@@ -215,7 +215,7 @@ def _afterglow(extended, image, images):
 
 def _median_of(images, wcs, weights, pixel_maps):
     """
-    Median and number of images on each pixel of a grid, each image drizzled alone.
+    Return the median and number of images on each pixel of a grid, each image drizzled alone.
 
     Each is kept where it lies and the rows are taken in strips, for a field of many pointings
     has many images, few of which overlap.
@@ -251,7 +251,7 @@ def _median_of(images, wcs, weights, pixel_maps):
 
 
 def nan_median(stack):
-    """Median along the first axis of what is not NaN (NaN of nothing), and how many values it has."""
+    """Return the median along the first axis of what is not NaN (NaN of nothing), and how many values it has."""
     # sorting puts NaN last
     ordered = np.sort(stack, axis=0)
     count = np.isfinite(stack).sum(axis=0)

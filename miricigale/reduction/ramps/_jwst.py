@@ -112,7 +112,7 @@ def _run(kind, model, options, references):
 
 
 def _result(planes, flags, groups, first, last):
-    """A `RampFit` of the pipeline's planes and flags of groups."""
+    """Return a `RampFit` of the pipeline's planes and flags of groups."""
     rate, var_poisson, var_read = (plane.astype(np.float32) for plane in planes)
     unusable = (flags & int(DQ.DO_NOT_USE)) != 0
     for plane in (rate, var_poisson, var_read):
@@ -193,7 +193,7 @@ class _References:
         return self._model("LinearityModel", coeffs=planes, dq=self._good())
 
     def reset(self, offsets):
-        """Anomaly of each group and integration, of references and settings together."""
+        """Return the anomaly of each group and integration, of references and settings together."""
         reset_map = self._maps.reset
         n_int, n_group = offsets.shape
         total = np.zeros((n_int, n_group, *self._shape), np.float32)

@@ -86,7 +86,7 @@ class RampFit:
 
     def noise_correction(self, kernel):
         """
-        Noise of large areas over that of single pixels in quadrature.
+        Return the noise of large areas over that of single pixels in quadrature.
 
         Parameters
         ----------
@@ -318,14 +318,14 @@ def _group_dq(group_dq, shape):
 
 
 def _read_only(array):
-    """One type of array for the compiled kernels, also of arrays that own no memory."""
+    """Return one type of array for the compiled kernels, also of arrays that own no memory."""
     array = np.ascontiguousarray(array).view()
     array.flags.writeable = False
     return array
 
 
 def _map(values, name, usable, *, above=-np.inf, floor=-np.inf, infinite=False):
-    """One value (1, 1), or one for each pixel, that is in range wherever it is used."""
+    """Return one value (1, 1), or one for each pixel, that is in range wherever it is used."""
     values = np.array(floats(values), ndmin=2, order="C")
     wanted = f"one number or of shape {usable.shape}"
     check_that(values.shape in ((1, 1), usable.shape), name, wanted, values.shape)
@@ -350,7 +350,7 @@ def _map(values, name, usable, *, above=-np.inf, floor=-np.inf, infinite=False):
 
 
 def _drift(values, shape):
-    """Drift of the read-out as (n_int, n_group, rows, channels)."""
+    """Return the drift of the read-out as (n_int, n_group, rows, channels)."""
     values = floats(values)
     if values.ndim <= 2:
         values = np.broadcast_to(values, shape[:2])[:, :, None, None]
@@ -362,7 +362,7 @@ def _drift(values, shape):
 
 
 def _groups(values, name, shape, *, n_least=0):
-    """Maps of groups and integrations, float32; what is not finite there is taken as zero."""
+    """Return the maps of groups and integrations, float32; what is not finite there is taken as zero."""
     if values is None:
         return _read_only(np.zeros((1, 0, 1, 1), np.float32))
     if hasattr(values, "mask"):

@@ -14,7 +14,7 @@ _CLIP = 3.0
 
 def reference_drift(data, reference, offsets=()):
     """
-    Mean level of the reference pixels in each group.
+    Return the mean level of the reference pixels in each group.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def _is_lost(data, reference):
 
 
 def _without(data, columns, offsets):
-    """Columns of the data, a small part of it, without maps of groups."""
+    """Return the columns of the data, a small part of it, without maps of groups."""
     pixels = data[..., columns]
     n_int, n_group = pixels.shape[:2]
     for offset in offsets:
@@ -78,7 +78,7 @@ def _without(data, columns, offsets):
 
 def reference_channels(data, reference, *, origin=(0, 0), offsets=()):
     """
-    Drift of each channel of the read-out, of odd and even rows apart.
+    Return the drift of each channel of the read-out, of odd and even rows apart.
 
     Parameters
     ----------

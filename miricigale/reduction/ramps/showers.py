@@ -69,7 +69,7 @@ def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
 
 
 def _tracks(hit):
-    """Brightest pixel of each track of jumps whose significances add up to a large one."""
+    """Return the brightest pixel of each track of jumps whose significances add up to a large one."""
     labels, number = label(hit > 0, structure=np.ones((3, 3)))
     index = np.arange(1, number + 1)
     large = index[sum_labels(hit, labels, index) >= _LARGE]
@@ -79,7 +79,7 @@ def _tracks(hit):
 
 
 def _significant(excess, good, threshold):
-    """Where the smoothed excess is above so many sigma."""
+    """Tell where the smoothed excess is above so many sigma."""
     if np.count_nonzero(good) < 100:
         return np.zeros(good.shape, bool)
     middle = np.median(excess[good])

@@ -134,7 +134,7 @@ def _group_flags(ramp, usable):
 
 def shares_charge(reducer, ramp):
     """
-    Whether the charge of a ramp was coupled between neighbors.
+    Tell whether the charge of a ramp was coupled between neighbors.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def shares_charge(reducer, ramp):
 
 
 def _skipped(reducer, ramp):
-    """Groups left out at the start and the end of the integrations of a ramp."""
+    """Return the groups left out at the start and the end of the integrations of a ramp."""
     n_group = ramp.exposure.n_groups
     steps = ramp.history.steps
     first = reducer.skip_first
@@ -203,7 +203,7 @@ def _finite(drift, ramp):
 
 
 def _anomaly(reducer, ramp, maps, first):
-    """Offset of each group after a reset, DN, in addition to that of the references."""
+    """Return the offset of each group after a reset, DN, in addition to that of the references."""
     exposure = ramp.exposure
     anomaly = reducer.reset_anomaly
     problems = []

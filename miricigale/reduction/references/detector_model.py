@@ -100,7 +100,7 @@ _OTHER = (
 
 def is_own(reducer, history):
     """
-    Whether the constants of the simulated detector are those of an exposure.
+    Tell whether the constants of the simulated detector are those of an exposure.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def is_own(reducer, history):
 
 def maps_of(reducer, ramp):
     """
-    What the detector of a ramp is taken for.
+    Return what the detector of a ramp is taken for.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def maps_of(reducer, ramp):
 
 def history_of(reducer, ramp, maps):
     """
-    History of the slopes of a ramp.
+    Return the history of the slopes of a ramp.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def history_of(reducer, ramp, maps):
 
 def brightness_of(reducer, rate):
     """
-    What turns slopes into surface brightness.
+    Return what turns slopes into surface brightness.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def brightness_of(reducer, rate):
 
 
 def _from_files(reducer, rate, facts, history):
-    """Flat field, conversion and flags of reference files, and their names."""
+    """Return the flat field, conversion and flags of reference files, and their names."""
     exposure = Exposure(
         facts.filter if facts.filter.startswith("miri.") else f"miri.{facts.band}",
         readout=rate.meta.get("readout", "FASTR1"),
@@ -270,7 +270,7 @@ def _from_files(reducer, rate, facts, history):
 
 
 def _header(exposure, day):
-    """Keywords by which references of a rate are found."""
+    """Return the keywords by which references of a rate are found."""
     header = {
         "DETECTOR": "MIRIMAGE", "EXP_TYPE": "MIR_IMAGE", "FILTER": band_label(exposure.filter),
         "SUBARRAY": exposure.subarray, "READPATT": exposure.readout,

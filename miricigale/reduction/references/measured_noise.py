@@ -68,7 +68,7 @@ class MeasuredNoise:
     slow_noise: float = 0.0
 
     def describe(self, name):
-        """One of read noise and gain in words, for headers."""
+        """Return one of read noise and gain in words, for headers."""
         if name == "read_noise":
             return f"{self.read_noise:.4g} DN (measured on the ramp)"
         if np.isinf(self.gain):
@@ -221,14 +221,14 @@ def _photon_transfer(signal, added, added_err, dark):
 
 
 def _sampled_pixels(mask):
-    """Rows and columns of at most so many pixels of a mask, evenly."""
+    """Return the rows and columns of at most so many pixels of a mask, evenly."""
     ys, xs = np.nonzero(mask)
     chosen = slice(None, None, max(1, ys.size // _PIXELS))
     return ys[chosen], xs[chosen]
 
 
 def _parts(ramp, k, pixels):
-    """Groups that sort pixels, groups whose noise is measured, and the signal, of integration k."""
+    """Return the groups that sort pixels, groups whose noise is measured, and the signal, of integration k."""
     data = ramp.data[k][:, *pixels][1:-1].astype(float)
     signal = _signal(data[len(data) // 2 :])
     if k == 0:
@@ -240,7 +240,7 @@ def _parts(ramp, k, pixels):
 
 
 def _mean(values, errors):
-    """Weighted mean and its error, wider where the values scatter by more than their errors."""
+    """Return the weighted mean and its error, wider where the values scatter by more than their errors."""
     weight = 1 / errors**2
     mean = (weight * values).sum() / weight.sum()
     chi2 = (weight * (values - mean) ** 2).sum() / max(values.size - 1, 1)
@@ -248,19 +248,19 @@ def _mean(values, errors):
 
 
 def _slope(data):
-    """Least-squares slope of each pixel, DN in a group."""
+    """Return the least-squares slope of each pixel, DN in a group."""
     group = np.arange(len(data)) - (len(data) - 1) / 2
     return np.tensordot(group, data, 1) / np.sum(group**2)
 
 
 def _signal(data):
-    """Median of the slopes of five parts: a hit must not move the mean of a class."""
+    """Return the median of the slopes of five parts: a hit must not move the mean of a class."""
     ends = np.linspace(0, len(data) - 1, min(6, len(data))).astype(int)
     return np.median(np.diff(data[ends], axis=0) / np.diff(ends)[:, None], axis=0)
 
 
 def _noise(data):
-    """Variance that each group adds, and that of a read, each with its error."""
+    """Return the variance that each group adds, and that of a read, each with its error."""
     longest = (len(data) - 1) // 2
     number = min(_LAGS, longest // 2)
     short = np.arange(1, number + 1)
@@ -275,7 +275,7 @@ def _noise(data):
 
 
 def _scatter(data, lags):
-    """Clipped variance of second differences over each of the lags, and its error."""
+    """Return the clipped variance of second differences over each of the lags, and its error."""
     variances = []
     errors = []
     for lag in lags:

@@ -114,7 +114,7 @@ class ReferenceCache:
         return ReferenceFiles(**files, incomplete=self.incomplete, origin=self.context)
 
     def _file(self, name):
-        """Path of a file of the cache."""
+        """Return the path of a file of the cache."""
         folder = self.folder / "references" / "jwst"
         for path in (folder / "miri" / name, folder / name):
             if path.is_file():

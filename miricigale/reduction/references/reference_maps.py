@@ -33,14 +33,14 @@ def _wanted(name, extension):
 
 
 def _mismatch(path, name, problem):
-    """Error that says why a file is no reference for an exposure."""
+    """Return the error that says why a file is no reference for an exposure."""
     return data_error(
         path, f"is no {name.replace('_', ' ')} reference for this exposure: {problem}"
     )
 
 
 def _header(hdus, path, name, extension, exposure=None):
-    """Keywords of a reference; one of another kind, detector, filter or read-out is refused."""
+    """Return the keywords of a reference; one of another kind, detector, filter or read-out is refused."""
     extensions = f"it has {[hdu.name for hdu in hdus]}"
     check_data(
         extension in hdus, path, f"cannot be read as {_wanted(name, extension)}: {extensions}"
@@ -69,14 +69,14 @@ def _header(hdus, path, name, extension, exposure=None):
 
 
 def _frame_counts(exposure):
-    """Frames in a group of references of groups: those of the exposure, or one."""
+    """Return the frames in a group of references of groups: those of the exposure, or one."""
     if exposure is None:
         return (1,)
     return (exposure.n_frames, 1)
 
 
 def _cut(path, name, array, header, exposure):
-    """The part of a reference, (..., ny, nx), that an exposure sees."""
+    """Return the part of a reference, (..., ny, nx), that an exposure sees."""
     part = exposure.aperture
     full = aperture("FULL")
     if all(f"SUBSTRT{axis}" in header for axis in (1, 2)):
@@ -99,7 +99,7 @@ def _cut(path, name, array, header, exposure):
 
 
 def _flags(path, name, hdus, header, exposure):
-    """Flags of a reference by the names in its legend, as `DQ`."""
+    """Return the flags of a reference by the names in its legend, as `DQ`."""
     shape = exposure.shape
     if "DQ" not in hdus or hdus["DQ"].data is None:
         return np.zeros(shape, np.int64)
@@ -122,13 +122,13 @@ def _flags(path, name, hdus, header, exposure):
 
 
 def _read(path, exposure, name, extension="SCI"):
-    """Array and flags of a reference."""
+    """Return the array and flags of a reference."""
     array, flags, _ = _read_with_header(path, exposure, name, extension)
     return array, flags
 
 
 def _read_with_header(path, exposure, name, extension="SCI"):
-    """Array, flags and keywords of a reference."""
+    """Return the array, flags and keywords of a reference."""
     wanted = _wanted(name, extension)
     with open_fits(path, wanted=wanted) as hdus:
         header = _header(hdus, path, name, extension, exposure)
@@ -142,7 +142,7 @@ def _read_with_header(path, exposure, name, extension="SCI"):
 
 
 def _read_values(path, exposure, name):
-    """Value of each pixel; those without one are flagged, and not to be used where they need it."""
+    """Return the value of each pixel; those without one are flagged, and not to be used where they need it."""
     values, flags = _read(path, exposure, name)
     flag, options = _VALUES[name]
     bad = ~np.isfinite(values) | ((flags & flag) != 0)
@@ -154,20 +154,20 @@ def _read_values(path, exposure, name):
 
 
 def _read_noise(path, exposure):
-    """Noise of one read, DN: CRDS has that of a difference of two."""
+    """Return the noise of one read, DN: CRDS has that of a difference of two."""
     noise, flags = _read_values(path, exposure, "read_noise")
     return noise / np.float32(np.sqrt(2)), flags
 
 
 def _read_bias(path, exposure):
-    """Level of an empty pixel, DN."""
+    """Return the level of an empty pixel, DN."""
     level, flags = _read(path, exposure, "bias")
     flags[~np.isfinite(level)] |= int(DQ.UNRELIABLE_BIAS)
     return np.nan_to_num(level, posinf=0.0, neginf=0.0), flags
 
 
 def _read_linearity(path, exposure):
-    """Coefficients of the polynomial to linear DN; none where the file says so."""
+    """Return the coefficients of the polynomial to linear DN; none where the file says so."""
     coef, flags = _read(path, exposure, "linearity", "COEFFS")
     wanted = "must hold coefficients (n, ny, nx) in COEFFS"
     check_data(coef.ndim == 3 and len(coef) >= 2, path, f"{wanted}, got shape {coef.shape}")
@@ -180,7 +180,7 @@ def _read_linearity(path, exposure):
 
 
 def _read_groups(path, exposure, name):
-    """DN of each group, (integrations, groups, ny, nx)."""
+    """Return the DN of each group, (integrations, groups, ny, nx)."""
     array, flags, header = _read_with_header(path, exposure, name)
     if array.ndim == 3:
         array = array[None]
@@ -195,7 +195,7 @@ def _read_groups(path, exposure, name):
 
 def _averaged_groups(array, n_frames, *, complete):
     """
-    Means of so many frames, (integrations, groups, ny, nx), as the pipeline makes them of a dark.
+    Return the means of so many frames, (integrations, groups, ny, nx), as the pipeline makes them of a dark.
 
     A ``complete`` reference has no value beyond its frames, so that a last part of a group is left out; else
     there is no signal in the frames beyond.
@@ -227,7 +227,7 @@ read_flat = functools.partial(_read_values, name="flat")
 
 def read_photom(path, exposure, day):
     """
-    MJy/sr per DN/s of the filter and sub-array of an exposure.
+    Return the MJy/sr per DN/s of the filter and sub-array of an exposure.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def photom_row(path, filter, subarray):
 
 
 def on_day(conversion, times, day):
-    """A conversion on a day (MJD): the tables of the pipeline divide it, the older one is added."""
+    """Return a conversion on a day (MJD): the tables of the pipeline divide it, the older one is added."""
     for name, row in times.items():
         if name == "TIMECOEFF":
             conversion += row["amplitude"] * np.exp(-(day - row["t0"]) / row["tau"])
@@ -299,7 +299,7 @@ _TIMES = {
 
 def read_variance(read_noise, n_frames, *, rounded):
     """
-    Variance of the read-out of a group, DN^2: a read, or the mean of several that are independent.
+    Return the variance of the read-out of a group, DN^2: a read, or the mean of several that are independent.
 
     Parameters
     ----------

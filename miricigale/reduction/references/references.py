@@ -80,7 +80,7 @@ class DetectorMaps:
 
     def integration(self, number):
         """
-        The maps for one integration alone.
+        Return the maps for one integration alone.
 
         Parameters
         ----------
@@ -101,7 +101,7 @@ class DetectorMaps:
 
 def own_maps(properties, ramp):
     """
-    The package's own detector, for ramps that it simulated or that are taken for such.
+    Return the package's own detector, for ramps that it simulated or that are taken for such.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def own_maps(properties, ramp):
 
 def needed(references, header, history, *, names, product):
     """
-    The reference files for one exposure, complete or with a warning.
+    Return the reference files for one exposure, complete or with a warning.
 
     Parameters
     ----------
@@ -288,14 +288,14 @@ class ReferenceFiles:
 
     @staticmethod
     def names():
-        """Names of all references, in the order in which they are used."""
+        """Return the names of all references, in the order in which they are used."""
         return tuple(REFERENCES)
 
     replace = dataclasses.replace
 
     def missing(self, history=None, *, names=SLOPES + BRIGHTNESS):
         """
-        References that are needed and not given.
+        Return the references that are needed and not given.
 
         Parameters
         ----------
@@ -314,7 +314,7 @@ class ReferenceFiles:
 
     def maps(self, ramp):
         """
-        What the files say of the detector of a ramp.
+        Return what the files say of the detector of a ramp.
 
         Parameters
         ----------

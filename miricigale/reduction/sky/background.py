@@ -246,13 +246,13 @@ def estimate_background(image, *, method="masked", box=64, filter_size=3, plane=
 
 
 def known_background(level):
-    """`Background` of a level of which nothing else is known."""
+    """Return the `Background` of a level of which nothing else is known."""
     unknown = np.broadcast_to(np.float32(np.nan), level.shape)
     return Background(level, unknown, unknown, np.broadcast_to(False, level.shape), 1, 1)
 
 
 def subtractable(background):
-    """`Background` to take off: a level of 0 where the level of the sky is not known."""
+    """Return the `Background` to take off: a level of 0 where the level of the sky is not known."""
     if BackgroundFlags.UNKNOWN not in background.flags:
         return background
     return dataclasses.replace(background, level=np.zeros_like(background.level))
@@ -294,7 +294,7 @@ def _masked(data, mask, noise_map, mesh, correlation):
 
 
 def _is_unknown(level, error, noise):
-    """Whether the level of the sky is too uncertain to be taken off."""
+    """Tell whether the level of the sky is too uncertain to be taken off."""
     brightness = abs(np.median(_thinned(level)))
     pixel_noise = np.median(_thinned(noise))
     # the sky is off already: its share of the error says nothing, and what is taken off changes nothing
@@ -305,7 +305,7 @@ def _is_unknown(level, error, noise):
 
 
 def _search(mesh, noise_map):
-    """Mesh of what sources leave, mask of all that were found, and whether they leave enough."""
+    """Return the mesh of what sources leave, mask of all that were found, and whether they leave enough."""
     mask = mesh.mask
     sources = mesh.sources
     for _ in range(_ROUNDS):
@@ -321,7 +321,7 @@ def _search(mesh, noise_map):
 
 
 def _averaged(data, mask, noise_map, step, correlation):
-    """Means over pixels that share their noise, their mask, and what `_stated` says of them."""
+    """Return the means over pixels that share their noise, their mask, and what `_stated` says of them."""
     mean, share = cells_of(data, ~mask, step)
     small = share < 0.5
     if noise_map is not None:
@@ -331,7 +331,7 @@ def _averaged(data, mask, noise_map, step, correlation):
 
 
 def _error_map(image, mask):
-    """Errors of an image, and where it has them; None without any."""
+    """Return the errors of an image, and where it has them; None without any."""
     if image.uncertainty is None:
         return None
     error = sigma(image)
@@ -340,13 +340,13 @@ def _error_map(image, mask):
 
 
 def _thinned(values):
-    """Every so many rows and columns of a large image."""
+    """Return every so many rows and columns of a large image."""
     step = max(1, int(np.sqrt(values.size / _SOME)))
     return values[::step, ::step]
 
 
 def _noise(noise_map, rms, mask):
-    """Noise about the mesh, larger where the errors are: no mesh follows the seams of mosaics."""
+    """Return the noise about the mesh, larger where the errors are: no mesh follows the seams of mosaics."""
     if noise_map is None or not (sampled := _thinned(noise_map[1] & ~mask)).any():
         return rms
     scale = np.median(_thinned(rms)[sampled] / _thinned(noise_map[0])[sampled])
@@ -370,7 +370,7 @@ def warn_of(background, mask, unit):
 
 
 def _sep_background(data, mask, box, filter_size, correlation):
-    """The mesh of sep as it is."""
+    """Return the mesh of sep as it is."""
     level, rms = sep_tools.background(data, mask, box, filter_size)
     # sep takes boxes of which half is left, and gives 0 and 1 where there is none
     enough = (sky_boxes(data, mask, box).share >= 0.5).any()

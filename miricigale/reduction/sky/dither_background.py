@@ -25,7 +25,7 @@ _WIDER = 2
 
 def dither_backgrounds(images, backgrounds=None, *, wcs=None):
     """
-    Backgrounds of dithered images from the other dithers, with the sources masked ("super background").
+    Return the backgrounds of dithered images from the other dithers, with the sources masked ("super background").
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
 
 
 def restored(image, level):
-    """An image of which a background was subtracted, with that background."""
+    """Return an image of which a background was subtracted, with that background."""
     image_with_sky = with_data(image, image.data + level)
     # what was far below the background is to be judged again
     low = (image_with_sky.flags & int(DQ.NEGATIVE)) != 0
@@ -144,7 +144,7 @@ def restored(image, level):
 
 
 def _deep_masks(images, backgrounds, wcs):
-    """Sources of the mosaic of the images, on the pixels of each."""
+    """Return the sources of the mosaic of the images, on the pixels of each."""
     check_images(images, wcs)
     pairs = zip(images, backgrounds, strict=True)
     flat = [with_data(im, im.data - background.level) for im, background in pairs]
@@ -166,7 +166,7 @@ def _deep_masks(images, backgrounds, wcs):
 
 def other_medians(images, masks, sources, levels, uses=None):
     """
-    For each image the median of the others in each pixel, each less its level; NaN without any.
+    Return for each image the median of the others in each pixel, each less its level; NaN without any.
 
     ``others`` has a row for each image: which ones count, all but itself by default.
     """

@@ -16,7 +16,7 @@ from miricigale.utils.options import check_that
 
 def sky_flats(images, *, window=None, box=16):
     """
-    Flat field of each of several exposures, from the sky of the others.
+    Return the flat field of each of several exposures, from the sky of the others.
 
     Parameters
     ----------

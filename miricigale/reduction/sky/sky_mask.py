@@ -33,7 +33,7 @@ _WIDE = 2.5
 
 
 def detect(residual, rms, mask, sources):
-    """Pixels that rise above the noise of the image, smoothed little, more and much."""
+    """Return the pixels that rise above the noise of the image, smoothed little, more and much."""
     good = ~mask & (rms > 0)
     sky = good & ~sources
     if not sky.any():
@@ -56,7 +56,7 @@ def detect(residual, rms, mask, sources):
 
 
 def _risen(smooth, good, sky, threshold, area):
-    """Connected places of an image that rise above the noise that its sky has."""
+    """Return the connected places of an image that rise above the noise that its sky has."""
     # correlated noise is smoothed less, so that it is measured, on the negative side: of the
     # other the mask leaves a part
     negative = -smooth[sky & (smooth < 0)]
@@ -74,7 +74,7 @@ def _risen(smooth, good, sky, threshold, area):
 
 
 def grown(sources, mask):
-    """A mask of sources, each part of it wider by a share of its half width, in cells."""
+    """Return a mask of sources, each part of it wider by a share of its half width, in cells."""
     # small ones by the cells around them
     cores = [(distance_transform_edt(cells_of(sources) < 0.5), 0.6)]
     radius = 2.5
@@ -93,7 +93,7 @@ def grown(sources, mask):
 
 def light_left(mesh, sources, noise, step=1):
     """
-    Light of sources in what is left as sky, as far as the image shows it.
+    Return the light of sources in what is left as sky, as far as the image shows it.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def light_left(mesh, sources, noise, step=1):
 
 
 def _median(values):
-    """Median of finite values; they are put in another order."""
+    """Return the median of finite values; they are put in another order."""
     half = values.size // 2
     values.partition(half)
     if values.size % 2:

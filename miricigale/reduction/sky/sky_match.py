@@ -14,7 +14,7 @@ _LEAST = 20
 
 def sky_offsets(images, wcs, *, pixel_maps=None):
     """
-    Constants by which the levels of images differ where they overlap.
+    Return the constants by which the levels of images differ where they overlap.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def sky_offsets(images, wcs, *, pixel_maps=None):
 
 
 def _means(im, pixels, shape):
-    """Numbers of the cells that an image fills at least by half, in order, and its mean in them."""
+    """Return the numbers of the cells that an image fills at least by half, in order, and its mean in them."""
     x, y = pixels
     ny, nx = (-(-n // _CELL) for n in shape)
     good = ~plain_mask(im) & np.isfinite(x) & np.isfinite(y)

@@ -125,7 +125,7 @@ class SkyBoxes:
 
 
 def box_edges(n, box):
-    """Edges of boxes of about ``box`` pixels that divide ``n`` evenly."""
+    """Return the edges of boxes of about ``box`` pixels that divide ``n`` evenly."""
     return np.linspace(0, n, max(1, round(n / box)) + 1).round().astype(int)
 
 
@@ -211,7 +211,7 @@ def _clipped(values, mode):
 
 
 def _spline(edges, n):
-    """What a cubic spline through values at the centers of boxes is at each pixel, as a matrix."""
+    """Return what a cubic spline through values at the centers of boxes is at each pixel, as a matrix."""
     nodes = 0.5 * (edges[1:] + edges[:-1] - 1)
     if nodes.size == 1:
         return np.ones((n, 1), np.float32)
@@ -221,7 +221,7 @@ def _spline(edges, n):
 
 
 def _filtered(values, size):
-    """Median of the finite values in windows; NaN where fewer than three would stand for none."""
+    """Return the median of the finite values in windows; NaN where fewer than three would stand for none."""
     if size == 1:
         return values
     before = (size - 1) // 2
@@ -249,7 +249,7 @@ def _filtered(values, size):
 
 
 def _filled(values):
-    """Values with the nearest finite one where there is none."""
+    """Return the values with the nearest finite one where there is none."""
     missing = ~np.isfinite(values)
     if not missing.any():
         return values
@@ -292,7 +292,7 @@ class SkyMesh:
         self._measure(sources, mode=mode)
 
     def measured(self, sources):
-        """The same of an image with other sources masked."""
+        """Return the same of an image with other sources masked."""
         out = copy.copy(self)
         out._measure(sources)
         return out

@@ -119,7 +119,7 @@ def read_bc03(path):
 
 
 def _summary(name, imf, first, metallicities, n_wave, basis):
-    """Lines that say what a set holds; ``first`` is the content of one of its files."""
+    """Return the lines that say what a set holds; ``first`` is the content of one of its files."""
     low, high = first.mass_limits
     last = first.wave[-1] / 1e4
     reach = f"the files reach {last:g} um"
@@ -212,7 +212,7 @@ def _check_set(bursts):
 
 
 def _version(part):
-    """Year of the version that made a file, by its second age, or None."""
+    """Return the year of the version that made a file, by its second age, or None."""
     for year, age in SECOND_AGE.items():
         if np.isclose(part.age[1], age, rtol=1e-3):
             return year
@@ -220,7 +220,7 @@ def _version(part):
 
 
 def _surviving(part, file):
-    """Mass in surviving stars without remnants, and how it was found."""
+    """Return the mass in surviving stars without remnants, and how it was found."""
     mass = part.quantities["mass"]
     remnants = part.quantities["remnants"]
     gas = part.quantities.get("gas")
@@ -251,7 +251,7 @@ def _surviving(part, file):
 
 
 def _ends_early(last):
-    """Whether spectra that end at this wavelength (um) are continued."""
+    """Tell whether spectra that end at this wavelength (um) are continued."""
     return last < LONGEST * (1 - 1e-6)
 
 

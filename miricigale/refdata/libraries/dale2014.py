@@ -102,7 +102,7 @@ def read_dale2014(path):
 
 
 def _find(path):
-    """Contents of the files by name, and where each was found."""
+    """Return the contents of the files by name, and where each was found."""
     wanted = (SPECTRA, CALIBRATION, STARS)
     if not path.is_dir() and not (path.is_file() and is_archive(path)):
         problem = "cannot be read as templates of Dale et al. 2014: wanted a folder or an archive"
@@ -126,7 +126,7 @@ def _find(path):
 
 
 def _numbers(data, place, n_columns, wanted):
-    """Columns of numbers of a text file, comments left out: array (n_rows, n_columns)."""
+    """Return the columns of numbers of a text file, comments left out: array (n_rows, n_columns)."""
     with file_errors(place, f"is not {wanted} in {n_columns} columns"):
         table = np.loadtxt(data.decode("ascii").splitlines(), ndmin=2)
     got = f"row 1 of {len(table)} has {table.shape[1]} columns"
@@ -175,7 +175,7 @@ def _check_order(wave, log_power, color, places):
 
 
 def _bundled_starlight(wave):
-    """L_lambda at 13 Gyr of a history exp(-t / 10 Gyr), from the bundled SSPs; arbitrary scale."""
+    """Return the L_lambda at 13 Gyr of a history exp(-t / 10 Gyr), from the bundled SSPs; arbitrary scale."""
     nodes, age, spectra, _ = load_ssp(locate("ssp.bc03"))
     born = np.arange(13000) + 0.5  # Myr ago
     # what each age counts for where spectra are linear between ages

@@ -122,7 +122,7 @@ def read_ised(path):
 
 
 def _unpacked(path):
-    """Content of a file, decompressed if it is compressed by gzip."""
+    """Return the content of a file, decompressed if it is compressed by gzip."""
     unpacked_size(path)
     try:
         data = path.read_bytes()
@@ -134,7 +134,7 @@ def _unpacked(path):
 
 
 def _content(source):
-    """The numbers of a file in their order, whatever its form."""
+    """Return the numbers of a file in their order, whatever its form."""
     source.begin("the head")
     age = source.vector().astype(float)
     limits = tuple(source.floats(2).tolist())
@@ -183,7 +183,7 @@ class _Source:
         return self.numbers("f4", n)
 
     def vector(self, n=None):
-        """Numbers after their count, which may be known."""
+        """Return the numbers after their count, which may be known."""
         count = self.integer()
         if not 0 <= count < _MOST_NUMBERS or (n is not None and count != n):
             wanted = n
@@ -201,7 +201,7 @@ class _Source:
 
 
 def _byte_order(data):
-    """``"<"`` or ``">"`` if it begins like a record of Fortran, else None."""
+    """Return ``"<"`` or ``">"`` if it begins like a record of Fortran, else None."""
     for order in "<>":
         if len(data) < 12:
             return None
@@ -212,7 +212,7 @@ def _byte_order(data):
 
 
 def _records(data, order, path):
-    """Contents of the records, between their lengths."""
+    """Return the contents of the records, between their lengths."""
     length = struct.Struct(f"{order}i")
     at = 0
     out = []
@@ -315,7 +315,7 @@ class _Words(_Source):
 
 
 def _repeated(line):
-    """Words of a line with Fortran's repeat counts, such as ``3*0.0``."""
+    """Return the words of a line with Fortran's repeat counts, such as ``3*0.0``."""
     if "*" not in line:
         return line.split()
     out = []

@@ -10,13 +10,13 @@ from miricigale.utils.files import check_unpacked, unpacked_size
 
 
 def is_archive(path):
-    """Whether a file is a zip or tar archive."""
+    """Tell whether a file is a zip or tar archive."""
     return zipfile.is_zipfile(path) or tarfile.is_tarfile(path)
 
 
 def members(path, accept):
     """
-    Files of a folder, or of a zip or tar archive, whose names ``accept`` takes.
+    Yield the files of a folder, or of a zip or tar archive, whose names ``accept`` takes.
 
     Yields
     ------

@@ -83,7 +83,7 @@ class Report:
 
 
 def _listed(values):
-    """The values of an axis, or their number and ends where there are more than twelve."""
+    """Return the values of an axis, or their number and ends where there are more than twelve."""
     if values.size <= 12:
         return f"{values.size}: {' '.join(f'{v:g}' for v in values)}"
     first = " ".join(f"{v:g}" for v in values[:3])
@@ -208,7 +208,7 @@ def _read(reader, name, path):
 
 
 def _entry(library, source):
-    """What the record beside the file says, in plain values."""
+    """Return what the record beside the file says, in plain values."""
     from miricigale import __version__
 
     return {

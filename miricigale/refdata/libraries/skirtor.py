@@ -135,7 +135,7 @@ def _texts(path):
 
 
 def _read_texts(path):
-    """Wavelengths, axes, spectra and checksums from the authors' text files."""
+    """Return the wavelengths, axes, spectra and checksums from the authors' text files."""
     wave = None
     keys = []
     disk = []
@@ -168,7 +168,7 @@ def _read_texts(path):
 
 
 def _parse(data, source):
-    """The seven columns of one file, shape (7, 132): wavelength in um, then lambda F_lambda."""
+    """Return the seven columns of one file, shape (7, 132): wavelength in um, then lambda F_lambda."""
     rows = [line for line in data.splitlines() if not line.startswith(b"#")]
     tokens = b"\n".join(rows).split()
     if len(tokens) != _ROWS * _COLUMNS:
@@ -220,7 +220,7 @@ def _check_columns(wave, table, observed, inclination, unit, source):
 
 
 def _read_fits(path):
-    """Wavelengths, axes, spectra and checksum from the FITS grid of lightningpy."""
+    """Return the wavelengths, axes, spectra and checksum from the FITS grid of lightningpy."""
     table = read_table(path, wanted=_WANTED, hdu=1)
     lacking = [name for name in _FITS_UNITS if name not in table.colnames]
     if lacking:

@@ -124,7 +124,7 @@ class LibraryTable:
         return levels
 
     def _codes(self, axis, values):
-        """For each value the number of the level that is the same, or -1."""
+        """Return for each value the number of the level that is the same, or -1."""
         levels = self.levels[axis]
         nearest = np.searchsorted(0.5 * (levels[1:] + levels[:-1]), values)
         # zero has no relative neighborhood: there the extent of the axis is the measure
@@ -152,7 +152,7 @@ class LibraryTable:
 
     def missing(self, **values):
         """
-        Axes on which the library has not these values.
+        Return the axes on which the library has not these values.
 
         Parameters
         ----------
@@ -256,7 +256,7 @@ def _extension(kind):
 
 
 def _fits_unit(library, name):
-    """The unit for other readers, or None where there is none that FITS knows; ours is in the text."""
+    """Return the unit for other readers, or None where there is none that FITS knows; ours is in the text."""
     unit = u.Unit(library.units.get(name, ""))
     try:
         if unit != u.one:

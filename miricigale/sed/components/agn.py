@@ -147,7 +147,7 @@ class AGN(Component):
 
     def templates(self, wave, values):
         """
-        Spectra for one watt of dust emission.
+        Return the spectra for one watt of dust emission.
 
         Parameters
         ----------
@@ -249,7 +249,7 @@ class Skirtor2016(AGN):
         return open_library(self.path, self.resource)
 
     def missing(self, **values):
-        """Axes on which the library has not these values: see `LibraryTable.missing`."""
+        """Return the axes on which the library has not these values: see `LibraryTable.missing`."""
         return self.table.missing(**values)
 
     def invalid(self, values):
@@ -264,7 +264,7 @@ class Skirtor2016(AGN):
 
 
 def _fine(wave):
-    """Wavelengths of the library and more of them where they are sparse."""
+    """Return the wavelengths of the library and more of them where they are sparse."""
     sparse = wave[np.searchsorted(wave, _SPARSE * (1.0 - 1e-6)) :]
     if sparse.size < 2:
         return wave
@@ -274,7 +274,7 @@ def _fine(wave):
 
 
 def _refined(wave, dust, fine):
-    """A spectrum at `_fine` wavelengths: power laws between those of the library."""
+    """Return a spectrum at `_fine` wavelengths: power laws between those of the library."""
     tiny = np.finfo(float).tiny
     return np.where(
         fine < _SPARSE,

@@ -14,7 +14,7 @@ _FAR = ((-0.070, 0.137, -0.628, -1.073), (0.374, -0.420, 4.257, 13.670))
 
 def milky_way(wave, r_v):
     """
-    k(lambda) of the Milky Way: Cardelli et al. 1989, the optical part of O'Donnell 1994.
+    Return the k(lambda) of the Milky Way: Cardelli et al. 1989, the optical part of O'Donnell 1994.
 
     Given for 0.1-3.33 um (from dust_extinction); the cubic of the far ultraviolet continues below
     and the power law of the infrared has no end.
@@ -30,7 +30,7 @@ def milky_way(wave, r_v):
 
 
 def _pei1992(wave, galaxy):
-    """Extinction k of mw, lmc or smc by table 4 of Pei 1992."""
+    """Return the extinction k of mw, lmc or smc by table 4 of Pei 1992."""
     law = declared("miricigale.sed", "extinction.toml")["pei1992"][galaxy]
     return _core.pei_extinction(wave, **law)
 
@@ -48,7 +48,7 @@ _MAG = -0.4 * np.log(10.0)
 @cached(maxsize=64)
 def _exponents(wave, law, *shape):
     """
-    First and last wavelength that a law dims, and ln of what one magnitude leaves there.
+    Return the first and last wavelength that a law dims, and ln of what one magnitude leaves there.
 
     A grid is asked for with thousands of amounts of dust: it is known by its bytes, which are
     hashed in 2 us.
@@ -70,7 +70,7 @@ def _exponents(wave, law, *shape):
 
 
 def _dimmed(wave, amount, law, *shape):
-    """10^(-0.4 k amount), as a new array that cannot be written to."""
+    """Return the 10^(-0.4 k amount), as a new array that cannot be written to."""
     first, last, part = _exponents(_core.wave_key(wave), law, *shape)
     out = np.ones(np.shape(wave))
     flat = out.reshape(-1)[first:last]

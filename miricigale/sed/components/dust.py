@@ -44,13 +44,13 @@ class DustEmission(Component):
         raise NotImplementedError
 
     def spectra(self, columns):
-        """Row by row what `spectrum` gives, for columns of values of shape (n,): shape (n, n_node)."""
+        """Return row by row what `spectrum` gives, for columns of values of shape (n,): shape (n, n_node)."""
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         return np.array([self.spectrum(dict(zip(columns, row, strict=True))) for row in rows])
 
     def template(self, wave, **values):
         """
-        Spectrum for one watt.
+        Return the spectrum for one watt.
 
         Parameters
         ----------
@@ -86,7 +86,7 @@ class _Mixture(DustEmission):
 
 
 def _interpolation_weights(axis, values):
-    """Weights, shape (n, n_axis), of the linear interpolation between ascending nodes."""
+    """Return the weights, shape (n, n_axis), of the linear interpolation between ascending nodes."""
     cell, part = _core.cells(axis, values)
     out = np.zeros((values.size, axis.size))
     rows = np.arange(values.size)
@@ -98,7 +98,7 @@ def _interpolation_weights(axis, values):
 
 @cached(maxsize=4)
 def _sequence(library, column):
-    """Alphas and spectra of an open library, in memory."""
+    """Return the alphas and spectra of an open library, in memory."""
     order = np.argsort(library.axes["alpha"])
     return library.axes["alpha"][order], frozen_array(library.spectra[column][order])
 
@@ -182,7 +182,7 @@ class Casey2012(DustEmission):
         return 0.75 / (slope + (B[2] + B[3] * alpha_mir) * temperature_dust)
 
     def parts(self, values):
-        """Blackbody and power law on one, arbitrary scale: L_lambda at `nodes`."""
+        """Return the blackbody and power law on one, arbitrary scale: L_lambda at `nodes`."""
         temperature = values["temperature_dust"]
         beta = values["emissivity_dust"]
         alpha = values["alpha_mir"]
@@ -272,7 +272,7 @@ class DraineLi2007(_DraineLi):
     @staticmethod
     def mean_intensity(values):
         """
-        Mean intensity <U> over the dust mass, Draine & Li 2007, equation 33.
+        Return the mean intensity <U> over the dust mass, Draine & Li 2007, equation 33.
 
         In units of the starlight near the Sun. The power per dust mass is P0 <U>, P0 being that at
         U = 1 (135 to 139 L_sun / M_sun in the table's source, by q_PAH).
@@ -353,7 +353,7 @@ def _logistic(x):
 
 
 def _without_feature(wave, spectra):
-    """Spectra whose 3.3 um feature is replaced by the power law through its ends."""
+    """Return the spectra whose 3.3 um feature is replaced by the power law through its ends."""
     feature = slice(*np.searchsorted(wave, PAH_33))
     ends = [feature.start, feature.stop]
     log_wave = np.log(wave)

@@ -57,11 +57,11 @@ class IGM(Component):
         raise NotImplementedError
 
     def edges(self):
-        """Rest wavelengths in um of the Lyman lines that jump most, and of the limit."""
+        """Return the rest wavelengths in um of the Lyman lines that jump most, and of the limit."""
         return np.append(_core.lyman_lines(_N_LINES + 2), _core.LYMAN_LIMIT)
 
     def nodes(self):
-        """Both sides of the Lyman lines and limit, where it jumps, and some below the limit."""
+        """Return both sides of the Lyman lines and limit, where it jumps, and some below the limit."""
         edges = self.edges()
         blue_edge = edges[-1] * _BELOW_LIMIT
         return np.sort(np.concatenate([edges * (1 - 1e-5), edges * (1 + 1e-5), blue_edge]))
@@ -104,7 +104,7 @@ class Madau1995(IGM):
     reference = "Madau 1995, ApJ 441, 18"
 
     def edges(self):
-        """Rest wavelengths in um of the four lines, and of the limit."""
+        """Return the rest wavelengths in um of the four lines, and of the limit."""
         return np.append(_core.lyman_lines(6), _core.LYMAN_LIMIT)
 
     def transmission(self, wave, redshift):
@@ -131,7 +131,7 @@ class Inoue2014(IGM):
     resource = "igm.inoue2014"
 
     def edges(self):
-        """Rest wavelengths in um of the first lines of table 2, and of the limit."""
+        """Return the rest wavelengths in um of the first lines of table 2, and of the limit."""
         return np.append(load_lines(self.path)[0][:_N_LINES], _core.INOUE_LIMIT)
 
     def transmission(self, wave, redshift):

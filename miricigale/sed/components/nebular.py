@@ -52,13 +52,13 @@ class NebularTable:
     lines: np.ndarray
 
     def models(self, metallicity):
-        """Numbers of the models of a metallicity, ascending in log U; empty if it is not there."""
+        """Return the numbers of the models of a metallicity, ascending in log U; empty if it is not there."""
         return np.flatnonzero(np.abs(self.metallicity / metallicity - 1.0) <= 1e-3)
 
     @cached(maxsize=64)
     def emission(self, metallicity, log_u):
         """
-        Continuum and lines one after the other, shape (n_age, n_wave + n_line), linear in log U
+        Return the continuum and lines one after the other, shape (n_age, n_wave + n_line), linear in log U
         between logarithms, of values that `Nebular.invalid` accepts.
         """
         models = self.models(metallicity)
@@ -197,7 +197,7 @@ class Nebular(Component):
 
     def by_photon(self, values):
         """
-        Light for each ionizing photon per second of stars of the ages of `table`.
+        Return the light for each ionizing photon per second of stars of the ages of `table`.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class Nebular(Component):
         return share * (self._drawn[1] @ emission.T).T
 
     def _emission(self, age, weights, ionizing, values):
-        """Continuum in W/um and lines in W, one after the other."""
+        """Return the continuum in W/um and lines in W, one after the other."""
         table = self.table
         share = _core.absorbed_share(values["f_esc"], values["f_dust"])
         photons = _core.photons_by_age(age, share * weights * ionizing, table.age)
@@ -222,7 +222,7 @@ class Nebular(Component):
 
     def spectra(self, age, weights, ionizing, values):
         """
-        Light of the gas around some stars.
+        Return the light of the gas around some stars.
 
         Parameters
         ----------
@@ -244,7 +244,7 @@ class Nebular(Component):
 
     def parts(self, age, weights, ionizing, values):
         """
-        Continuum and lines of `spectra`, which are their sum: two arrays of its shape.
+        Return the continuum and lines of `spectra`, which are their sum: two arrays of its shape.
 
         Parameters are those of `spectra`.
         """
@@ -257,7 +257,7 @@ class Nebular(Component):
 
     def lines(self, age, weights, ionizing, values):
         """
-        Luminosities of the lines before any dust: dict of W by name.
+        Return the luminosities of the lines before any dust: dict of W by name.
 
         Parameters are those of `spectra`.
         """

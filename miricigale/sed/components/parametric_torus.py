@@ -117,7 +117,7 @@ def _torus(path, wave_bytes, disk, slope, shape):
 
 def _seen_fraction(const, wave, tau, inclination, opening, q):
     """
-    Disk light seen, direct and scattered, over the face-on disk.
+    Return the disk light seen, direct and scattered, over the face-on disk.
 
     Inclinations may be an array of shape (n, 1), all on one side of the edge of the torus.
     """
@@ -142,7 +142,7 @@ def _seen_fraction(const, wave, tau, inclination, opening, q):
 
 
 def _anisotropy(const, tau, inclination, opening):
-    """Dust light seen at an inclination over its mean over the sphere."""
+    """Return the dust light seen at an inclination over its mean over the sphere."""
     ani = const["anisotropy"]
     a, b, c, d = ani["constants"]
     depth = np.log(tau / 7.0)
@@ -173,7 +173,7 @@ def _absorbed(path, tau, opening, q):
 
 
 def _dust_shape(e, wave_bytes, shape):
-    """Dust emission at an inclination, arbitrary scale."""
+    """Return the dust emission at an inclination, arbitrary scale."""
     wave = np.frombuffer(wave_bytes)
     opacity = e["c0"] * (wave / 9.7) ** -e["s1"] + _core.drude(wave, 9.7, e["w97"])
     opacity += e["g18"] * _core.drude(wave, 18.0, e["w18"])

@@ -61,7 +61,7 @@ class BurstHistory(StarFormationHistory):
     tau_burst = Parameter(0.05, (0.001, 100.0), "E-folding time of the burst.", unit="Gyr")
 
     def _numbers(self, values):
-        """Arguments of the functions in `_core`, times in Myr."""
+        """Return the arguments of the functions in `_core`, times in Myr."""
         return (
             self.steps(values),
             values["tau"] * 1e3,
@@ -248,7 +248,7 @@ class TableSFH(StarFormationHistory):
 
 
 def _bins(table):
-    """Edges of the bins in Myr and rates in Msun/yr, shape (n_column, n_bin), checked."""
+    """Return the edges of the bins in Myr and rates in Msun/yr, shape (n_column, n_bin), checked."""
     names = [name for name in table.colnames if name != "time"]
     wanted = "with a column 'time' and one or more columns of rates"
     check_that("time" in table.colnames and names, "table", wanted, table.colnames)

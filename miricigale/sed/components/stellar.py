@@ -73,7 +73,7 @@ class StellarPopulations(Component):
 
     def ionizing(self, metallicity):
         """
-        Photons that ionize hydrogen, of one metallicity.
+        Return the photons that ionize hydrogen, of one metallicity.
 
         Returns
         -------
@@ -88,7 +88,7 @@ class StellarPopulations(Component):
 
     def age_weights(self, history, values):
         """
-        Weights of the tabulated ages for a history.
+        Return the weights of the tabulated ages for a history.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ def _nearest(nodes, metallicity):
 
 @cached(maxsize=16)
 def _steps(age_bytes):
-    """Steps of 1 Myr among these ages, as many as a history may have."""
+    """Return the steps of 1 Myr among these ages, as many as a history may have."""
     return _core.age_steps(np.frombuffer(age_bytes, dtype=float), _OLDEST)
 
 
@@ -241,7 +241,7 @@ class BC03Library(StellarPopulations):
 
 @cached(maxsize=8)
 def _library_table(library, metallicity):
-    """Ages, spectra in memory and surviving masses of one metallicity of an open library."""
+    """Return the ages, spectra in memory and surviving masses of one metallicity of an open library."""
     rows = np.flatnonzero(library.axes["metallicity"] == metallicity)
     rows = rows[np.argsort(library.axes["age"][rows])]
     # the name in files made before

@@ -13,7 +13,7 @@ from miricigale.workflow.engine.schedule import Place
 @contextlib.contextmanager
 def cluster_executor(address, *, memory=None):
     """
-    Executor of the workers of a dask.distributed scheduler.
+    Return the executor of the workers of a dask.distributed scheduler.
 
     A unit whose worker dies is done again on another one, three times.
 

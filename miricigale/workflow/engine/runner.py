@@ -192,7 +192,7 @@ class StudyRunner:
 
     def forecast(self, store):
         """
-        What a run would do.
+        Return what a run would do.
 
         Parameters
         ----------
@@ -282,7 +282,7 @@ class StudyRunner:
         return int(total)
 
     def _config_stands(self, store):
-        """Whether manifest and ``config.toml`` say what this run does."""
+        """Tell whether manifest and ``config.toml`` say what this run does."""
         values = _values(self.config)
         return store.config == values == self._values_of(store.path(CONFIG))
 

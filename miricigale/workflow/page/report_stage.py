@@ -126,7 +126,7 @@ def make_report(context, _):
 
 
 def _patch_products(context, truth, patch):
-    """Mosaics and kernels of a patch by band, as the truth of this name has them."""
+    """Return the mosaics and kernels of a patch by band, as the truth of this name has them."""
     mosaics = {}
     kernels = {}
     for name in study_patches(context.config)[patch].bands:

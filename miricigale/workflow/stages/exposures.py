@@ -178,7 +178,7 @@ def _read_pointings(table, roll, filters):
     columns = {name.lower(): name for name in table.colnames}
 
     def cell(row, name):
-        """Value of a column of a row; None without one."""
+        """Return the value of a column of a row; None without one."""
         value = None
         if name in columns:
             value = row[columns[name]]
