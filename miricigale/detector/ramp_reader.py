@@ -185,11 +185,11 @@ def _check_header(path, header, exposure):
     for name, true in times.items():
         in_header = header.get(name)
         if name == "TGROUP" and n_frames > 1 and _is_time(in_header, frame):
-            msg = (
+            warn(
                 f"{path}: TGROUP = {in_header} s is the time of a frame, as in files of 2023 and before; "
-                f"a group of {exposure.readout} takes {true:.6g} s, which is used"
+                f"a group of {exposure.readout} takes {true:.6g} s, which is used",
+                DetectorWarning,
             )
-            warn(msg, DetectorWarning)
         elif in_header is not None and not _is_time(in_header, true):
             truth = f"the frame of {exposure.readout} {exposure.subarray} takes {frame} s"
             group = "one group" if n_frames == 1 else f"one of {n_frames} of a group"

@@ -77,9 +77,9 @@ def bad_pixels(values, header, get, path):
     bad = values != 0
     if np.any(values[bad] & (values[bad] - 1)) or np.unique(values[bad]).size > 1:
         part = np.mean(bad)
-        msg = (
+        warn(
             f"{path} has bits of which nothing says what they mean (TELESCOP {telescope or 'missing'!s}, no "
-            f"MP_ cards): every pixel that is not 0 is taken as bad, {part:.2%} of them"
+            f"MP_ cards): every pixel that is not 0 is taken as bad, {part:.2%} of them",
+            PhotometryWarning,
         )
-        warn(msg, PhotometryWarning)
     return bad, "not 0"

@@ -179,11 +179,11 @@ def image_wcs(header, hdus):
         try:
             distorted = asdf_wcs(header, hdus)
         except ImportError as err:
-            msg = (
+            warn(
                 f"{file}: the coordinates in the header lack the distortion, which is in "
-                f"the extension ASDF: positions are pixels off. {err}"
+                f"the extension ASDF: positions are pixels off. {err}",
+                PhotometryWarning,
             )
-            warn(msg, PhotometryWarning)
             return wcs
         if distorted is None:
             # of an image without distortion, as it was given
@@ -191,12 +191,12 @@ def image_wcs(header, hdus):
         x, y = (np.atleast_1d(value - 1) for value in wcs.wcs.crpix)
         inside = -0.5 <= x[0] <= shape[1] - 0.5 and -0.5 <= y[0] <= shape[0] - 0.5
         if inside and (offset := _pixels_apart(wcs, distorted, x, y)) > _APART_AT_REFERENCE:
-            msg = (
+            warn(
                 f"{file}: the coordinates in its header and those in its extension ASDF (gwcs) are {offset:.3g} "
                 "pixels apart at the reference pixel: those of ASDF are used, which have the distortion. Was the "
-                "header aligned, but not the gwcs?"
+                "header aligned, but not the gwcs?",
+                PhotometryWarning,
             )
-            warn(msg, PhotometryWarning)
         return distorted
     _compare_with_gwcs(wcs, hdus, shape, file)
     return wcs
@@ -242,12 +242,12 @@ def _compare_with_gwcs(wcs, hdus, shape, file):
         return
     offset = _pixels_apart(wcs, exact, *compared_pixels(shape))
     if offset > _APART:
-        msg = (
+        warn(
             f"{file}: the coordinates in its header and those in its extension ASDF (gwcs) are up to {offset:.3g} "
             "pixels apart: those of the header are used. If those of ASDF are right, remove the WCS keywords of "
-            "the header; if not, the extension ASDF"
+            "the header; if not, the extension ASDF",
+            PhotometryWarning,
         )
-        warn(msg, PhotometryWarning)
 
 
 def compared_pixels(shape):

@@ -170,11 +170,11 @@ def checked_psf(
     usual = _core.half_maximum_width(stamp, x, y) * psf.cell
     ratio = width / usual
     if smoothed and ratio > _OTHER_WIDTH:
-        msg = (
+        warn(
             f"'{argument}' is {ratio:.2g} times as wide (FWHM {width:.3g} arcsec) as the model of "
-            f"{filter}, with which it is not compared: was the image brought to this resolution?"
+            f"{filter}, with which it is not compared: was the image brought to this resolution?",
+            PSFWarning,
         )
-        warn(msg, PSFWarning)
         return psf
     wanted = f"a PSF of {filter}, about {usual:.3g} arcsec wide (FWHM)"
     got = f"one of {width:.3g} arcsec with pixels of {psf.cell:.4g} arcsec: is that its pixel?"
@@ -187,11 +187,11 @@ def checked_psf(
         word = "narrower"
         if ratio > 1:
             word = "wider"
-        msg = (
+        warn(
             f"'{argument}' is {abs(ratio - 1):.0%} {word} (FWHM {width:.3g} arcsec) than the model of "
-            f"{filter}: does it hold the pixel, the drizzling and no more?"
+            f"{filter}: does it hold the pixel, the drizzling and no more?",
+            PSFWarning,
         )
-        warn(msg, PSFWarning)
     return _scaled(psf, float(stamp.sum()), filter, argument)
 
 

@@ -204,8 +204,9 @@ class PSFFile:
         """
         for data in self.planes:
             if not np.all(np.isfinite(data)) or not data.max() > 0 or not data.sum() > 0:
-                msg = "is no PSF: it has no light, or pixels that are not finite"
-                raise data_error(self.path, msg)
+                raise data_error(
+                    self.path, "is no PSF: it has no light, or pixels that are not finite"
+                )
         shape = self.planes.shape[1:]
         problem = f"has {shape} pixels, a PSF needs {_LEAST_SIDE} along either side"
         check_data(min(shape) >= _LEAST_SIDE, self.path, problem)
@@ -273,11 +274,11 @@ def _best_extension(hdus, name):
     if len(images) > 1:
         labels = {k: str(hdus[k].name or k) for k in images}
         label = labels.pop(chosen)
-        msg = (
+        warn(
             f"{name} has several images: extension {label} is taken{why}, not {', '.join(labels.values())}; "
-            f"{name}[NUMBER] names one"
+            f"{name}[NUMBER] names one",
+            PSFWarning,
         )
-        warn(msg, PSFWarning)
     return chosen
 
 
@@ -368,11 +369,11 @@ def _warn_of_contradiction(scales):
     first, *further_names = scales
     for name in further_names:
         if abs(scales[name] / scales[first] - 1) > _SAME_SCALE:
-            msg = (
+            warn(
                 f"the header of the PSF or kernel states pixels of {scales[first]:.4g} arcsec ({first}) and of "
-                f"{scales[name]:.4g} ({name}): the first are used"
+                f"{scales[name]:.4g} ({name}): the first are used",
+                PSFWarning,
             )
-            warn(msg, PSFWarning)
 
 
 def states_pixel(path):

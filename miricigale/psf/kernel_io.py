@@ -118,11 +118,11 @@ def _check_pixel(path, cell, pixel_scale):
         return
     scale = scalar(pixel_scale, ANGLE, "pixel_scale")
     if abs(cell / scale - 1) > 0.02:
-        msg = (
+        raise data_error(
+            path,
             f"is a kernel for pixels of {cell:.4g} arcsec, and those of the image that it is for "
-            f"have {scale:.4g} arcsec ('pixel_scale')"
+            f"have {scale:.4g} arcsec ('pixel_scale')",
         )
-        raise data_error(path, msg)
 
 
 def _write_field(field, path, *, overwrite=False):

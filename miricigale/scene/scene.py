@@ -277,11 +277,11 @@ class Scene(WithTable):
         bad = ~(flux >= 0) | ~finite
         ids = self._catalog["id"][bad]
         first = ", ".join(map(str, ids[:5].tolist())) + (", ..." if len(ids) > 5 else "")
-        msg = (
+        warn(
             f"{len(ids)} of {len(self._catalog)} sources are not painted: fluxes in {self._filter!r} "
-            f"are {', '.join(counts)} (flag no_flux of the truth): ids {first}"
+            f"are {', '.join(counts)} (flag no_flux of the truth): ids {first}",
+            CatalogWarning,
         )
-        warn(msg, CatalogWarning)
 
     def _check_background(self, background):
         """Return the `Background` of one, of its level or of how bright the zodiacal light is; None for none."""

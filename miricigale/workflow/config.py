@@ -93,8 +93,9 @@ class StudyConfig(Configuration):
         exposures = self.exposures
         n = len(exposures.filters)
         self.check(n, "exposures.filters", "must name at least one filter")
-        wanted = f"must have one pattern, or one per filter ({n})"
-        self.check_length("exposures.dithers", (0, 1, n), wanted)
+        self.check_length(
+            "exposures.dithers", (0, 1, n), f"must have one pattern, or one per filter ({n})"
+        )
         has_file = any(name.lower().endswith(".pointing") for name in exposures.dithers)
         for key in ("dither_observation", "dither_exposures"):
             good = has_file or not getattr(exposures, key)
@@ -106,8 +107,7 @@ class StudyConfig(Configuration):
         check_levels("scene", "background", scene.background, n, scene.background_date)
         if exposures.kind == "rates":
             reason = "with [exposures] kind = 'rates', which have no ramps"
-            good = not self.run.keep_level1b
-            self.check(good, "run.keep_level1b", f"must be false {reason}")
+            self.check(not self.run.keep_level1b, "run.keep_level1b", f"must be false {reason}")
             good = self.reduction.backend == "native"
             self.check(good, "reduction.backend", f"must be 'native' {reason}")
 
@@ -119,8 +119,7 @@ class StudyConfig(Configuration):
         self.check(good, "sed.frac_agn", "must begin with a number")
         self.check("all" in fit.sets, "fit.sets", "must have 'all'")
         good = n > 1 or not {"blue", "red"}.intersection(fit.sets)
-        wanted = "may have 'blue' and 'red' with two filters and more only"
-        self.check(good, "fit.sets", wanted)
+        self.check(good, "fit.sets", "may have 'blue' and 'red' with two filters and more only")
         wanted = f"must be at most the number of MIRI filters ({n})"
         self.check(fit.min_detected <= n, "fit.min_detected", wanted)
         good = fit.depths or not fit.bands or self.catalog.source not in known_resources()
@@ -135,8 +134,9 @@ class StudyConfig(Configuration):
         self.check(not foreign, "perturb.of", wanted, foreign)
         need_agn = sorted(set(NEEDS_AGN).intersection(perturb.effects))
         good = not need_agn or any(value != 0 for value in perturbed_values(self))
-        wanted = f"must have a value above 0 for {need_agn}"
-        self.check(good, "perturb.of", wanted, list(perturb.of))
+        self.check(
+            good, "perturb.of", f"must have a value above 0 for {need_agn}", list(perturb.of)
+        )
         good = perturb.cutouts or CUTOUTS not in perturb.effects
         self.check(good, "perturb.cutouts", "must name an image for the effect 'cutouts'")
         good = not perturb.cutouts or {CUTOUTS, ALL}.intersection(perturb.effects)
@@ -154,10 +154,12 @@ class StudyConfig(Configuration):
         good = not photometry.rivals or is_paper_grid
         self.check(good, "highres.pixel_scale", "must be 0.06 with [photometry] rivals")
         if patches.size:
-            good = patches.size >= patches.overlap
-            self.check(good, "patches.size", "must be 0 or above overlap")
-            good = photometry.method == "package"
-            self.check(good, "photometry.method", "must be 'package' in patches")
+            self.check(
+                patches.size >= patches.overlap, "patches.size", "must be 0 or above overlap"
+            )
+            self.check(
+                photometry.method == "package", "photometry.method", "must be 'package' in patches"
+            )
             wanted = "must be left out in patches: whole fields are compared"
             self.check(not photometry.rivals, "photometry.rivals", wanted)
             self.check(not self.variants.images, "variants.images", wanted)

@@ -128,8 +128,9 @@ def read_text(path):
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as err:
-        reason = f"is not a text file in UTF-8: {err.reason} at byte {err.start}"
-        raise config_error(path, reason) from None
+        raise config_error(
+            path, f"is not a text file in UTF-8: {err.reason} at byte {err.start}"
+        ) from None
 
 
 def read_setting(text):

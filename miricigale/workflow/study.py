@@ -50,8 +50,9 @@ def check_study(config):
         good = not path or Path(file_place(path)[0]).expanduser().is_file()
         config.check(good, f"perturb.{key}", "must be a file")
     unknown = sorted(set(existing_bands(config)).difference(Filter.names()))
-    wanted = "must be filters that 'miricigale filters' lists"
-    config.check(not unknown, "fit.bands", wanted, unknown)
+    config.check(
+        not unknown, "fit.bands", "must be filters that 'miricigale filters' lists", unknown
+    )
     with of_option("[exposures]", KeyError, ValueError):
         exposures = study_exposures(config)
     counts = collections.Counter(exposure.filter for exposure in exposures.values())

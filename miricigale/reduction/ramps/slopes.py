@@ -212,11 +212,11 @@ def _anomaly(reducer, ramp, maps, first):
     if anomaly is None and maps.reset is None and ramp.shows(ResetAnomaly):
         problems.append(("a reset anomaly", "'reset_anomaly', or "))
     for problem, remedy in problems if reducer.skip_first is None else ():
-        msg = (
+        warn(
             f"the ramp shows {problem} that this Reducer leaves in: "
-            f"give it {remedy}'skip_first' groups to be left out"
+            f"give it {remedy}'skip_first' groups to be left out",
+            ReductionWarning,
         )
-        warn(msg, ReductionWarning)
     if anomaly is None:
         return 0.0
     # of each frame, and then the means of groups

@@ -370,12 +370,12 @@ class ReferenceFiles:
             if "gain" in unknown:
                 values["slow_noise"] = measured.slow_noise
             if "gain" in unknown and measured.effective:
-                msg = (
+                warn(
                     f"the gain of {measured.gain:.3g} e-/DN is that of all noise that grows with time: the "
                     "light is even and there are no reference pixels, which would separate slow noise of the "
-                    "read-out from photons (measure_noise). Give 'gain' if it is known"
+                    "read-out from photons (measure_noise). Give 'gain' if it is known",
+                    ReferenceWarning,
                 )
-                warn(msg, ReferenceWarning)
         if self.origin is not None:
             names["context"] = self.origin
         return DetectorMaps(**values, used=names)

@@ -28,8 +28,9 @@ class Display:
     def __exit__(self, *exc):
         self._bar.close()
         if n_repeats := self._facts.total() - len(self._facts):
-            text = "%d more such warnings of other units: 'warnings' in %s"
-            log.warning(text, n_repeats, MANIFEST)
+            log.warning(
+                "%d more such warnings of other units: 'warnings' in %s", n_repeats, MANIFEST
+            )
 
     def warn(self, category, text):
         """Show a warning, once for units that differ in what it quotes, such as the band."""
