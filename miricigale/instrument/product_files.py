@@ -152,19 +152,14 @@ def write_product(image, path, *, planes=None, wcs=None, overwrite=False):
     if is_resampled:
         primary["S_RESAMP"] = "COMPLETE"
     extension = asdf_extension()
+    shape = image.shape[-2:]
     if wcs is not None:
         primary["S_WCS"] = "COMPLETE"
-        _add_sky(science, wcs, image.shape[-2:])
+        _add_sky(science, wcs, shape)
         if image.unit.is_equivalent(SURFACE_BRIGHTNESS):
-            if is_resampled:
-                if "PIXAR_SR" not in science:
-                    science["PIXAR_SR"] = proj_plane_pixel_area(wcs) * u.deg.to(u.rad) ** 2
-            else:
-                extension = asdf_extension(wcs, image.shape[-2:], science)
-                if "AREA" not in planes or "PIXAR_SR" not in science:
-                    science["PIXAR_SR"] = _nominal_area()
-                    planes["AREA"] = pixel_area_map(wcs, image.shape[-2:]) / _nominal_area()
-            science["PIXAR_A2"] = science["PIXAR_SR"] * u.rad.to(u.arcsec) ** 2
+            _add_areas(science, planes, wcs, shape, is_resampled)
+            if not is_resampled:
+                extension = asdf_extension(wcs, shape, science)
     data = np.asarray(image.data * scale, np.float32)
     hdus = [fits.PrimaryHDU(header=primary), fits.ImageHDU(data, science, name="SCI")]
     if image.uncertainty is not None:
@@ -185,6 +180,17 @@ def write_product(image, path, *, planes=None, wcs=None, overwrite=False):
     with replacing(path, overwrite=overwrite) as partial:
         write_fits(hdus + [extension], partial)
     return path
+
+
+def _add_areas(science, planes, wcs, shape, is_resampled):
+    """Add the solid angle of pixels to the header of SCI, and a map of it to the planes of an exposure."""
+    if is_resampled:
+        if "PIXAR_SR" not in science:
+            science["PIXAR_SR"] = proj_plane_pixel_area(wcs) * u.deg.to(u.rad) ** 2
+    elif "AREA" not in planes or "PIXAR_SR" not in science:
+        science["PIXAR_SR"] = _nominal_area()
+        planes["AREA"] = pixel_area_map(wcs, shape) / _nominal_area()
+    science["PIXAR_A2"] = science["PIXAR_SR"] * u.rad.to(u.arcsec) ** 2
 
 
 def _headers(image, filename):

@@ -169,6 +169,35 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     check_type(table, argument, Table, "a table")
     catalog = quantity_table(table, copy=True)
     check_that(len(catalog), argument, "a table with rows", "none")
+    _name_ids(catalog, argument)
+    catalog["sky"] = as_positions(catalog, argument, wcs)
+    points = list(_fill_columns(catalog, argument))
+    units = without_none(CATALOG_COLUMNS)
+    require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
+    fluxes = [*filters, *(name for name in catalog.colnames if is_band(name))]
+    require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
+    catalog["id"] = _checked_ids(catalog, argument)
+    catalog["profile"] = _checked_profiles(catalog["profile"], argument)
+    numbers = without(CATALOG_COLUMNS, ("id", "sky", "profile"))
+    for name in catalog.colnames:
+        unit = getattr(catalog[name], "unit", None)
+        linear = isinstance(unit, u.UnitBase)  # a magnitude is none
+        if "." in name and linear and unit.is_equivalent(FNU):
+            numbers[name] = FNU
+    for name, unit in numbers.items():
+        catalog[name] = _plain_column(catalog, name, unit, argument)
+    if "star" not in catalog.colnames:
+        catalog["star"] = np.zeros(len(catalog), dtype=bool)
+    _check_stars(catalog["star"], argument)
+    catalog["flags"] = _flags(catalog)
+    catalog["flags"].info.description = CatalogFlags.describe()
+    for text in points:
+        warn(f"{argument}: {text}", CatalogWarning)
+    return catalog
+
+
+def _name_ids(catalog, argument):
+    """Call the column of ids ``id``; refuse a catalog without one."""
     ids = id_column(catalog.colnames, argument)
     if ids is None:
         looks = likely_ids(catalog)
@@ -180,45 +209,35 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
         )
     if ids != "id":
         catalog.rename_column(ids, "id")
-    catalog["sky"] = as_positions(catalog, argument, wcs)
-    points = list(_fill_columns(catalog, argument))
-    units = without_none(CATALOG_COLUMNS)
-    require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
-    fluxes = [*filters, *(name for name in catalog.colnames if is_band(name))]
-    require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
+
+
+def _checked_ids(catalog, argument):
+    """Return the ids of a catalog, integers or ASCII text; refuse others, and one that is there twice."""
     ids = read_ids(catalog, argument)
     wanted = "a table with integers or text in 'id'"
     # a number with a fraction is rather a measurement
     is_plain = ids.dtype.kind in "iu" or (ids.dtype.kind == "U" and catalog["id"].dtype.kind != "f")
     check_that(is_plain, argument, wanted, catalog["id"].dtype)
-    catalog["id"] = unique_ids(ascii_ids(ids, argument), argument)
-    profile = catalog["profile"]
-    # missing ones are refused below
-    profile = np.asarray(profile.filled("") if hasattr(profile, "mask") else profile).astype(str)
+    return unique_ids(ascii_ids(ids, argument), argument)
+
+
+def _checked_profiles(profile, argument):
+    """Return the names of profiles as text; refuse unknown and missing ones."""
+    if hasattr(profile, "mask"):
+        profile = profile.filled("")
+    profile = np.asarray(profile).astype(str)
     unknown = sorted(set(profile.tolist()) - set(PROFILES))
     check_that(not unknown, argument, f"a table with 'profile' among {PROFILES}", unknown)
-    catalog["profile"] = profile
-    numbers = without(CATALOG_COLUMNS, ("id", "sky", "profile"))
-    for name in catalog.colnames:
-        unit = getattr(catalog[name], "unit", None)
-        linear = isinstance(unit, u.UnitBase)  # a magnitude is none
-        if "." in name and linear and unit.is_equivalent(FNU):
-            numbers[name] = FNU
-    for name, unit in numbers.items():
-        catalog[name] = _plain_column(catalog, name, unit, argument)
-    if "star" not in catalog.colnames:
-        catalog["star"] = np.zeros(len(catalog), dtype=bool)
-    star = catalog["star"]
-    if star.dtype != bool or np.any(own_mask(star)):
-        got = "missing values"
-        if star.dtype != bool:
-            got = star.dtype
-        raise argument_error(argument, "a table with True or False in 'star'", got)
-    catalog["flags"] = _flags(catalog)
-    catalog["flags"].info.description = CatalogFlags.describe()
-    for text in points:
-        warn(f"{argument}: {text}", CatalogWarning)
-    return catalog
+    return profile
+
+
+def _check_stars(star, argument):
+    """Refuse a column of stars that is not True or False in each row."""
+    got = "missing values"
+    if star.dtype != bool:
+        got = star.dtype
+    good = star.dtype == bool and not np.any(own_mask(star))
+    check_that(good, argument, "a table with True or False in 'star'", got)
 
 
 def _fill_columns(table, argument):

@@ -162,6 +162,12 @@ class ModelGrid(Frozen):
     io_module = __name__
 
     def __post_init__(self):
+        self._freeze()
+        self._check_shapes()
+        self._check_values()
+
+    def _freeze(self):
+        """Put read-only copies of what was given into the place of it."""
         new = {"filters": tuple(map(str, self.filters)), "meta": dict(self.meta)}
         new["recipe"] = dict(self.recipe)
         arrays = {}
@@ -177,13 +183,16 @@ class ModelGrid(Frozen):
         self.__dict__.update(new)
         for name, (_, dtype, _) in _ARRAYS.items():
             self.__dict__[name] = frozen_array(getattr(self, name), dtype)
+        self.__dict__["inert"] = tuple(map(tuple, self.inert)) or ((),) * self.n_agn
+
+    def _check_shapes(self):
+        """Refuse arrays and tables that are not of one number of redshifts, models, fractions and bands."""
         n_z = self.redshift.size
         n_b = len(self.filters)
-        n_g = self.dust_luminosity.size
-        n_a = self.agn_multiplicity.size
-        inert = self.__dict__["inert"] = tuple(map(tuple, self.inert)) or ((),) * n_a
-        check_that(len(inert) == n_a, "inert", f"names for each of {n_a} AGN models", len(inert))
-        fraction_span(self.frac_agn_definition)
+        n_g = self.n_galaxies
+        n_a = self.n_agn
+        wanted = f"names for each of {n_a} AGN models"
+        check_that(len(self.inert) == n_a, "inert", wanted, len(self.inert))
         sizes = {"z": n_z, "g": n_g, "a": n_a, "f": self.frac_agn.size, "b": n_b}
         for name, (_, _, letters) in _ARRAYS.items():
             shape = tuple(sizes[letter] for letter in letters)
@@ -200,6 +209,10 @@ class ModelGrid(Frozen):
         if len(set(self.filters)) != n_b or n_b == 0:
             raise argument_error("filters", "one or more different names", f"{self.filters}")
         check_that(n_z and n_g, "galaxy", "of at least one redshift and model", f"({n_z}, {n_g})")
+
+    def _check_values(self):
+        """Refuse axes that do not ascend or leave their range, and numbers that are not finite."""
+        fraction_span(self.frac_agn_definition)
         z = self.redshift
         f = self.frac_agn
         n_alike = self.agn_multiplicity
@@ -207,7 +220,7 @@ class ModelGrid(Frozen):
         check_that(
             is_ascending(f) and f[0] >= 0 and f[-1] < 1, "frac_agn", "ascending values in [0, 1)", f
         )
-        check_that(n_a or f.tolist() == [0.0], "frac_agn", "[0] for a grid without AGN", f)
+        check_that(self.n_agn or f.tolist() == [0.0], "frac_agn", "[0] for a grid without AGN", f)
         check_that(np.all(n_alike >= 1), "agn_multiplicity", ">= 1", n_alike)
         for name in ("galaxy", "agn", "dust_luminosity"):
             check_that(

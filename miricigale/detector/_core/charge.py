@@ -204,6 +204,38 @@ def _push(deposits, n, slot, head, row, col, charge):
 
 
 @njit()
+def _add_track(x, y, dx, dy, charge, leakage, first_row, n_row, n_col, slot, deposits, n, head):
+    """Append what a straight track of ``charge`` leaves in each pixel that it crosses and in the neighbors."""
+    last_row = first_row + n_row
+    # walk from pixel to pixel (Amanatides & Woo 1987); places along the track are parts of its length
+    px = math.floor(x)
+    py = math.floor(y)
+    step_x = 1 if dx > 0.0 else -1
+    step_y = 1 if dy > 0.0 else -1
+    next_x = ((px + (step_x > 0)) - x) / dx if dx != 0.0 else math.inf
+    next_y = ((py + (step_y > 0)) - y) / dy if dy != 0.0 else math.inf
+    done = 0.0
+    while done < 1.0:
+        to = min(next_x, next_y, 1.0)
+        q = charge * (to - done)
+        done = to
+        if abs(py - first_row) <= n_row + 1 and q > 0.0:
+            for k in range(5):
+                cx = px + (k == 1) - (k == 2)
+                cy = py + (k == 3) - (k == 4)
+                share = 1.0 - 4.0 * leakage if k == 0 else leakage
+                if 0 <= cx < n_col and first_row <= cy < last_row and share > 0.0:
+                    deposits, n = _push(deposits, n, slot, head, cy - first_row, cx, q * share)
+        if next_x <= next_y:
+            px += step_x
+            next_x += abs(1.0 / dx) if dx != 0.0 else math.inf
+        else:
+            py += step_y
+            next_y += abs(1.0 / dy) if dy != 0.0 else math.inf
+    return deposits, n
+
+
+@njit()
 def _deposits(key, first_row, n_detector_rows, n_row, n_col, n_slot, settings):
     """
     Draw cosmic-ray hits of some rows, in all ``n_slot`` groups.
@@ -248,33 +280,9 @@ def _deposits(key, first_row, n_detector_rows, n_row, n_col, n_slot, settings):
             dy = length * math.sin(azimuth)
             charge = yield_median * strength * math.sqrt(thickness**2 + length**2)
             shower &= charge >= shower_above
-            # walk through the pixels that the track crosses (Amanatides & Woo 1987)
-            px = math.floor(x)
-            py = math.floor(y)
-            step_x = 1 if dx > 0.0 else -1
-            step_y = 1 if dy > 0.0 else -1
-            next_x = ((px + (step_x > 0)) - x) / dx if dx != 0.0 else math.inf
-            next_y = ((py + (step_y > 0)) - y) / dy if dy != 0.0 else math.inf
-            done = 0.0
-            while done < 1.0:
-                to = min(next_x, next_y, 1.0)
-                q = charge * (to - done)
-                done = to
-                if abs(py - first_row) <= n_row + 1 and q > 0.0:
-                    for k in range(5):
-                        cx = px + (k == 1) - (k == 2)
-                        cy = py + (k == 3) - (k == 4)
-                        share = 1.0 - 4.0 * leakage if k == 0 else leakage
-                        if 0 <= cx < n_col and first_row <= cy < last_row and share > 0.0:
-                            deposits, n = _push(
-                                deposits, n, slot, head, cy - first_row, cx, q * share
-                            )
-                if next_x <= next_y:
-                    px += step_x
-                    next_x += abs(1.0 / dx) if dx != 0.0 else math.inf
-                else:
-                    py += step_y
-                    next_y += abs(1.0 / dy) if dy != 0.0 else math.inf
+            deposits, n = _add_track(
+                x, y, dx, dy, charge, leakage, first_row, n_row, n_col, slot, deposits, n, head
+            )
             if shower:
                 peak = shower_charge * strength / (2.0 * math.pi * shower_sigma**2)
                 r = math.ceil(3.0 * shower_sigma)

@@ -73,7 +73,6 @@ _MEASURED = ("highres", "photometry", "errors", "fit", "point_sources", "perturb
 def make_report(context, _):
     """Stage 14: the page with its figures, and the numbers as JSON."""
     config = context.config
-    bands = config.exposures.filters
     truths = study_truths(config)
     shown = reference(config)
     model = sed.SEDModel.yang2021()
@@ -90,16 +89,7 @@ def make_report(context, _):
     extra = paper.extra_numbers(study, metrics, kernels)
     extra |= rivals.source_extractor_numbers(rival_tables, context.seed)
     study = dataclasses.replace(study, extra=extra)
-    numbers = study_numbers(study, seed=context.seed, n_draws=300)
-    context.save_table("report/numbers.ecsv", numbers)
-    numbers = whole_sample(numbers)
-    metrics["truths"] = {}
-    for name, truth in unperturbed.items():
-        metrics["truths"][name] = truth_metrics(truth, tables[name], numbers, bands, context.seed)
-    metrics["fits"] = metrics["truths"][shown]["fits"]
-    if metrics["n_sample"] == 0:
-        log.warning("no source is left to fit: %s", metrics["n_left_out"])
-    _save_metrics(context, metrics)
+    numbers = _save_numbers(context, study, unperturbed, tables, metrics)
     subtitle = f"{metrics['n_field']} galaxies in {field_text(config)}, injected fracAGN "
     subtitle += f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
     title = f"miricigale: {config.run.name}"
@@ -123,6 +113,23 @@ def make_report(context, _):
     write_inputs(page)
     write_origin(page, [page.tables.truth.meta, matched.meta])
     context.save("report/index.html", lambda path: report.write(path))
+
+
+def _save_numbers(context, study, truths, tables, metrics):
+    """Save the numbers of the fits, add those of the whole samples to ``metrics``, and return these."""
+    numbers = study_numbers(study, seed=context.seed, n_draws=300)
+    context.save_table("report/numbers.ecsv", numbers)
+    numbers = whole_sample(numbers)
+    metrics["truths"] = {}
+    for name, truth in truths.items():
+        metrics["truths"][name] = truth_metrics(
+            truth, tables[name], numbers, study.bands, context.seed
+        )
+    metrics["fits"] = metrics["truths"][study.truths[0].name]["fits"]
+    if metrics["n_sample"] == 0:
+        log.warning("no source is left to fit: %s", metrics["n_left_out"])
+    _save_metrics(context, metrics)
+    return numbers
 
 
 def _patch_products(context, truth, patch):
