@@ -28,7 +28,8 @@ def plot_filters(curves, ax=None, **kwargs):
         ax.plot(wave, throughput, **{"label": plain_text(name), **kwargs})
     ax.set(xlabel="wavelength (µm)", ylabel="throughput")
     if len(curves) > 1:
-        legend(ax)
+        # above the curves, which leave no place between them
+        legend(ax, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=min(5, len(curves)))
     return ax
 
 
