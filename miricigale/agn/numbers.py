@@ -255,12 +255,16 @@ def prior_table(bins, prior, by_redshift, all_redshifts):
     Returns
     -------
     table : `~astropy.table.QTable`
-        A row for each bin of the fraction, first for all redshifts.
+        A row for each bin of the fraction, first for all redshifts, then for each of several bins.
     """
     edges = (0.0,) + tuple(bins.frac_agn)
     rows = []
     samples = [(bins.redshift[0], bins.redshift[-1], all_redshifts.shares[:, 0])]
-    for i in range(len(bins.redshift) - 1):
+    n_z = len(bins.redshift) - 1
+    for i in range(n_z):
+        # a single bin is that of all redshifts
+        if n_z == 1:
+            break
         samples.append((bins.redshift[i], bins.redshift[i + 1], by_redshift.shares[:, i]))
     for z_low, z_high, shares in samples:
         for j, shipped in enumerate(prior):

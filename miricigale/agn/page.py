@@ -4,13 +4,25 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.agn.numbers import FLOOR
-from miricigale.pages import Page, SectionWriter
+from miricigale.pages import Missing, Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import row_dicts
 
 #: Colors of the measured prior, and of the prior of the fits.
 _MEASURED, _SHIPPED = "#1d4ed8", "#c2410c"
+#: Smallest share of galaxies that the figure of the prior shows.
+_LEAST_SHARE = 1e-4
+#: Formats of numbers with intervals, and why one is missing.
+_INTERVALS = {
+    "n": (".0f", "no object"),
+    "n_corrected": (".1f", "no injected AGN is selected"),
+    "completeness": (".0f %", "none was injected"),
+    "above": (".0f %", "none was injected"),
+    "density": (".1e", "the bin has no upper end, or no such injected AGN"),
+    "obscured": (".0f %", "no quasars were fitted"),
+    "measured": (".1f %", "no object"),
+}
 
 
 def write_page(result, path, name):
@@ -41,6 +53,7 @@ def write_page(result, path, name):
     page.section("numbers", floor=f"{FLOOR:g}")
     page.figure("figure", _luminosity_function(result.numbers))
     page.table("table", _rows(result.numbers), floor=f"{FLOOR:g}")
+    page.table("densities", _rows(result.numbers), floor=f"{FLOOR:g}")
     if np.isfinite(result.numbers["obscured"]).any():
         page.section("obscured")
         page.table("table", _rows(result.numbers))
@@ -70,18 +83,21 @@ def _rows(table):
         for name in ("redshift", "log_luminosity", "frac_agn"):
             if f"{name}_low" in row:
                 row[name] = _span(row[f"{name}_low"], row[f"{name}_high"])
-        for name in (
-            "n",
-            "n_corrected",
-            "completeness",
-            "above",
-            "density",
-            "obscured",
-            "measured",
-        ):
-            if f"{name}_low" in row and f"{name}_high" in row:
-                row[f"{name}_err"] = 0.5 * (row[f"{name}_high"] - row[f"{name}_low"])
+        for name, (spec, reason) in _INTERVALS.items():
+            if f"{name}_low" in row and name in row:
+                row[f"{name}_interval"] = _interval(row, name, spec, reason)
     return rows
+
+
+def _interval(row, name, spec, reason):
+    """Value of a row with the ends of its interval, which may be on one side of it only, as text."""
+    value, low, high = (row[key] for key in (name, f"{name}_low", f"{name}_high"))
+    if not np.isfinite(value):
+        return Missing(reason)
+    spec, percent, _ = spec.partition(" %")
+    scale = 100.0 if percent else 1.0
+    value, low, high = (f"{scale * number:{spec}}" for number in (value, low, high))
+    return f"{value} ({low} to {high}){percent}"
 
 
 def _span(low, high):
@@ -168,9 +184,9 @@ def _completeness(numbers):
 
 def _prior(prior):
     """Shares of the AGN fraction, shipped and measured, for all redshifts."""
-    low, high = prior["redshift_low"][0], prior["redshift_high"][0]
-    of_all = (prior["redshift_low"] == low) & (prior["redshift_high"] == high)
-    rows = prior[of_all][: np.count_nonzero(of_all)]
+    low = prior["redshift_low"][0]
+    high = prior["redshift_high"][0]
+    rows = prior[(prior["redshift_low"] == low) & (prior["redshift_high"] == high)]
     figure, [[ax]] = new_figure(1, 1, size=(WIDTH / 1.6, 3.2))
     place = np.arange(len(rows))
     value, bars = _bars(rows, "measured")
@@ -178,6 +194,6 @@ def _prior(prior):
     ax.plot(place, np.asarray(rows["shipped"]), "x", color=_SHIPPED, label="shipped")
     names = [_span(row["frac_agn_low"], row["frac_agn_high"]) for row in rows]
     ax.set_xticks(place, names, fontsize=8)
-    ax.set(xlabel="fracAGN", ylabel="share of galaxies", yscale="log")
+    ax.set(xlabel="fracAGN", ylabel="share of galaxies", yscale="log", ylim=(_LEAST_SHARE, 1.5))
     ax.legend(frameon=False)
     return figure

@@ -359,6 +359,17 @@ def test_injected_agn_are_measured_on_images(run, model, tmp_path):
     )
 
 
+def test_the_page_shows_ends_of_intervals(result):
+    """Wilson's interval of 2 of 4 is 50 +- 22.4 %, and of 4 of 4 it is 80 to 100 %: closed forms."""
+    survey, folder = result
+    assert survey.numbers["n_injected"].tolist() == [4, 4]
+    page = (folder / "page.html").read_text()
+    assert "50 (28 to 72) %" in page
+    assert "100 (80 to 100) %" in page
+    # a single bin of redshift is that of all
+    assert len(np.unique(survey.prior["frac_agn_high"])) == len(survey.prior)
+
+
 def test_injected_agn_have_fewer_models(run, model, tmp_path):
     catalog = run("first")[1].parent / "catalog.ecsv"
     survey = AGNSurvey(20 * u.arcmin**2, redshift=(0.5, 1.5), n_injections=4, injected_models=40)
