@@ -57,6 +57,8 @@ class SampleNumbers:
         Selected objects by fitted redshift and luminosity.
     pure : `~numpy.ndarray`, shape (n_z, n_lum)
         Sum of their probabilities to have an AGN fraction of at least the limit, by the measured prior.
+    pure_shipped : `~numpy.ndarray`, shape (n_z, n_lum)
+        The same by the prior of the fits.
     injected : dict of str to `~numpy.ndarray` of int, shape (n_z, n_lum)
         Injected AGN by true redshift and luminosity: ``all``; ``above`` the floor; above the ``limit``; the
         ``selected`` ones; and of these the ``right`` ones, above the limit.
@@ -74,6 +76,7 @@ class SampleNumbers:
     n_used: int
     selected: np.ndarray
     pure: np.ndarray
+    pure_shipped: np.ndarray
     injected: dict
     seed: int
 
@@ -138,7 +141,11 @@ class SampleNumbers:
             row |= {name: share.value, f"{name}_low": share.low, f"{name}_high": share.high}
         n_selected = self.selected[i, k]
         row["n_selected"] = int(n_selected)
-        row["purity"] = self.pure[i, k] / n_selected if n_selected else np.nan
+        row["purity"] = np.nan
+        row["purity_shipped"] = np.nan
+        if n_selected:
+            row["purity"] = self.pure[i, k] / n_selected
+            row["purity_shipped"] = self.pure_shipped[i, k] / n_selected
         row |= _summary(self._corrected(i, k, "all"), "n_corrected")
         row["constrained"] = bool(row["above"] >= MIN_ABOVE)
         row |= self._density(number, row["n_shipped"], injected, i, k)
@@ -181,11 +188,19 @@ class SampleNumbers:
     def _obscured(self, by_class, i, k):
         """Share of the AGN that is obscured: those in fits as a galaxy, whose torus hides the disk."""
         if "quasar" not in by_class:
-            return _summary(np.full(1, np.nan), "obscured")
+            return _summary(np.full(1, np.nan), "obscured") | {"obscured_shipped": np.nan}
         rng = stream(self.seed, "agn", "obscured", i, k)
         hidden = rng.standard_gamma(by_class["galaxy"] + _JEFFREYS)
         unobscured = rng.standard_gamma(by_class["quasar"] + _JEFFREYS)
-        return _summary(hidden / (hidden + unobscured), "obscured")
+        first = self._first(self.floor)
+        by_posterior = {}
+        for name in ("galaxy", "quasar"):
+            by_posterior[name] = self.shipped[name][i, first:, k].sum()
+        total = by_posterior["galaxy"] + by_posterior["quasar"]
+        shipped = np.nan
+        if total > 0:
+            shipped = float(by_posterior["galaxy"] / total)
+        return _summary(hidden / (hidden + unobscured), "obscured") | {"obscured_shipped": shipped}
 
     def totals(self):
         """

@@ -243,6 +243,11 @@ class AGNSurvey:
         texts = declared("miricigale.agn", "columns.toml")["sources"]
         sources = described_columns(columns, texts)
         selected = sample.selected & sample.used
+        pure = {}
+        for name in probability:
+            pure[name] = self._counts(
+                sample.redshift, sample.log_luminosity, selected, np.nan_to_num(columns[name])
+            )
         numbers = SampleNumbers(
             bins=bins,
             limit=self.limit,
@@ -253,12 +258,8 @@ class AGNSurvey:
             n_all=len(sample),
             n_used=int(sample.used.sum()),
             selected=self._counts(sample.redshift, sample.log_luminosity, selected),
-            pure=self._counts(
-                sample.redshift,
-                sample.log_luminosity,
-                selected,
-                np.nan_to_num(columns["agn_probability"]),
-            ),
+            pure=pure["agn_probability"],
+            pure_shipped=pure["agn_probability_shipped"],
             injected=self._injected_counts(injected),
             seed=self.seed,
         )

@@ -359,6 +359,16 @@ def test_injected_agn_are_measured_on_images(run, model, tmp_path):
     )
 
 
+def test_purities_are_of_both_priors(result):
+    """Right objects of all bins are those of the list, by either prior."""
+    survey, _ = result
+    numbers = survey.numbers[survey.numbers["n_selected"] > 0]
+    sources = survey.sources[survey.sources["selected"]]
+    for prior in ("", "_shipped"):
+        right = np.sum(numbers["n_selected"] * numbers[f"purity{prior}"])
+        assert right == pytest.approx(np.sum(sources[f"agn_probability{prior}"]))
+
+
 def test_the_page_shows_ends_of_intervals(result):
     """Wilson's interval of 2 of 4 is 50 +- 22.4 %, and of 4 of 4 it is 80 to 100 %: closed forms."""
     survey, folder = result
