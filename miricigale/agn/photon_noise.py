@@ -109,7 +109,9 @@ class PhotonNoise:
             counts = unit * u.s
             is_rate = True
         if counts is None or not _is_count(counts):
-            return cls.unknown(f"no VAR_POISSON, and pixels in {unit} without counts")
+            return cls.unknown(
+                f"no VAR_POISSON, and pixels in {unit}, whose electrons are not stated"
+            )
         text = []
         scale = 1.0
         if not any(counts.is_equivalent(base) for base in _ELECTRONS):

@@ -104,7 +104,9 @@ def test_headers_that_do_not_say_it():
     text = PhotonNoise.of_header(u.Unit("electron/s"), silent, 1.0).text
     assert text == "not drawn: no VAR_POISSON, and pixels in electron / s without EXPTIME"
     text = PhotonNoise.of_header(u.Unit("MJy/sr"), silent | {"EXPTIME": 5.0}, 1.0).text
-    assert text == "not drawn: no VAR_POISSON, and pixels in MJy / sr without counts"
+    assert (
+        text == "not drawn: no VAR_POISSON, and pixels in MJy / sr, whose electrons are not stated"
+    )
 
 
 def test_files_state_it(tmp_path):
