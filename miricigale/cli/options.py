@@ -234,15 +234,22 @@ def declarations(file="commands.toml"):
 
 @contextlib.contextmanager
 def workers(scheduler, n_threads, memory=None):
-    """Processes of this machine, or the workers of a dask scheduler, as an executor of a run that is resumed."""
+    """
+    Processes of this machine, or the workers of a dask scheduler, as an executor of a run that is resumed.
+
+    None on one thread: this process works itself, for another one would import the package once more.
+    """
     from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import process_pool, thread_count
     from miricigale.workflow.engine.cluster import cluster_executor
 
-    if scheduler is None:
-        pool = process_pool(thread_count(n_threads or None))
-    else:
+    n_processes = thread_count(n_threads or None)
+    if scheduler is not None:
         pool = cluster_executor(scheduler, memory=memory)
+    elif n_processes > 1:
+        pool = process_pool(n_processes)
+    else:
+        pool = contextlib.nullcontext()
     try:
         with pool as executor:
             yield executor

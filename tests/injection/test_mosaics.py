@@ -219,7 +219,7 @@ def test_sources_are_put_into_the_prior_too(folder, prior_files, tmp_path, capsy
     files = [str(one.path) for one in prior_files]
     options = ["--filter", "irac.ch4", "--psf", str(image.psf), "--highres-psf", str(prior.psf)]
     options += ["--sources", str(tmp_path / "own.ecsv"), "--trials", "1", "--number", "10"]
-    options += ["--segmentation", str(tmp_path / "seg.fits"), "--no-progress"]
+    options += ["--segmentation", str(tmp_path / "seg.fits"), "--no-progress", "--threads", "1"]
     assert main(["inject", *files, *options, "-o", str(tmp_path / "run")]) == 0
     assert "10 sources; page: index.html" in capsys.readouterr().out
     found = QTable.read(tmp_path / "run" / "sources.fits")

@@ -5,6 +5,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import astropy.units as u
@@ -18,7 +19,7 @@ from helpers.errors import refuses
 from miricigale.agn import AGNSurvey
 from miricigale.cli import main
 from miricigale.cli.exposures import reducer_of
-from miricigale.cli.options import declarations, destination, make_parser
+from miricigale.cli.options import declarations, destination, make_parser, workers
 from miricigale.detector import Detector
 from miricigale.filters.surveys import SURVEYS
 from miricigale.fitting import fit_catalog
@@ -386,3 +387,10 @@ def test_a_reader_that_leaves_ends_a_command_quietly():
         message = process.stderr.read()
     assert process.returncode == 128 + signal.SIGPIPE
     assert message == b""
+
+
+def test_a_command_on_one_thread_starts_no_other_process():
+    with workers(None, 1) as executor:
+        assert executor is None
+    with workers(None, 2) as executor:
+        assert isinstance(executor, ProcessPoolExecutor)
