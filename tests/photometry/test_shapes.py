@@ -2,12 +2,15 @@ import numpy as np
 import pytest
 import scipy.ndimage
 import scipy.optimize
+import scipy.stats
 from astropy.nddata import overlap_slices
 from numpy.testing import assert_allclose
 
 from helpers.light import gaussian_image
+from miricigale.photometry._core.shape_fits import evidence_of
+from miricigale.photometry.shapes.population import Population
 from miricigale.photometry.shapes.shape_models import ShapeModels
-from miricigale.photometry.shapes.shapes import Neighbors, ShapeFitter
+from miricigale.photometry.shapes.shapes import Neighbors, ShapeFitter, normal_nodes
 from miricigale.photometry.shapes.template_choice import cutouts
 from miricigale.profiles import sersic_image
 
@@ -151,8 +154,6 @@ def test_light_of_a_neighbor_beyond_the_stamp_is_where_it_is():
 
 
 def test_evidence_is_the_integral_over_light_and_center():
-    from miricigale.photometry._core.shape_fits import evidence_of
-
     fitter, rng = ShapeFitter(gaussian_psf(), SCALE), np.random.default_rng(3)
     truth = np.array([16.2, 15.9, np.log(2.5), 0.0, 0.2, -0.1])
     light = 600 * fitter.profiles((33, 33), truth)[0] + rng.normal(0, 1.0, (33, 33))
@@ -203,10 +204,46 @@ def test_evidence_is_the_integral_over_light_and_center():
         assert_allclose(flux, np.log(misfit(center, shape)[1]), atol=1e-4)
 
 
+def test_the_shape_of_a_source_is_the_mean_over_its_nodes():
+    """Nodes, their odds and moments in one compiled call, by numpy; light of a given shape has a closed form."""
+    fitter, rng = ShapeFitter(gaussian_psf(), SCALE), np.random.default_rng(5)
+    truth = np.array([16.2, 15.9, np.log(2.0), 0.1, 0.2, -0.1])
+    light = 400 * fitter.profiles((33, 33), truth)[0] + rng.normal(size=(33, 33))
+    weight = np.ones((33, 33))
+    population = Population.expected(SCALE)
+    shape = fitter.fit(light, weight, truth[:2], population)
+    best = fitter.fit(light, weight, truth[:2], population, nodes=False)
+    # nodes are where a normal distribution, 1.4 times as wide as that of the fit, has them
+    covariance = best.covariance[3:, 3:]
+    root = 1.4 * np.linalg.cholesky(covariance)
+    assert_allclose(shape.nodes[:, 2:], best.parameters[2:] + normal_nodes() @ root.T, rtol=1e-9)
+    # likelihoods are over the density that nodes are drawn from
+    stamp = fitter._stamp(light, weight, best.parameters[None], 16)
+    along = np.linalg.solve(covariance, best.covariance[3:, 1:3])
+    drift = (shape.nodes[:, 2:] - best.parameters[2:]) @ along
+    mean = np.append(truth[:2], population.mean)
+    values = evidence_of(
+        *stamp.pixels, best.parameters[None], np.array([best.flux]), shape.nodes[:, 2:].copy(),
+        drift, mean[None], np.eye(2)[None] / 0.7**2, np.zeros((0, light.size)),
+    )  # fmt: skip
+    density = scipy.stats.multivariate_normal(best.parameters[2:], root @ root.T)
+    expected = values[:, 0] - density.logpdf(shape.nodes[:, 2:])
+    assert_allclose(shape.nodes[:, 0], expected, rtol=1e-9)
+    odds, point = population.odds(shape.nodes[None], np.array([shape.as_point]))
+    assert_allclose(shape.point, point[0], rtol=1e-9)
+    odds = odds[0] / odds[0].sum()
+    flux_and_shape = np.append(np.log(shape.flux), shape.parameters[2:])
+    assert_allclose(flux_and_shape, odds @ shape.nodes[:, 1:], rtol=1e-9)
+    assert_allclose(shape.parameters[:2], best.parameters[:2])
+    keep = np.ix_([0, 3, 4, 5, 6], [0, 3, 4, 5, 6])
+    moments = np.cov(shape.nodes[:, 1:].T, aweights=odds, bias=True)
+    moments[0, 0] += 1 / np.linalg.inv(best.covariance)[0, 0]
+    assert_allclose(shape.covariance[keep], moments, rtol=1e-8, atol=1e-12)
+    assert_allclose(shape.covariance[1:3, 1:3], best.covariance[1:3, 1:3])
+
+
 def test_neighbors_that_may_change_take_power_from_the_evidence():
     """At the best light and a fixed center only the error of the light is larger, by what they share of it."""
-    from miricigale.photometry._core.shape_fits import evidence_of
-
     fitter, rng = ShapeFitter(gaussian_psf(), SCALE), np.random.default_rng(4)
     truth = np.array([16.2, 15.9, np.log(2.5), 0.0, 0.2, -0.1])
     model = fitter.profiles((33, 33), truth)[0]

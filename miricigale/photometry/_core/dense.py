@@ -108,6 +108,9 @@ def inverse_of(factor):
     unit = np.zeros(n)
     for i in range(n):
         unit[i] = 1.0
-        inverse[i] = solve_factor(factor, unit)
+        row = solve_factor(factor, unit)
         unit[i] = 0.0
+        # by number: to assign arrays takes more than a second to compile
+        for j in range(n):
+            inverse[i, j] = row[j]
     return inverse

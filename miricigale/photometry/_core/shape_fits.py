@@ -10,18 +10,22 @@ from miricigale.photometry._core.dense import (
     log_determinant,
     solve_factor,
 )
-from miricigale.photometry._core.shapes import FAST, STEP, fill_curves, profile_of
+from miricigale.photometry._core.shapes import FAST, INDEX_RANGE, STEP, fill_curves, profile_of
 from miricigale.utils.compilation import njit
 
 #: How square images are made from transforms, by products of small matrices: frequencies kx and ky (rad per pixel)
 #: at ky >= 0, then at ky <= 0, (2 ny nx,), what their squares count in the sum over all pixels; the PSF's
-#: transform, (2, ny, nx); cosines and sines along y, (2, half + 1, ny), and cosines and negative sines along x,
-#: (2, half + 1, nx), at distances from the middle pixel; largest part of the PSF's light in each row, (ny,), and
+#: transform, (2, ny, nx); cosines and sines along y, (2, ny, half + 1), and cosines and negative sines along x,
+#: (2, nx, half + 1), at distances from the middle pixel; largest part of the PSF's light in each row, (ny,), and
 #: column, (nx,).
 Plan = collections.namedtuple("Plan", "kx ky weight response waves_y waves_x light_y light_x")
 
 #: Part of a source's light below which the frequencies of its image are left out.
 _FAINT = 1e-5
+
+#: Least half-light radius (pixels), and largest ellipticity, that are fitted.
+_LEAST_RADIUS = 0.05
+_MOST_ELLIPTICITY = 2.0
 
 
 def make_plan(size, transform, passed):
@@ -55,9 +59,9 @@ def make_plan(size, transform, passed):
     response *= (1 + twice[:nx]) / period
     frequency = 2 * np.pi / period
     ky, kx = np.meshgrid(frequency * np.arange(ny), frequency * np.arange(nx), indexing="ij")
-    distance = np.arange(size // 2 + 1)[:, None]
-    phase_y = distance * ky[:, 0]
-    phase_x = distance * kx[0]
+    distance = np.arange(size // 2 + 1)
+    phase_y = ky[:, :1] * distance
+    phase_x = kx[0][:, None] * distance
     return Plan(
         kx=np.tile(kx.ravel(), 2).astype(np.float32),
         ky=np.append(ky, -ky).astype(np.float32),
@@ -84,10 +88,9 @@ def _count(light, frequency, radius, profile):
 
 
 @njit()
-def _extent(plan, shape, table):
+def _extent(plan, shape, profile):
     """Return the numbers (ny, nx) of rows and columns of frequencies in which a shape, (4,), has light."""
     _, all_y, all_x = plan.response.shape
-    profile = profile_of(table, shape[1], False)[0]
     eta = np.sqrt(shape[2] ** 2 + shape[3] ** 2)
     turn = 0.0
     if eta > 0.0:
@@ -103,8 +106,10 @@ def _extent(plan, shape, table):
 
 @njit()
 def _frequencies(plan, ny, nx):
-    """Return kx, ky and weights of the first ny rows and nx columns of a plan, (3, 2 ny nx)."""
+    """Return kx, ky and weights of the first ny rows and nx columns of a plan, each (2 ny nx,)."""
     _, all_y, all_x = plan.response.shape
+    if ny == all_y and nx == all_x:
+        return plan.kx, plan.ky, plan.weight
     values = np.empty((3, 2 * ny * nx), np.float32)
     # by number: expressions of pieces of arrays take longer to compile
     for sign in range(2):
@@ -115,7 +120,7 @@ def _frequencies(plan, ny, nx):
                 values[0, first + j] = plan.kx[source + j]
                 values[1, first + j] = plan.ky[source + j]
                 values[2, first + j] = plan.weight[source + j]
-    return values
+    return values[0], values[1], values[2]
 
 
 @njit()
@@ -189,19 +194,23 @@ def _quarters(plan, curves, x, y, n_moved, size):
     halves = np.empty((4, half + 1, m * nx), np.float32)
     rows = halves.reshape(2, 2 * (half + 1) * m, nx)
     quarters = np.empty((2, 2 * (half + 1) * m, half + 1), np.float32)
-    waves_y = np.empty((half + 1, ny), np.float32)
-    waves_x = np.empty((half + 1, nx), np.float32)
     for k in range(4):
-        for i in range(half + 1):
-            for j in range(ny):
-                waves_y[i, j] = plan.waves_y[k % 2, i, j]
-        np.dot(waves_y, sums[k], halves[k])
+        np.dot(_nearest(plan.waves_y[k % 2], ny, half + 1).T, sums[k], halves[k])
     for k in range(2):
-        for i in range(half + 1):
-            for j in range(nx):
-                waves_x[i, j] = plan.waves_x[k, i, j]
-        np.dot(rows[k], waves_x.T, quarters[k])
+        np.dot(rows[k], _nearest(plan.waves_x[k], nx, half + 1), quarters[k])
     return quarters
+
+
+@njit()
+def _nearest(waves, n, n_distances):
+    """Return the waves of the first n frequencies, at the first distances from the middle."""
+    if waves.shape[1] == n_distances:
+        return waves[:n]
+    nearest = np.empty((n, n_distances), np.float32)
+    for i in range(n):
+        for j in range(n_distances):
+            nearest[i, j] = waves[i, j]
+    return nearest
 
 
 @njit()
@@ -225,7 +234,7 @@ def draw_curves(plan, curves, x, y, n_derivatives):
     images : float32 `~numpy.ndarray`, shape (n + n_derivatives, size, size)
     """
     _, ny, nx = plan.response.shape
-    half = plan.waves_x.shape[1] - 1
+    half = plan.waves_x.shape[2] - 1
     size = 2 * half + 1
     curves = curves.reshape(-1, 2, ny, nx)
     quarters = _quarters(plan, curves, x, y, n_derivatives // 2, size)
@@ -295,10 +304,11 @@ def _products(plan, table, inverse, squares, parameters, columns):
     for s in range(n):
         first = s * k
         shape = parameters[s, 2:]
-        ny, nx = _extent(plan, shape, table)
-        frequencies = _frequencies(plan, ny, nx)
+        profile = profile_of(table, shape[1])
+        ny, nx = _extent(plan, shape, profile[0])
+        kx, ky, _ = _frequencies(plan, ny, nx)
         curves = np.empty((n_curves, 2, ny, nx), np.float32)
-        fill_curves(frequencies[0], frequencies[1], shape, table, curves.reshape(n_curves, -1))
+        fill_curves(kx, ky, shape, profile, curves.reshape(n_curves, -1))
         # each source is drawn on a square of its own
         center_x = parameters[s, 0] - squares[s, 0]
         center_y = parameters[s, 1] - squares[s, 1]
@@ -336,6 +346,24 @@ def _products(plan, table, inverse, squares, parameters, columns):
                     products[first + i, t * k + j] = block[i, j]
                     products[t * k + j, first + i] = block[i, j]
     return products
+
+
+@njit()
+def parameter_limits(white):
+    """Return the least and largest parameters, (2, 6), of a profile on a rectangle of pixels."""
+    limits = np.empty((2, 6))
+    # the place is free; ln radius, ln index, ellipticities
+    for i in range(2):
+        limits[0, i] = -np.inf
+        limits[1, i] = np.inf
+    limits[0, 2] = np.log(_LEAST_RADIUS)
+    limits[1, 2] = np.log(max(white.shape[0], white.shape[1]))
+    for i in range(2):
+        limits[i, 3] = np.log(INDEX_RANGE[i])
+    for i in range(4, 6):
+        limits[0, i] = -_MOST_ELLIPTICITY
+        limits[1, i] = _MOST_ELLIPTICITY
+    return limits
 
 
 @njit()
@@ -455,7 +483,9 @@ def minimum(plan, table, white, inverse, squares, start, mean, precision, limits
     n, m = precision.shape[:2]
     k = 1 + m
     columns = np.zeros((n * k + 1, white.size))
-    columns[-1] = white.reshape(-1)
+    pixels = white.reshape(-1)
+    for i in range(white.size):
+        columns[n * k, i] = pixels[i]
     flux = np.zeros(n)
     matrix = np.zeros((n * k, n * k))
     for i in range(n * k):
@@ -544,13 +574,13 @@ def _image_products(quarters, inverse, white):
 
 
 @njit(fastmath=FAST, forceinline=True)
-def _steepness(frequencies, curve):
+def _steepness(kx, ky, weight, curve):
     """Sum the squares of the slopes of an image over all pixels, by its transform and `_frequencies`."""
     total = 0.0
     for i in range(curve.size):
-        x = frequencies[0, i]
-        y = frequencies[1, i]
-        total += frequencies[2, i] * (x * x + y * y) * curve[i] * curve[i]
+        x = kx[i]
+        y = ky[i]
+        total += weight[i] * (x * x + y * y) * curve[i] * curve[i]
     return total
 
 
@@ -587,10 +617,6 @@ def evidence_of(
     The constraint on the center is that of the best shape, in proportion to the squares of the slopes of the
     images.
     """
-    # the best one first, whose center is free
-    all_shapes = np.empty((len(shapes) + 1, 4))
-    all_shapes[0] = best[0, 2:]
-    all_shapes[1:] = shapes
     x0 = best[0, 0] - squares[0, 0]
     y0 = best[0, 1] - squares[0, 1]
     columns = np.empty((3, white.size))
@@ -604,14 +630,24 @@ def evidence_of(
     xy = 0.0
     yy = 0.0
     likelihoods = np.zeros((len(shapes), 2))
+    last_ny = 0
+    last_nx = 0
+    kx, ky, weight = plan.kx, plan.ky, plan.weight
+    # the best one first, whose center is free
     for s in range(-1, len(shapes)):
-        shape = all_shapes[s + 1]
-        ny, nx = _extent(plan, shape, table)
-        frequencies = _frequencies(plan, ny, nx)
+        shape = best[0, 2:]
+        if s >= 0:
+            shape = shapes[s]
+        profile = profile_of(table, shape[1])
+        ny, nx = _extent(plan, shape, profile[0])
+        if ny != last_ny or nx != last_nx:
+            kx, ky, weight = _frequencies(plan, ny, nx)
+            last_ny = ny
+            last_nx = nx
         curves = np.empty((1, 2, ny, nx), np.float32)
         curve = curves.reshape(1, -1)
-        fill_curves(frequencies[0], frequencies[1], shape, table, curve)
-        steepness = _steepness(frequencies, curve[0])
+        fill_curves(kx, ky, shape, profile, curve)
+        steepness = _steepness(kx, ky, weight, curve[0])
         x = x0
         y = y0
         n_moved = 1

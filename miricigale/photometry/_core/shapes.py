@@ -53,8 +53,8 @@ def profile_table():
 
 
 @njit()
-def profile_of(table, log_n, changes):
-    """Return the transform of one index at the nodes, and its derivative to ln n if ``changes`` is True."""
+def profile_of(table, log_n):
+    """Return the transform of one index at the nodes, and its derivative to ln n."""
     # the interval of the spline in ln n
     place = (log_n - _FIRST) / _INDEX_STEP
     m = min(max(int(place), 0), table.shape[1] - 1)
@@ -66,8 +66,7 @@ def profile_of(table, log_n, changes):
         c = table[2, m, i]
         d = table[3, m, i]
         profile[0, i] = d + t * (c + t * (b + t * a))
-        if changes:
-            profile[1, i] = c + t * (2.0 * b + 3.0 * t * a)
+        profile[1, i] = c + t * (2.0 * b + 3.0 * t * a)
     return profile
 
 
@@ -88,7 +87,7 @@ def _cubic(profile, place):
 
 
 @njit(fastmath=FAST, forceinline=True)
-def fill_curves(kx, ky, shape, table, out):
+def fill_curves(kx, ky, shape, profile, out):
     """
     Write the transform of a centered Sersic profile of unit light, and its derivatives.
 
@@ -98,13 +97,12 @@ def fill_curves(kx, ky, shape, table, out):
         Frequencies in radians per pixel.
     shape : `~numpy.ndarray`, shape (4,)
         As for `shape_curves`.
-    table : `~numpy.ndarray`
-        `profile_table`.
+    profile : `~numpy.ndarray`
+        As from `profile_of`.
     out : float32 `~numpy.ndarray`, shape (1, m) or (5, m)
         For the profile, or also for its derivatives to the four.
     """
     changes = len(out) > 1
-    profile = profile_of(table, shape[1], changes)
     g1 = np.float32(shape[2])
     g2 = np.float32(shape[3])
     eta = np.sqrt(shape[2] ** 2 + shape[3] ** 2)
@@ -181,5 +179,5 @@ def shape_curves(kx, ky, shapes):
     table = profile_table()
     out = np.empty((len(shapes), 1, len(kx)), np.float32)
     for shape, curve in zip(shapes, out, strict=True):
-        fill_curves(kx, ky, shape, table, curve)
+        fill_curves(kx, ky, shape, profile_of(table, shape[1]), curve)
     return out[:, 0]

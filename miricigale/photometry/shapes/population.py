@@ -77,6 +77,11 @@ class Population:
         """Inverse of the covariance of the four."""
         return self._inverse[0]
 
+    @property
+    def log_det(self):
+        """Ln of the determinant of 2 pi times the covariance of the four."""
+        return self._inverse[1]
+
     def odds(self, nodes, points, brightness=None):
         """
         Calculate probabilities of the shapes of sources: of their nodes, (n, k), and of points, (n,).

@@ -7,7 +7,7 @@ import scipy.fft
 
 from miricigale.photometry._core.sampling import box_response
 from miricigale.photometry._core.shape_fits import draw_curves, make_plan
-from miricigale.photometry._core.shapes import fill_curves, profile_table
+from miricigale.photometry._core.shapes import fill_curves, profile_of, profile_table
 from miricigale.utils.missing_values import floats
 
 #: Size of the transform over that of the stamp.
@@ -73,7 +73,8 @@ class ShapeModels:
         n_curves = 5 if derivatives else 1
         n_moved = 2 if derivatives else 0
         curves = np.empty((n_curves, len(plan.kx)), np.float32)
-        fill_curves(plan.kx, plan.ky, parameters[2:], profile_table(), curves)
+        profile = profile_of(profile_table(), parameters[3])
+        fill_curves(plan.kx, plan.ky, parameters[2:], profile, curves)
         images = draw_curves(plan, curves, x, y, n_moved)
         return np.ascontiguousarray(images[:, : shape[0], : shape[1]])
 

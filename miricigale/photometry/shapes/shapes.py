@@ -8,8 +8,15 @@ import numpy as np
 import scipy.linalg
 from astropy.nddata import NoOverlapError, overlap_slices
 
-from miricigale.photometry._core.shape_fits import Plan, evidence_of, minimum
-from miricigale.photometry._core.shapes import INDEX_RANGE, profile_table
+from miricigale.photometry._core.shape_fits import Plan, minimum, parameter_limits
+from miricigale.photometry._core.shapes import profile_table
+from miricigale.photometry._core.source_fits import (
+    GAIN,
+    LEAST_HALF,
+    cut_out,
+    fit_source,
+    half_width,
+)
 from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.shapes.population import Population
 from miricigale.photometry.shapes.shape_models import ShapeModels
@@ -23,10 +30,8 @@ _OFFSET = 0.7
 #: The same as the inverse of a covariance.
 _CENTER = np.diag([_OFFSET**-2] * 2)
 
-#: Nodes that a shape's probability is summed over, and the width of their density over that of the
-#: normal distribution about the best shape.
+#: Nodes that a shape's probability is summed over.
 _NODES = 32
-_WIDER = 1.4
 
 #: What is kept of the profile fitted to a source: its parameters with x and y on the whole image, the
 #: covariance of ln flux and parameters, the probability of a point, and the profile's part of the
@@ -43,23 +48,12 @@ FITTED = np.dtype(
     ]
 )
 
-#: Ln radius (pixels) of what is drawn as a point.
-POINT_SIZE = -30.0
-
-#: Largest number of steps, and the gain in chi^2 below which the fit ends.
+#: Largest number of steps of a fit.
 _STEPS = 25
-_GAIN = 0.1
 
-#: Excess of chi^2 over twice the evidence of the profile that rules a point out at once.
-_FAR_BELOW = 200.0
-
-#: Radii (ln over the expected one) that the search begins with.
-_STARTS = (-0.9, 0.0, 0.9)
-
-#: Half-width (pixels) of the stamps, least and most, and in half-light radii.
-_HALF = 16
-_MOST = 48
-_REACH = 4.0
+#: Changes of the expected parameters that the search begins with: ln radius over the expected one.
+_STARTS = np.zeros((3, 6))
+_STARTS[:, 2] = -0.9, 0.0, 0.9
 
 
 @value_class
@@ -97,30 +91,6 @@ class Shape:
             theta=angle, max_radius=farthest,
         )  # fmt: skip
         return Cutout(stamp, origin, convolved=False)
-
-    def mean_shape(self, odds, point):
-        """Return the mean shape of the nodes, given their probabilities and that of a point."""
-        if odds.sum() > 0:
-            odds = odds / odds.sum()
-        else:
-            odds = np.full(len(odds), 1.0 / len(odds))
-        # mean and covariance of flux and shape over the nodes
-        mean = odds @ self.nodes[:, 1:]
-        off = self.nodes[:, 1:] - mean
-        shape_covariance = (off * odds[:, None]).T @ off
-        # noise of the flux of each shape
-        shape_covariance[0, 0] += 1.0 / np.linalg.inv(self.covariance)[0, 0]
-        covariance = np.zeros((7, 7))
-        keep = [0, 3, 4, 5, 6]
-        covariance[1:3, 1:3] = self.covariance[1:3, 1:3]
-        covariance[np.ix_(keep, keep)] = shape_covariance
-        return dataclasses.replace(
-            self,
-            flux=float(np.exp(mean[0])),
-            parameters=np.concatenate([self.parameters[:2], mean[1:]]),
-            covariance=covariance,
-            point=float(point),
-        )
 
     def semi_major(self, size, origin):
         """Return the semi-major axis (pixels) of the ellipse through each pixel of an image at (y, x)."""
@@ -210,48 +180,29 @@ class ShapeFitter(ShapeModels):
         """
         population = population or self.expected
         mean, precision = _prior(xy, population)
-        half = _HALF if start is None else _half_width(start.parameters)
-        # the best of some sizes to begin with
-        inner = self._stamp(data, weight, mean[None], half)
+        # none of them for the best profile alone
+        deviates = normal_nodes()[: None if nodes else 0]
         if start is None:
-            starts = [mean + [0, 0, step, 0, 0, 0] for step in _STARTS]
-            parameters = min(starts, key=inner.misfit)
+            # the best of some sizes to begin with
+            half = LEAST_HALF
+            starts = mean + _STARTS
         else:
-            parameters = start.parameters
-
-        def best(parameters, precision):
-            solution = inner.minimum(parameters[None], mean[None], precision[None])
-            if solution is None:
-                return None
-            _, flux, parameters, evidence, covariance, _ = solution
-            return flux[0], parameters[0], evidence, covariance[0]
-
-        extended = best(parameters, precision)
-        if extended is not None and start is None:
-            first_fit = extended[1]
-            if _half_width(first_fit) > half:
-                inner = self._stamp(data, weight, mean[None], _half_width(first_fit))
-                extended = best(first_fit, precision)
-        if extended is None:
+            half = half_width(start.parameters)
+            starts = start.parameters[None]
+        stamp = self._stamp(data, weight, mean[None], half)
+        solution = stamp.fit(starts, mean, precision, population, neighbors, deviates)
+        found, is_wider, flux, parameters, *_ = solution
+        if is_wider:
+            stamp = self._stamp(data, weight, mean[None], half_width(parameters))
+            starts = parameters[None]
+            solution = stamp.fit(starts, mean, precision, population, neighbors, deviates)
+            found, _, flux, parameters, *_ = solution
+        if not found:
             return None
-        flux, parameters, evidence, covariance = extended
+        covariance, node_values, as_point, point = solution[4:]
         if not nodes:
             return Shape(flux, parameters, 0.0, covariance)
-        # what else the source may be: shapes about the best, and a point
-        changes = inner.changes(neighbors)
-        nodes = inner.nodes(parameters, flux, covariance[1:, 1:], mean, changes)
-        start = parameters.copy()
-        start[2] = POINT_SIZE
-        as_point = -np.inf
-        # a point that is far worse in the same place need not be moved to the best one
-        if inner.misfit(start) < -2 * evidence + _FAR_BELOW:
-            point = best(start, precision[:2, :2].copy())
-            if point is not None:
-                point_flux, _, point_evidence, _ = point
-                as_point = point_evidence - np.log(point_flux)
-        shape = Shape(flux, parameters, 0.0, covariance, nodes, as_point)
-        odds, point_odds = population.odds(nodes[None], np.array([as_point]))
-        return shape.mean_shape(odds[0], point_odds[0])
+        return Shape(flux, parameters, point, covariance, node_values, as_point)
 
     def fit_together(self, data, weight, xy, populations, shapes):
         """
@@ -280,7 +231,7 @@ class ShapeFitter(ShapeModels):
         for k, population in enumerate(populations):
             mean[k], precision[k] = _prior(xy[k], population)
         start = np.array([shape.parameters for shape in shapes])
-        half_widths = np.array([_half_width(parameters) for parameters in start])
+        half_widths = [half_width(parameters) for parameters in start]
         inner = self._stamp(data, weight, mean, half_widths)
         solution = inner.minimum(start, mean, precision)
         if solution is None:
@@ -312,19 +263,12 @@ class ShapeFitter(ShapeModels):
 
     def _stamp(self, data, weight, means, half):
         """Cut out the pixels within distances, (n,) or one, of the middles, (n, 6), in a rectangle."""
-        squares = np.empty((len(means), 3), int)
-        squares[:, 2] = 2 * half + 1
-        squares[:, :2] = np.round(means[:, :2]) - np.reshape(half, (-1, 1))
-        x0, y0, _ = squares.min(axis=0)
-        x1, y1 = (squares[:, :2] + squares[:, 2:]).max(axis=0)
-        white_inverse = np.zeros((2, y1 - y0, x1 - x0))
-        for x, y, size in squares.tolist():
-            part = np.s_[max(y, 0) : max(y + size, 0), max(x, 0) : max(x + size, 0)]
-            inverse = weight[part]
-            at = max(y, 0) - y0, max(x, 0) - x0
-            box = np.s_[:, at[0] : at[0] + inverse.shape[0], at[1] : at[1] + inverse.shape[1]]
-            white_inverse[box] = data[part] * inverse, inverse
-        return _Stamp(self, self.plan(int(squares[:, 2].max())), *white_inverse, squares)
+        half_widths = np.broadcast_to(half, len(means)).astype(int)
+        data = np.ascontiguousarray(data, float)
+        weight = np.ascontiguousarray(weight, float)
+        squares, white, inverse = cut_out(data, weight, means, half_widths)
+        plan = self.plan(2 * int(half_widths.max()) + 1)
+        return _Stamp(self, plan, white, inverse, squares)
 
 
 @value_class
@@ -340,27 +284,20 @@ class _Stamp:
         """As the kernels take them."""
         return self.plan, profile_table(), self.white, self.inverse, self.squares
 
-    @functools.cached_property
-    def limits(self):
-        """Least and largest parameters."""
-        size = np.log(max(self.white.shape))
-        index = np.log(INDEX_RANGE)
-        low = [-np.inf, -np.inf, np.log(0.05), index[0], -2.0, -2.0]
-        return np.array([low, [np.inf, np.inf, size, index[1], 2.0, 2.0]])
-
     def minimum(self, start, mean, precision, steps=_STEPS):
         """Fit as `~miricigale.photometry._core.shape_fits.minimum`; None if nothing is found."""
-        solution = minimum(*self.pixels, start, mean, precision, self.limits, steps, _GAIN)
+        limits = parameter_limits(self.white)
+        solution = minimum(*self.pixels, start, mean, precision, limits, steps, GAIN)
         if not np.isfinite(solution[0]):
             return None
         return solution
 
-    def misfit(self, parameters):
-        """Return chi^2 of a profile with the light that fits best, infinite if that is negative."""
-        solution = self.minimum(parameters[None], parameters[None], np.empty((1, 0, 0)), 0)
-        if solution is None:
-            return np.inf
-        return solution[0]
+    def fit(self, starts, mean, precision, population, neighbors, deviates):
+        """Fit as `~miricigale.photometry._core.source_fits.fit_source`."""
+        return fit_source(
+            *self.pixels, starts, mean[None], precision[None], population.log_det, population.point,
+            self.changes(neighbors), deviates, _STEPS,
+        )  # fmt: skip
 
     def changes(self, neighbors):
         """Return whitened changes of the light of neighbors by independent unit normal deviates, (p, pixels)."""
@@ -385,40 +322,6 @@ class _Stamp:
             scipy.linalg.solve_triangular(neighbors.root, columns, lower=True)
         )
 
-    def nodes(self, parameters, flux, covariance, mean, changes):
-        """
-        Calculate shapes about the best as `Population.odds` takes them: likelihood over density, flux, shape.
-
-        The likelihood is that of the best light, center and neighbors: these change along ``changes``, (m, p), the
-        whitened change of their light by the independent unit normal deviates of what is possible. ``covariance``,
-        (6, 6), is that of center and shape.
-        """
-        # nodes are drawn from a normal distribution wider than that of the fit
-        root = np.linalg.cholesky(covariance[2:, 2:]) * _WIDER
-        z = normal_nodes()
-        shapes = parameters[2:] + z @ root.T
-        shapes[:, 0] = np.clip(shapes[:, 0], np.log(0.05), self.limits[1, 2])
-        low, high = np.log(INDEX_RANGE)
-        shapes[:, 1] = np.clip(shapes[:, 1], low, high)
-        # the center moves with the shape as their covariance says
-        drift = (shapes - parameters[2:]) @ np.linalg.solve(covariance[2:, 2:], covariance[2:, :2])
-        likelihoods = evidence_of(
-            *self.pixels,
-            parameters[None],
-            np.array([flux]),
-            shapes,
-            drift,
-            mean[None],
-            _CENTER[None],
-            changes,
-        )
-        # ln of the normal density from which the nodes are drawn
-        density = (
-            -0.5 * np.sum(z * z, axis=1) - np.sum(np.log(np.diag(root))) - 2 * np.log(2 * np.pi)
-        )
-        likelihoods[:, 0] -= density
-        return np.column_stack([likelihoods, shapes])
-
 
 def _prior(xy, population):
     """Return the prior of the parameters of a source at a position: mean, and inverse of the covariance."""
@@ -426,8 +329,3 @@ def _prior(xy, population):
     precision[:2, :2] = _CENTER
     precision[2:, 2:] = population.precision
     return np.concatenate([xy, population.mean]), precision
-
-
-def _half_width(parameters):
-    """Return the half-width (pixels) of the stamp that a profile is fitted on."""
-    return int(np.clip(np.ceil(_REACH * major_radius(parameters)), _HALF, _MOST))

@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 
+from miricigale.photometry._core.source_fits import POINT_SIZE
 from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.photometry.shapes.divided_galaxies import (
@@ -23,7 +24,7 @@ from miricigale.photometry.shapes.rectangles import (
     source_stamp,
     within,
 )
-from miricigale.photometry.shapes.shapes import POINT_SIZE, ShapeFitter, not_fitted
+from miricigale.photometry.shapes.shapes import ShapeFitter, not_fitted
 from miricigale.photometry.shapes.smoothing import SMOOTHED_NOISE, smooth_image
 from miricigale.photometry.shapes.source_models import (
     DividedGalaxy,

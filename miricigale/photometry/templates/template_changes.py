@@ -8,9 +8,10 @@ import scipy.ndimage
 
 from miricigale.photometry._core.shape_fits import Plan, draw_curves
 from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
+from miricigale.photometry._core.source_fits import POINT_SIZE
 from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.shapes.shape_models import ShapeModels
-from miricigale.photometry.shapes.shapes import POINT_SIZE, major_radius, normal_nodes
+from miricigale.photometry.shapes.shapes import major_radius, normal_nodes
 from miricigale.utils.values import value_class
 
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
@@ -60,7 +61,7 @@ class DrawnCutout:
     @property
     def shape(self):
         """Shape of ``data``."""
-        size = 2 * self.plan.waves_x.shape[1] - 1
+        size = 2 * self.plan.waves_x.shape[2] - 1
         return size, size
 
     @property
