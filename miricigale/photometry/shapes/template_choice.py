@@ -220,13 +220,13 @@ class _Lights:
     def _is_contaminated(self, model, label, neighbor_light):
         """Return whether the light of neighbors is another than when a model was fitted, by its chi^2."""
         change = neighbor_light - model.neighbor_light
-        # an upper limit of chi^2, on all pixels of the stamp, is enough for most
         with np.errstate(divide="ignore", invalid="ignore"):
-            limit = np.sum(change * change / self.variance[model.stamp], dtype=float)
-        if limit < 0.99 * _CONTAMINATED_CHI2:
+            chi2 = change * change / self.variance[model.stamp]
+        # an upper limit, on all pixels of the stamp, is enough for most
+        if np.sum(chi2, dtype=float) < 0.99 * _CONTAMINATED_CHI2:
             return False
-        weight, _, _ = self._weight(model.stamp, label, model.labels)
-        return np.sum((change * weight) ** 2) >= _CONTAMINATED_CHI2
+        _, is_free = self._own_and_free(model.stamp, label, model.labels)
+        return np.sum(chi2[is_free], dtype=float) >= _CONTAMINATED_CHI2
 
     def rejoined(self, models, sources, population):
         """
@@ -437,7 +437,8 @@ class _Lights:
                 places.append(xy - corner)
                 populations.append(population.at(self.segments.brightness(label)))
                 starts.append(member.shape.moved(rectangle_corner(member.stamp) - corner))
-            _, weight, _ = self._weight(hull_of_group, labels[0], labels)
+            _, is_free = self._own_and_free(hull_of_group, labels[0], labels)
+            weight = self._weight(hull_of_group, is_free)
             shapes, neighbors = self.fitter.fit_together(data, weight, places, populations, starts)
             fitted = []
             for member, shape, neighbor in zip(members, shapes, neighbors, strict=True):
@@ -484,24 +485,28 @@ class _Lights:
         size = rows.stop - rows.start, columns.stop - columns.start
         return np.float32(shape.flux) * self.fitter.profiles(size, shape.parameters)[0]
 
-    def _weight(self, stamp, label, together=()):
-        """Return the inverse noise of pixels that are free of others, the same for a profile, and own pixels."""
+    def _own_and_free(self, stamp, label, together=()):
+        """Return which pixels are a source's own, and which are free of others; those fitted together are none."""
         labels = self.segments.labels[stamp]
         usable = self.segments.usable[stamp]
         is_own = usable & (labels == label)
         is_free = is_own | usable & ~self.is_source[labels]
         for other_label in together:
             is_free |= usable & (labels == other_label)
-        weight = 1.0 / np.sqrt(np.where(is_free, self.variance[stamp], np.inf), dtype=float)
+        return is_own, is_free
+
+    def _weight(self, stamp, is_free):
+        """Return the inverse noise of free pixels for a profile, zero on others."""
         # no profile is right to better than a part of the brightness
-        misfit = _MISFIT * np.maximum(self.light[stamp], 0.0) * weight
-        looser = weight / np.sqrt(1.0 + misfit * misfit)
-        return weight, looser, is_own
+        misfit = np.maximum(_MISFIT * self.light[stamp], 0.0, dtype=float)
+        variance = self.variance[stamp] + misfit * misfit
+        return 1.0 / np.sqrt(np.where(is_free, variance, np.inf))
 
     def _draft(self, label, xy, nodes):
         """Fit the profile of one source, whatever others there are; there is no template yet."""
         stamp = source_stamp(self.segments.places[label - 1], xy, self.data.shape)
-        _, weight, _ = self._weight(stamp, label)
+        _, is_free = self._own_and_free(stamp, label)
+        weight = self._weight(stamp, is_free)
         data = self.data[stamp].astype(float)
         shape = self.fitter.fit(data, weight, xy - rectangle_corner(stamp), nodes=nodes)
         if shape is None:
@@ -512,11 +517,12 @@ class _Lights:
         """Fit one source again, ``others`` being the light of others on its stamp, ``last`` its last model."""
         stamp = last.stamp
         # the profile, without the light of neighbors
-        weight, looser, is_own = self._weight(stamp, label, last.labels)
+        is_own, is_free = self._own_and_free(stamp, label, last.labels)
+        weight = self._weight(stamp, is_free)
         data = self.data[stamp].astype(float) - neighbor_light
         corner = rectangle_corner(stamp)
         prior = population.at(self.segments.brightness(label))
-        shape = self.fitter.fit(data, looser, xy - corner, prior, last.shape, last.neighbors)
+        shape = self.fitter.fit(data, weight, xy - corner, prior, last.shape, last.neighbors)
         if shape is None:
             # as it was before, and if there was no template yet, as its profile
             has_template = last.is_profile or last.cutout is not None
@@ -536,7 +542,8 @@ class _Lights:
         n = np.count_nonzero(core)
         if self.select:
             # chi^2 of the profile on the core beyond that of noise
-            excess = np.sum(((data - new.image) * weight)[core] ** 2) - n
+            residual = (data - new.image)[core]
+            excess = np.sum(residual**2 / self.variance[stamp][core]) - n
             if excess < _EXCESS * np.sqrt(2 * max(n, 1)):
                 return dataclasses.replace(new, is_profile=True)
         # the image in the core, the profile beyond, scaled to what is seen
@@ -544,18 +551,17 @@ class _Lights:
         origin = np.subtract(profile.origin, corner[::-1])
 
         def convolve(images):
-            return self.fitter.convolve(images, origin, weight.shape)
+            return self.fitter.convolve(images, origin, data.shape)
 
-        scale, outer = adjust_wings(
+        scale, outer, image = adjust_wings(
             profile.data,
             shape.semi_major(profile.data.shape, origin),
             max(np.sqrt(n / (np.pi * shape.axes[1])), 2.0),
             convolve=convolve,
             data=data,
-            weight=np.where(core, 0.0, looser),
+            weight=np.where(core, 0.0, weight),
         )
         light = profile.data * scale
-        image = convolve(light[None])[0]
         remainder = np.where(core, data - image, 0.0)
         # light of the profile, of the core's difference from it, and beyond the stamp
         total = light.sum() + remainder.sum() + outer * (shape.flux - profile.data.sum())

@@ -32,6 +32,8 @@ def adjust_wings(stamp, radius, core, *, convolve, data, weight):
     -------
     scale, outer : `~numpy.ndarray`, shape (h, w), and float
         What the profile is to be multiplied with, never negative; the same beyond the stamp.
+    image : `~numpy.ndarray`, shape (ny, nx)
+        The scaled profile on the pixels of ``data``.
 
     Notes
     -----
@@ -48,7 +50,8 @@ def adjust_wings(stamp, radius, core, *, convolve, data, weight):
     inner = np.clip(1.0 - place, 0.0, 1.0)
     use = weight > 0
     parts = np.concatenate([inner[None], hats])
-    columns = convolve(stamp * parts)[:, use] * weight[use]
+    convolved = convolve(stamp * parts)
+    columns = convolved[:, use] * weight[use]
     # prior: differences of neighboring nodes, the first from 1, have the width of the walk's steps
     walk = (np.eye(n_nodes) - np.eye(n_nodes, k=-1)) / _SCALE_CHANGE
     begin = np.zeros(n_nodes)
@@ -57,4 +60,6 @@ def adjust_wings(stamp, radius, core, *, convolve, data, weight):
         np.vstack([columns[1:].T, walk]),
         np.concatenate([data[use] * weight[use] - columns[0], begin]),
     )
-    return inner + np.tensordot(scale, hats, axes=1), float(scale[-1])
+    # convolution is linear: that of the whole is the sum of those of its parts
+    image = convolved[0] + np.tensordot(scale, convolved[1:], axes=1)
+    return inner + np.tensordot(scale, hats, axes=1), float(scale[-1]), image
