@@ -34,16 +34,16 @@ class Measured:
     rows: np.ndarray
 
 
-def recovered_rows(positions, fluxes, former, former_fluxes, sky, flux, radius):
+def recovered_rows(positions, former, former_fluxes, sky, flux, radius):
     """
     Say which detection is which injected source.
 
     Parameters
     ----------
-    positions, fluxes
-        Detections on the image with the sources: `~astropy.coordinates.SkyCoord`, and `~numpy.ndarray` in uJy.
+    positions : `~astropy.coordinates.SkyCoord`
+        Of detections on the image with the sources.
     former, former_fluxes
-        The same on the image without them.
+        Positions and fluxes (`~numpy.ndarray`, uJy) of detections on the image without them.
     sky, flux
         The same of the injected sources.
     radius : `~astropy.units.Quantity`
@@ -187,9 +187,7 @@ class PriorField:
             prior_light = light_on_file(
                 inputs.highres, sources, sources["prior_flux"], psfs[1], self.n_threads
             )
-        file = image_file
-        if image_file is None:
-            file = inputs.images[0]
+        file = image_file or inputs.images[0]
         pixels = Pixels(inputs.highres.read(prior_light), [], {self.band: file.read(light)})
         segments, catalog = inputs.find_sources(pixels, inputs.catalog)
         detected = inputs.segmentation is None and inputs.catalog is None
@@ -198,18 +196,14 @@ class PriorField:
         measurement = inputs.measure(pixels, self.photometers, segments, catalog)
         rows = np.arange(len(catalog) - n, len(catalog))
         if n and detected:
-            prior_fluxes = sources["prior_flux"].to_value(FNU)
-            fluxes = np.asarray(catalog["flux"].to_value(FNU))
-            former_fluxes = np.asarray(former["flux"].to_value(FNU))
             # as far as a position of the prior may be off and still be the source's
             radius = measurement.results[self.band].psf_fwhm / 2
             rows = recovered_rows(
                 catalog["sky"],
-                fluxes,
                 former["sky"],
-                former_fluxes,
+                np.asarray(former["flux"].to_value(FNU)),
                 sources["sky"],
-                prior_fluxes,
+                sources["prior_flux"].to_value(FNU),
                 radius,
             )
         result = measurement.results[self.band]
@@ -233,7 +227,7 @@ class PriorField:
         joined["label"] = np.concatenate([np.asarray(catalog["label"], int), rows["label"]])
         return segments, joined
 
-    def shapes(self, pixels, segments, catalog, psfs):
+    def shapes(self, pixels, segments, catalog):
         """Return the fitted profiles of the sources (`~miricigale.injection.population.fitted_shapes`)."""
         psf = self.photometers[self.band].mean_kernel.source
         return fitted_shapes(pixels.prior, segments, catalog, psf, self.n_threads)
@@ -332,8 +326,7 @@ class ImageField:
         light = None
         if n and image_file is None:
             light = light_on_file(self.file, sources, sources["flux"], psfs[0], self.n_threads)
-        image = (self.file if image_file is None else image_file).read(light)
-        image = own_pixels(image)
+        image = own_pixels((image_file or self.file).read(light))
         segments = None
         if former is None:
             segmentation, catalog = detect_sources(image, preset=self.preset)
@@ -352,22 +345,20 @@ class ImageField:
         psf = psf_image(rotated, pixel_scale=scale * ANGLE, shape=n)
         return fitted_shapes(image, segments, catalog, psf, self.n_threads)
 
-    def shapes(self, pixels, segments, catalog, psfs):
+    def shapes(self, pixels, segments, catalog):
         """Return the fitted profiles of the sources, which are the catalog."""
         return catalog
 
 
 def with_shapes(former, sources):
     """Return a catalog of Sersic profiles and points: those of the field, and after them what is injected."""
-    tables = [former, sources]
-    if sources is None:
-        tables = [former]
-    rows = QTable()
+    tables = [former]
     ids = np.asarray(former["id"])
     if sources is not None:
+        tables.append(sources)
         ids = np.concatenate([ids, new_ids(ids, len(sources))])
-    rows["id"] = ids
-    rows["sky"] = joined_sky([one["sky"] for one in tables])
+    rows = QTable({"id": ids})
+    rows["sky"] = joined_sky([table["sky"] for table in tables])
     rows["profile"] = np.concatenate([np.asarray(table["profile"]) for table in tables])
     for name, unit in (
         ("half_light_radius", ANGLE),

@@ -88,7 +88,8 @@ def light_on_image(sources, flux, wcs, shape, psf, n_threads=None):
     rows[band] = flux
     wcs = wcs.deepcopy()
     wcs.pixel_shape = shape[::-1]
-    return scene_light(rows, band, wcs, psf, n_threads)
+    scene = Scene(rows, filter=band, wcs=wcs, psf=psf, n_threads=n_threads)
+    return np.asarray(scene.render().data)
 
 
 def light_on_file(file, sources, flux, psf, n_threads=None):
@@ -125,8 +126,3 @@ def light_on_file(file, sources, flux, psf, n_threads=None):
     every = np.zeros(header.shape)
     every[y : y + n * light.shape[0], x : x + n * light.shape[1]] = np.kron(light, np.ones((n, n)))
     return every
-
-
-def scene_light(rows, band, wcs, psf, n_threads):
-    """Return what a `~miricigale.scene.Scene` renders, as an array."""
-    return np.asarray(Scene(rows, filter=band, wcs=wcs, psf=psf, n_threads=n_threads).render().data)

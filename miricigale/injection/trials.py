@@ -106,7 +106,7 @@ def measure_base(field, injection):
     result = measured.result
     psfs = field.psfs(result)
     n = len(catalog)
-    shapes = field.shapes(pixels, segments, catalog, psfs)
+    shapes = field.shapes(pixels, segments, catalog)
     flux = np.asarray(result.flux.value[:n])
     error = np.asarray(result.flux_err.value[:n])
     usable = np.isfinite(error) & (error > 0)
@@ -308,7 +308,7 @@ def run_trial(field, injection, base, sources, image_file):
     fluxes = np.asarray(detections["flux"].to_value(FNU))
     former_fluxes = np.asarray(base.detections["flux"].to_value(FNU))
     partners = recovered_rows(
-        detections["sky"], fluxes, base.detections["sky"], former_fluxes, sources["sky"],
+        detections["sky"], base.detections["sky"], former_fluxes, sources["sky"],
         sources["flux"].to_value(FNU), base.facts["fwhm"] * ANGLE,
     )  # fmt: skip
     rows["detected"] = partners >= 0

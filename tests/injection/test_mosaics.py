@@ -236,10 +236,7 @@ def test_sources_are_put_into_the_prior_too(folder, prior_files, tmp_path, capsy
 def test_a_source_hidden_by_a_brighter_one_is_not_recovered():
     known, found = places([0.0, 9.0]), places([0.02, 9.0, 5.0])
     sky = places([0.0, 5.0, 9.0, 12.0])
-    fluxes = np.array([5.0, 3.0, 2.0])
-    rows = recovered_rows(
-        found, fluxes, known, np.array([5.0, 0.5]), sky, np.ones(4), 0.3 * u.arcsec
-    )
+    rows = recovered_rows(found, known, np.array([5.0, 0.5]), sky, np.ones(4), 0.3 * u.arcsec)
     assert_array_equal(rows, [-1, 2, 1, -1])
 
 
