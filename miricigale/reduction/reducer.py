@@ -13,7 +13,6 @@ from miricigale.instrument import (
     as_wcs,
     miri_detector,
 )
-from miricigale.reduction.combine.align import align_images, visit_of
 from miricigale.reduction.combine.combine import combine, drizzle, subtract_dithers
 from miricigale.reduction.images.files import as_exposure, exposure_list
 from miricigale.reduction.images.images import own_grid, with_data
@@ -51,7 +50,7 @@ from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, positive
 
-# pixels of mosaics
+# pixels of mosaics, MIRI's
 _SCALE = 0.11 * ANGLE
 
 
@@ -235,16 +234,11 @@ class Reducer(Interactive):
         rates = []
         for number in progress(range(ramp.shape[0]), show=progress_bar, desc="integrations"):
             part = ramp.integration(number)
-            integration_maps = maps.integration(number)
-            rates.append(
-                rate_image(
-                    self,
-                    part,
-                    integration_maps,
-                    fit_slopes(self, part, integration_maps, first=number),
-                )
-            )
-            rates[-1].image.meta["integration"] = number
+            part_maps = maps.integration(number)
+            fit = fit_slopes(self, part, part_maps, first=number)
+            rate = rate_image(self, part, part_maps, fit)
+            rate.image.meta["integration"] = number
+            rates.append(rate)
         if planes:
             return rates
         return [rate.image for rate in rates]
@@ -397,7 +391,7 @@ class Reducer(Interactive):
         rate = None
         if exposure.unit.is_equivalent(RATE):
             rate = exposure
-        if rate is None and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
+        elif not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
             raise argument_error("exposure", f"in {RATE} or {SURFACE_BRIGHTNESS}", exposure.unit)
         files = self.references
         history = ExposureHistory.of(exposure)
@@ -448,11 +442,10 @@ class Reducer(Interactive):
         backgrounds = []
         name = None
         record = ExposureRecord()
-        for number, ramp in enumerate(
-            progress(exposure_list(ramps), show=progress_bar, desc="reduce")
-        ):
+        exposures = progress(exposure_list(ramps), show=progress_bar, desc="reduce")
+        for number, ramp in enumerate(exposures, start=1):
             ramp = as_exposure(ramp)
-            record.check(f"exposure {number + 1}", ramp)
+            record.check(f"exposure {number}", ramp)
             rate, subtracted, background = self.reduce(ramp)
             del ramp
             band = ImageFacts.of(subtracted).filter
@@ -500,15 +493,12 @@ class Reducer(Interactive):
         """
         if self.background.sky_flat is not None and len(images) == len(backgrounds):
             images, backgrounds = flattened(self, images, backgrounds)
-        if isinstance(align, str) and align == "visits":
-            images, _ = align_images(images, groups=map(visit_of, images))
-            align = None
         pixel_scale = self.mosaic_scale(pixel_scale)
         return combine(self, images, backgrounds, rates, wcs, pixel_scale, align, planes)
 
     def mosaic_scale(self, pixel_scale=None):
         """
-        Return the pixel of mosaics without a WCS of their own.
+        Return the pixel of mosaics without a WCS of their own, arcsec.
 
         Parameters
         ----------

@@ -3,7 +3,7 @@
 import numpy as np
 
 from miricigale.instrument import ImageFacts, as_wcs
-from miricigale.reduction.combine.align import align_images
+from miricigale.reduction.combine.align import align_images, visit_of
 from miricigale.reduction.images.images import check_images, own_grid, with_data
 from miricigale.reduction.mosaic.mosaic import drizzle_images, pixel_maps_of, weight_map
 from miricigale.reduction.mosaic.outliers import reject_outliers
@@ -141,10 +141,14 @@ def _aligned(images, align):
     """Images aligned with sources at positions, or with each other; as they are if ``align`` is None."""
     if align is None:
         return images
+    groups = None
     if isinstance(align, str):
-        check_that(align == "dithers", "align", "a SkyCoord, 'dithers' or None", repr(align))
+        good = align in ("dithers", "visits")
+        check_that(good, "align", "a SkyCoord, 'dithers' or None", repr(align))
+        if align == "visits":
+            groups = map(visit_of, images)
         align = None
-    aligned, _ = align_images(images, align)
+    aligned, _ = align_images(images, align, groups=groups)
     return aligned
 
 

@@ -246,8 +246,15 @@ def fit_groups(
         return fit_part((ys + rows.start, xs.copy(), none, none[:0]))
 
     with threads(n_threads) as executor:
-        options = {"executor": executor, "progress_bar": progress_bar, "desc": "slopes"}
-        events = np.concatenate(parallel_map(fit_rows, chunks(ny, _ROWS), **options))
+        events = np.concatenate(
+            parallel_map(
+                fit_rows,
+                chunks(ny, _ROWS),
+                executor=executor,
+                progress_bar=progress_bar,
+                desc="slopes",
+            )
+        )
         showers = np.zeros((4, 0), np.int64)
         if np.isfinite(shower):
             showers = find_showers(
