@@ -302,8 +302,15 @@ class Detector(Interactive):
                 group_dq[i, g, rows.start + r] = group_flags[i, g, r]
 
         task.run(store, n_threads, progress_bar)
-        attributes = {"effects": task.effects, "properties": self.properties, "meta": task.meta}
-        return Ramp(data, task.exposure, pixel_dq=pixel_dq, group_dq=group_dq, **attributes)
+        return Ramp(
+            data,
+            task.exposure,
+            pixel_dq=pixel_dq,
+            group_dq=group_dq,
+            effects=task.effects,
+            properties=self.properties,
+            meta=task.meta,
+        )
 
     __call__ = expose
 
@@ -349,8 +356,8 @@ class Detector(Interactive):
         path = Path(path)
         task = self._task(image, exposure, seed, previous)
         pixel_dq = np.zeros(task.shape[2:], np.uint32)
-        options = {"start": start, "overwrite": overwrite}
-        with level1b.row_writer(path, task.exposure, **options) as (write_rows, finish):
+        writer = level1b.row_writer(path, task.exposure, start=start, overwrite=overwrite)
+        with writer as (write_rows, finish):
 
             def store(rows, counts, pixel_flags, group_flags):
                 # level 1b holds no flags of groups

@@ -71,8 +71,15 @@ def study_numbers(study, *, seed, n_draws=500):
                     options += REDSHIFT_BINS
                 for option in options:
                     key = stream(seed, "numbers", sky.name, band_set, quantity, str(option))
-                    choice = {"truth": sky, "band_set": band_set, "option": option}
-                    estimate = measure(study, quantity, **choice, seed=key, n_draws=n_draws)
+                    estimate = measure(
+                        study,
+                        quantity,
+                        truth=sky,
+                        band_set=band_set,
+                        option=option,
+                        seed=key,
+                        n_draws=n_draws,
+                    )
                     z_low, z_high = option or (0.0, np.inf)
                     row = {"truth": sky.name, "band_set": band_set, "quantity": quantity}
                     row |= {"z_low": z_low, "z_high": z_high}

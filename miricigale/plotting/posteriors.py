@@ -205,8 +205,16 @@ def plot_sed_fit(
         parts = {"best model": spectrum, **(parts or {})}
     if parts:
         _draw_spectra(ax, parts, wave)
-    boxes = {"color": "tab:orange", "markersize": 7, "fillstyle": "none"}
-    ax.plot(wave, model, "s", zorder=3, label="best model in the bands", **boxes)
+    ax.plot(
+        wave,
+        model,
+        "s",
+        zorder=3,
+        label="best model in the bands",
+        color="tab:orange",
+        markersize=7,
+        fillstyle="none",
+    )
     points = _points(groups, is_used, limit)
     for rows, label, style in points:
         rows = rows & have & (flux > 0)

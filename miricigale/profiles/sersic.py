@@ -244,6 +244,14 @@ def sersic_stamp(*, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta=0.0, m
     x1 = int(np.ceil(x + half_x - 0.5))
     y0 = int(np.floor(y - half_y + 0.5))
     y1 = int(np.ceil(y + half_y - 0.5))
-    options = {"total_flux": total_flux, "r_eff": r_eff, "n": n, "axis_ratio": axis_ratio}
-    stamp = sersic_image((y1 - y0 + 1, x1 - x0 + 1), x=x - x0, y=y - y0, theta=theta, **options)
+    stamp = sersic_image(
+        (y1 - y0 + 1, x1 - x0 + 1),
+        x=x - x0,
+        y=y - y0,
+        theta=theta,
+        total_flux=total_flux,
+        r_eff=r_eff,
+        n=n,
+        axis_ratio=axis_ratio,
+    )
     return stamp, (y0, x0)

@@ -102,8 +102,15 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
                 i = round(x)
                 j = round(y)
                 v, u = np.mgrid[j - half : j + half + 1, i - half : i + half + 1]
-                stamp = np.where(use, data, 0.0)[v, u], sigma[v, u]
-                star_stamps.append(Star(*stamp, (u - x) * cells, (v - y) * cells, area=cells**2))
+                star_stamps.append(
+                    Star(
+                        np.where(use, data, 0.0)[v, u],
+                        sigma[v, u],
+                        (u - x) * cells,
+                        (v - y) * cells,
+                        area=cells**2,
+                    )
+                )
     check_that(star_stamps, "stars", "at least one with its stamp on an image", f"{wanted} without")
     fit = StarPSF(psf.data / cells**2, star_stamps)
     meta = {

@@ -126,8 +126,15 @@ def write_samples(samples, path, *, overwrite=False):
     for i, axis in enumerate(samples.axes.values()):
         if axis.share is not None:
             shares[f"SHARE{i}"] = np.asarray(axis.share, dtype=float)
-    parts = {"text": text, "arrays": shares, "tables": {"SAMPLES": table}}
-    write_parts(path, _SAMPLES, shown=samples.to_table(), **parts, overwrite=overwrite)
+    write_parts(
+        path,
+        _SAMPLES,
+        shown=samples.to_table(),
+        text=text,
+        arrays=shares,
+        tables={"SAMPLES": table},
+        overwrite=overwrite,
+    )
 
 
 def read_samples(path, grid, *, model=None):

@@ -33,8 +33,14 @@ def members(path, accept):
                 yield PurePosixPath(file.as_posix()), file.read_bytes(), str(file)
         return
     n_bytes = 0
-    damage = zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error
-    with file_errors(path, "is a truncated or damaged archive", *damage):
+    with file_errors(
+        path,
+        "is a truncated or damaged archive",
+        zipfile.BadZipFile,
+        tarfile.TarError,
+        EOFError,
+        zlib.error,
+    ):
         for place, size, read in _zipped(path) if zipfile.is_zipfile(path) else _tarred(path):
             if accept(place.name):
                 n_bytes += size

@@ -61,8 +61,17 @@ def spectra_figure(study, key, model):
         if wave.min() < place < wave.max():
             for axis in (ax, lower):
                 axis.axvline(place, color=TRUE, lw=0.7, ls=":")
-            at_top = {"transform": ax.get_xaxis_transform(), "ha": "right", "va": "top"}
-            ax.text(place, 0.98, f"{wavelength:g}", rotation=90, fontsize=7, color=TRUE, **at_top)
+            ax.text(
+                place,
+                0.98,
+                f"{wavelength:g}",
+                rotation=90,
+                fontsize=7,
+                color=TRUE,
+                transform=ax.get_xaxis_transform(),
+                ha="right",
+                va="top",
+            )
     ax.set_title(f"z = {redshift:g}", fontsize="medium")
     ax.set_xlabel("")
     lower.set_xlabel("observed wavelength (µm)")

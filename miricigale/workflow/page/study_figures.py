@@ -149,8 +149,16 @@ def histogram_figure(study, quantity):
                 if true is not None and true > 0.5:
                     x = 0.03
                     side = "left"
-                at = {"transform": ax.transAxes, "va": "top", "ha": side, "fontsize": 7.5}
-                ax.text(x, 0.97 - 0.2 * k, note, color=color, **at)
+                ax.text(
+                    x,
+                    0.97 - 0.2 * k,
+                    note,
+                    color=color,
+                    transform=ax.transAxes,
+                    va="top",
+                    ha=side,
+                    fontsize=7.5,
+                )
         if true is not None:
             ax.axvline(true, color=TRUE, lw=1, ls="--", label="truth")
         # space for the numbers
@@ -281,8 +289,16 @@ def detection_figure(study):
     )
     for k, (name, rows) in enumerate(groups.items()):
         color, marker = STYLES[k]
-        style = {"ms": 3 + 2.5 * k, "color": color, "mfc": "none" if k else color, "alpha": 0.75}
-        ax.plot(z[good & rows], power[good & rows], marker, label=name, **style)
+        ax.plot(
+            z[good & rows],
+            power[good & rows],
+            marker,
+            label=name,
+            ms=3 + 2.5 * k,
+            color=color,
+            mfc="none" if k else color,
+            alpha=0.75,
+        )
     if good.any():
         low, high = np.percentile(power[good], [1, 100])
         ax.set(xlim=(0, 1.03 * z[good].max()), ylim=(0.5 * low, 2 * high))
