@@ -123,6 +123,8 @@ def light_on_file(file, sources, flux, psf, n_threads=None):
     # the middle of the first of the repeated pixels, in those of the file
     middle = np.array(header.wcs.world_to_pixel(image.wcs.pixel_to_world(0, 0)))
     x, y = np.rint(middle - (n - 1) / 2).astype(int)
-    every = np.zeros(header.shape)
-    every[y : y + n * light.shape[0], x : x + n * light.shape[1]] = np.kron(light, np.ones((n, n)))
-    return every
+    file_light = np.zeros(header.shape)
+    file_light[y : y + n * light.shape[0], x : x + n * light.shape[1]] = np.kron(
+        light, np.ones((n, n))
+    )
+    return file_light

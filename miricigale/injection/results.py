@@ -250,10 +250,10 @@ class InjectionResult(Interactive):
         negative = np.asarray(self.detections["negative"])[member]
         n_negative = int(np.count_nonzero(negative))
         n_positive = len(negative) - n_negative
-        fewest, most = poisson_conf_interval(n_negative, interval="frequentist-confidence")
+        smallest, largest = poisson_conf_interval(n_negative, interval="frequentist-confidence")
         row = {"name": name, "low": low, "high": high}
         row |= {"n_positive": n_positive, "n_negative": n_negative}
-        counts = {"purity": n_negative, "purity_low": most, "purity_high": fewest}
+        counts = {"purity": n_negative, "purity_low": largest, "purity_high": smallest}
         for column, n in counts.items():
             if n_positive:
                 row[column] = 1.0 - n / n_positive

@@ -312,10 +312,10 @@ def run_trial(field, injection, base, sources, image_file):
         sources["flux"].to_value(FNU), base.facts["fwhm"] * ANGLE,
     )  # fmt: skip
     rows["detected"] = partners >= 0
-    rows["flux_detected"] = _taken(fluxes, partners) * FNU
+    rows["flux_detected"] = _values_of_rows(fluxes, partners) * FNU
     rows["in_prior"] = measured.rows >= 0
     for name in ("flux", "flux_err"):
-        rows[name] = _taken(getattr(result, name).to_value(FNU), measured.rows) * FNU
+        rows[name] = _values_of_rows(getattr(result, name).to_value(FNU), measured.rows) * FNU
     rows["flags"] = np.where(measured.rows >= 0, result.flags[measured.rows], 0)
     rows["template"] = np.where(measured.rows >= 0, result.template[measured.rows], "none")
     rows["recovered"] = rows["flux"] > injection.threshold * rows["flux_err"]
@@ -346,7 +346,7 @@ def place_names(xy, shape):
     return np.array(PLACES)[3 * row + column]
 
 
-def _taken(values, rows):
+def _values_of_rows(values, rows):
     """Return the values of rows; NaN for those of -1."""
     labels = np.full(len(rows), np.nan)
     labels[rows >= 0] = np.asarray(values)[rows[rows >= 0]]

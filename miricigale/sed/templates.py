@@ -92,7 +92,7 @@ def _read_file(file):
     gravities = [name for name in fluxes if re.fullmatch(r"g\d\d", name)]
     with file_errors(file, "cannot be read as a spectrum"):
         # NaN where a value is lacking, which is none of a spectrum
-        units = _stated(file, table)
+        units = _stated_units(file, table)
         wave_unit = units[0] or u.AA
         wave = plain_floats(table[first], first, "spectrum")
         wave = wave * unit_of_wavelengths(table[first].unit or wave_unit)
@@ -119,7 +119,7 @@ def _read_file(file):
         return out
 
 
-def _stated(file, table):
+def _stated_units(file, table):
     """Units of wavelengths and fluxes in the comments of a text; None for those of columns that have their own."""
     if any(column.unit is not None for column in table.itercols()):
         return None, None

@@ -55,7 +55,7 @@ def _with_tuples(values):
     return restored
 
 
-def _plain(value):
+def _plain_value(value):
     """Return a value that JSON does not know in a form that it does; `_restored` takes it back."""
     if isinstance(value, u.Quantity):
         return {"value": float(value.value), "unit": value.unit.to_string()}
@@ -72,7 +72,7 @@ def _plain(value):
 
 
 def _restored(values):
-    """Return what `_plain` made plain."""
+    """Return what `_plain_value` made plain."""
     if values.keys() == {"value", "unit"}:
         return values["value"] * u.Unit(values["unit"])
     if "of" not in values:
@@ -96,7 +96,7 @@ def as_text(value):
     text : str
         JSON, the same for the same settings; paths of images are absolute.
     """
-    return json.dumps(value, default=_plain, sort_keys=True)
+    return json.dumps(value, default=_plain_value, sort_keys=True)
 
 
 def from_text(text):

@@ -117,10 +117,10 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None, browser=
     if browser is not None and len(all_numbers):
         title = f"Fits of {Path(path).name}"
         name = write_browser(browser, title, results, all_numbers, curves, step=step)
-        every = step * browser_step(len(all_numbers))
+        step_of_page = step * browser_step(len(all_numbers))
         shown = "all objects"
-        if every > 1:
-            shown = f"one object in {every}"
+        if step_of_page > 1:
+            shown = f"one object in {step_of_page}"
         page.text("browser", browser=Link("one by one", name), shown=shown)
     if columns is not None:
         classes_section(page, columns, list(classes), all_numbers["ids"])

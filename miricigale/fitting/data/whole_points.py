@@ -72,16 +72,16 @@ class WholePoints:
             limited = usable & (point[:, LIMIT] > 0)
             measured = usable & ~limited
             total_limited = data.limit[:, band]
-            both = measured & ~total_limited
-            mean, mean_sigma, difference, error = _mean(point[both], data, both, band)
-            flux[both, band] = mean
-            sigma[both, band] = mean_sigma
-            wide = np.hypot(_WIDE * error, point[both, FLUX])
-            log_density[both] += np.logaddexp(
+            is_paired = measured & ~total_limited
+            mean, mean_sigma, difference, error = _mean(point[is_paired], data, is_paired, band)
+            flux[is_paired, band] = mean
+            sigma[is_paired, band] = mean_sigma
+            wide = np.hypot(_WIDE * error, point[is_paired, FLUX])
+            log_density[is_paired] += np.logaddexp(
                 _log(1.0 - part[band]) + _log_normal(difference, error),
                 _log(part[band]) + _log_normal(difference, wide),
             )
-            chi2[both] += np.square(difference / error)
+            chi2[is_paired] += np.square(difference / error)
             # a flux takes the place of a limit, which it keeps or not
             below = measured & total_limited
             apart = data.flux[below, band] - point[below, FLUX]

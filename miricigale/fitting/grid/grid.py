@@ -310,10 +310,10 @@ class GridEngine(Frozen):
                 )
             of_all = target
             tables, target, log_norm = self._of_masses(target, workspace[2])
-            given = tables, self._scales, self._request, target, limits
+            arguments = tables, self._scales, self._request, target, limits
             sums.draws.state[0] = seeds[i]
             _core.clear(sums)
-            if target.norm[0] > 0.0 and _core.sum_up(*given, *workspace, single=single):
+            if target.norm[0] > 0.0 and _core.sum_up(*arguments, *workspace, single=single):
                 self._summarize(stated, target, limits, sums, out, i)
                 if broad is not None:
                     in_fit = np.isfinite(sigma[i]) | (inverse[i] > 0)

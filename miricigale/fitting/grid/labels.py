@@ -180,8 +180,8 @@ def labels_of_ranges(labels):
         codes = np.unique(code)
         if len(codes) < 2:
             continue
-        for each in codes:
-            members.append(np.flatnonzero(code == each))
+        for range_code in codes:
+            members.append(np.flatnonzero(code == range_code))
     return members
 
 

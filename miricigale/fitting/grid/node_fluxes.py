@@ -101,8 +101,8 @@ class FluxMoments:
         index = start.index
         share = np.exp(start.log_weight - start.log_weight.max())
         share /= share.sum()
-        used = np.isfinite(self.sigma[row])
-        flux = np.where(used, self.flux[row], 0.0)
+        is_used = np.isfinite(self.sigma[row])
+        flux = np.where(is_used, self.flux[row], 0.0)
         template_error = engine.template_error[index[:, 0]] * flux
         total_variance = np.square(self.sigma[row]) + np.square(template_error)
         weight = 1.0 / total_variance
@@ -112,7 +112,7 @@ class FluxMoments:
         scaled = scale[:, None] * model
         chi2 = np.sum(weight * np.square(flux - scaled), axis=1)
         # -2 ln(likelihood), for errors differ between redshifts
-        best = np.argmin(chi2 + np.sum(np.log(total_variance[:, used]), axis=1))
+        best = np.argmin(chi2 + np.sum(np.log(total_variance[:, is_used]), axis=1))
         mean = share @ scaled
         variance = share @ np.square(scaled - mean)
         if engine.scale_error:
@@ -158,7 +158,7 @@ class _ScanTask(Frozen):
         return moments
 
 
-def _without_wrong_bands(engine, used):
+def _without_wrong_bands(engine, has_data):
     """
     Return the engine for photometry none of whose bands may be wrong; None if some of them may be.
 
@@ -166,12 +166,12 @@ def _without_wrong_bands(engine, used):
     """
     if engine.mixture is None:
         return engine
-    if np.any(engine.mixture.part[used] > 0):
+    if np.any(engine.mixture.part[has_data] > 0):
         return None
-    plain = dataclasses.replace(engine, mixture=None)
+    plain_engine = dataclasses.replace(engine, mixture=None)
     # tables do not depend on it
-    plain.__dict__["tables"] = engine.tables
-    return plain
+    plain_engine.__dict__["tables"] = engine.tables
+    return plain_engine
 
 
 def flux_moments(fitter, table, *, redshift=None, redshift_prior=None, executor=None):
@@ -214,13 +214,13 @@ def flux_moments(fitter, table, *, redshift=None, redshift_prior=None, executor=
             scanned = parallel_map(task, items, executor=executor)
         for piece, piece_moments in zip(pieces, scanned, strict=True):
             moments.put(piece, piece_moments)
-    others = np.flatnonzero(~moments.fitted)
-    if others.size:
+    other_rows = np.flatnonzero(~moments.fitted)
+    if other_rows.size:
         options = {"executor": executor}
         if redshift is not None:
-            options["redshift"] = np.asarray(redshift)[others]
+            options["redshift"] = np.asarray(redshift)[other_rows]
         if redshift_prior is not None:
             nodes, density = redshift_prior
-            options["redshift_prior"] = (nodes, np.asarray(density)[others])
-        moments.put_results(others, fitter.fit(table[others], **options))
+            options["redshift_prior"] = (nodes, np.asarray(density)[other_rows])
+        moments.put_results(other_rows, fitter.fit(table[other_rows], **options))
     return moments

@@ -76,8 +76,8 @@ def thinned(index, weight, always, most):
     large = (weight > level) | always
     upto = np.cumsum(np.where(large, 0.0, weight)) / level
     steps = np.floor(upto + 0.5)
-    taken = np.diff(steps, prepend=0.0) > 0
-    chosen = large | taken
+    is_taken = np.diff(steps, prepend=0.0) > 0
+    chosen = large | is_taken
     return index[chosen], np.where(large, weight, level)[chosen]
 
 

@@ -86,10 +86,10 @@ class RelativeErrors(Frozen):
 
     def _expected(self, data, log_prior, is_other):
         """Return the fluxes that all bands say together, shape (n, nb); NaN of objects that no model fits."""
-        others = data._changed(
+        other_bands = data._changed(
             sigma=np.where(is_other, data.sigma, np.inf), limit=np.zeros_like(data.limit)
         )
-        moments = FluxMoments.of_data(others, self.engine.grid.filters)
+        moments = FluxMoments.of_data(other_bands, self.engine.grid.filters)
         nodes = None
         if data.redshift is not None and self.engine.grid.redshift.size > 1:
             nodes = np.argmax(log_prior, axis=1)
@@ -105,7 +105,7 @@ class RelativeErrors(Frozen):
                 start.index[:, 0] = nodes[row]
             moments.put_draws(self.engine, row, start)
 
-        self._scan.fit(**others.of_engine(log_prior), each=put, nodes=nodes)
+        self._scan.fit(**other_bands.of_engine(log_prior), each=put, nodes=nodes)
         return self._weighted(data, moments)
 
     def _weighted(self, data, moments):

@@ -145,8 +145,8 @@ def _patch_products(context, truth, patch):
 
 def _save_metrics(context, metrics):
     """Save the numbers as JSON, with null for NaN, which JSON does not know."""
-    plain = json.loads(json.dumps(metrics), parse_constant=lambda _: None)
-    text = json.dumps(plain, indent=1)
+    values = json.loads(json.dumps(metrics), parse_constant=lambda _: None)
+    text = json.dumps(values, indent=1)
     context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
 
 

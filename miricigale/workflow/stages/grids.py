@@ -41,7 +41,7 @@ class SkyPatch(NamedTuple):
 
 
 @cached(maxsize=8, copies=True)
-def _whole(key, pixel_scale):
+def _field_wcs(key, pixel_scale):
     """Return the WCS of the whole field on pixels of a scale (arcsec)."""
     return mosaic_wcs(list(all_exposures(*key).values()), pixel_scale * u.arcsec)
 
@@ -56,7 +56,7 @@ def _patches(key, options, pixel_scale):
     from miricigale.photometry.commands.patches import PatchGrid
 
     exposures = all_exposures(*key)
-    wcs = _whole(key, pixel_scale)
+    wcs = _field_wcs(key, pixel_scale)
     side = math.ceil(options.size / pixel_scale)
     rim = math.ceil(options.overlap / pixel_scale)
     nx, ny = wcs.pixel_shape
@@ -125,14 +125,14 @@ def of_patch(name, patch):
 def grid_of(config, pixel_scale, patch=""):
     """Return the north-up WCS that covers every exposure of the study, or a patch of it with its overlap."""
     key = exposure_sections(config)
-    field = _whole(key, pixel_scale)
+    field = _field_wcs(key, pixel_scale)
     if not patch:
         return field
     box = study_patches(config)[patch].box
     if pixel_scale != config.highres.pixel_scale:
         from miricigale.photometry.commands.patches import seen_part
 
-        prior = _whole(key, config.highres.pixel_scale)
+        prior = _field_wcs(key, config.highres.pixel_scale)
         box = seen_part(box, prior, field, field.pixel_shape[::-1])
     wcs = field[box]
     rows, columns = box
