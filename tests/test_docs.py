@@ -31,6 +31,8 @@ SMALLER = {
     "how_to/measure/image_offsets": {"size=50 ": "size=36 "},
     "how_to/measure/large_mosaic": {"size=30 ": "size=18 ", "patch_size=300": "patch_size=180"},
     "how_to/run/agn_classes": {"n = 150": "n = 50"},
+    "how_to/run/cluster": {"n = 60": "n = 20"},
+    "how_to/run/compare_with_truth": {"n = 100": "n = 30", "size=20 ": "size=16 "},
     "tutorials/agn_from_images": {
         "width = 45 ": "width = 27 ",
         "n_injections=24": "n_injections=8",
