@@ -218,6 +218,7 @@ def test_posteriors_in_bins_are_those_of_the_fit(model, photometry, tmp_path):
     assert np.all(np.isnan(on_nodes.fit(photometry[:1]).agn_weights))
 
 
+@pytest.mark.slow
 def test_all_agn_are_counted_where_there_is_no_doubt(result, truth):
     survey, _ = result
     above = survey.totals[survey.totals["frac_agn"] == 0.4]
@@ -232,6 +233,7 @@ def test_all_agn_are_counted_where_there_is_no_doubt(result, truth):
     assert number == pytest.approx(N_AGN, abs=1)
 
 
+@pytest.mark.slow
 def test_bright_agn_are_complete_and_others_are_pure(result):
     survey, _ = result
     bright = survey.numbers[-1]
@@ -246,6 +248,7 @@ def test_bright_agn_are_complete_and_others_are_pure(result):
     np.testing.assert_allclose(survey.numbers["purity"][some], 1.0, atol=0.02)
 
 
+@pytest.mark.slow
 def test_injected_agn_are_found_at_their_luminosities(result):
     injected = result[0].injected
     good = (injected["frac_agn"] > 0.3) & (injected["frac_agn"] < 0.85)
@@ -254,6 +257,7 @@ def test_injected_agn_are_found_at_their_luminosities(result):
     assert np.all(np.abs(apart) < 0.15)
 
 
+@pytest.mark.slow
 def test_workers_and_a_second_call_change_no_byte(result, run):
     _, first = result
     with threads(2) as executor:
@@ -271,6 +275,7 @@ def test_workers_and_a_second_call_change_no_byte(result, run):
         assert words in page
 
 
+@pytest.mark.slow
 def test_injected_agn_are_in_the_nuclei_that_were_measured(model, truth, photometry, tmp_path):
     host = truth.copy()
     host["frac_agn"] = 0.0
@@ -326,6 +331,7 @@ class StubImages:
         return table
 
 
+@pytest.mark.slow
 def test_injected_agn_are_measured_on_images(run, model, tmp_path):
     catalog = run("first")[1].parent / "catalog.ecsv"
     survey = AGNSurvey(

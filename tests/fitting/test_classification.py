@@ -220,6 +220,7 @@ def test_little_red_dots_are_no_dwarfs(fitters):
     assert np.sum(compare_classes(found)["class"] == "galaxy") >= 38
 
 
+@pytest.mark.slow
 def test_tables_of_classes_are_the_same_in_parquet(fitters, tmp_path):
     pytest.importorskip("pyarrow")
     data = sources(2, 5)

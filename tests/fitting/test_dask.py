@@ -102,7 +102,6 @@ def test_two_dask_workers_give_the_numbers_of_one_process(
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_workers_that_are_left_or_start_later_keep_a_function():
     """Seconds after it was sent, when dask has taken back copies of data, with one worker after the other lost."""
     distributed = pytest.importorskip("distributed")
@@ -121,6 +120,7 @@ def test_workers_that_are_left_or_start_later_keep_a_function():
         assert not any(kept.values())
 
 
+@pytest.mark.slow
 def test_processes_get_the_grid_once(fitter, photometry, whole, process):
     assert len(pickle.dumps(fitter)) > 400_000
     process.n_bytes.clear()

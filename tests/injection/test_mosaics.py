@@ -339,6 +339,7 @@ def test_sources_without_room_are_refused(folder, tmp_path):
         injection.run(image_of(folder), folder=tmp_path / "full")
 
 
+@pytest.mark.slow
 def test_own_sources_are_injected_in_turn_where_the_image_has_data(folder, tmp_path):
     own = points(np.random.default_rng(3), -1.6, 0.6, 6)
     own["sky"] = places([0.0, 60.0, -4.0, 4.0, 4.0, -60.0], [0.0, 0.0, 4.0, 4.0, -4.0, 0.0])

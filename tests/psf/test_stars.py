@@ -73,6 +73,7 @@ def measured(model, field):
     return psf_from_stars(images, tables, model)
 
 
+@pytest.mark.slow
 def test_width_and_energy_come_back(truth, model, measured):
     assert fwhm(model) < 0.96 * fwhm(truth)
     assert fwhm(measured).value == pytest.approx(fwhm(truth).value, rel=0.01)
@@ -88,6 +89,7 @@ def test_width_and_energy_come_back(truth, model, measured):
     assert abs(flux[1]) < min(0.01, 2.5 * measured.meta["flux_err"])
 
 
+@pytest.mark.slow
 def test_meta_says_where_it_comes_from(measured):
     meta = measured.meta
     assert (meta["n_images"], meta["n_stamps"], meta["n_left_out"]) == (7, 63, 0)

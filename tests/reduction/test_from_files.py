@@ -120,6 +120,7 @@ def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
         assert mosaic.image.pixel_scale.to_value(u.arcsec) == pytest.approx(scale, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_backgrounds_of_dithers_are_those_of_the_classes(files, tmp_path):
     reducer = Reducer(background=BackgroundSettings("dithers"))
     table = reduce_files(files[:3], tmp_path, reducer=reducer)
