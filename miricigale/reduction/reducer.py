@@ -166,12 +166,15 @@ class Reducer(Interactive):
         """
         Fit the ramps of an exposure, with every plane of the result.
 
-        ``ramp`` and ``progress_bar`` are as for `fit_ramp`.
+        Parameters
+        ----------
+        ramp, progress_bar
+            As for `fit_ramp`.
 
         Returns
         -------
         fit : `RampFit`
-            Slope, Poisson and read variance, groups used, jumps, flags.
+            Slope (DN/s), Poisson and read variance, groups used, jumps, flags.
 
         Raises
         ------
@@ -291,6 +294,7 @@ class Reducer(Interactive):
         Returns
         -------
         image : `~astropy.nddata.CCDData`
+            MJy/sr, without its background.
         background : `Background`
             What was taken off, a level of 0 if it is not known.
         """
@@ -312,7 +316,9 @@ class Reducer(Interactive):
         Returns
         -------
         images : list of `~astropy.nddata.CCDData`
+            MJy/sr, background subtracted.
         backgrounds : list of `Background`
+            What was taken off each.
         """
         return subtract_dithers(self, list(images), wcs=wcs)
 
@@ -355,11 +361,17 @@ class Reducer(Interactive):
         """
         Drizzle images onto one grid, with every plane of the result.
 
-        Parameters are those of `mosaic`.
+        Parameters
+        ----------
+        images : iterable of `~astropy.nddata.CCDData`
+            As for `mosaic`.
+        wcs : `~astropy.wcs.WCS`
+            Of the output, with ``pixel_shape``.
 
         Returns
         -------
         mosaic : `Mosaic`
+            Surface brightness (MJy/sr), weights, number of images of each pixel.
         images : list of `~astropy.nddata.CCDData`
             The inputs with outliers masked.
         """
