@@ -13,7 +13,19 @@ _ARROW = {"fmt": "_", "uplims": True, "color": "tab:blue", "markersize": 10, "zo
 #: Colors and markers of groups of bands, which differ in shade too.
 _GROUPS = (("tab:blue", "o"), ("#9a3412", "D"), ("0.35", "^"))
 #: Colors and styles of spectra.
-_SPECTRA = (("0.45", "-"), ("#1d4ed8", ":"), ("C1", "--"), ("C2", "-."))
+_SPECTRA = (
+    ("0.25", "-"),
+    ("#1d4ed8", ":"),
+    ("C1", "--"),
+    ("C2", "-."),
+    ("C3", "-"),
+    ("C4", "--"),
+    ("C5", "-."),
+    ("C6", ":"),
+    ("C8", "-"),
+)
+#: Wavelengths in um that an axis of photometry is labeled with.
+_WAVELENGTHS = np.array([0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000])
 
 
 def _value(quantity, unit=None):
@@ -149,6 +161,7 @@ def plot_sed_fit(
     spectrum=None,
     parts=None,
     groups=None,
+    measured_err=None,
     ax=None,
     title=None,
 ):
@@ -175,6 +188,9 @@ def plot_sed_fit(
     groups : array_like of str, shape (n,), optional
         Label of each measured band; labels differ in color and marker. With ``parts`` or
         ``groups`` there is a legend.
+    measured_err : `~astropy.units.Quantity`, shape (n,), optional
+        Errors as they were measured, drawn as heavy bars over those of ``flux_err``, which are larger by the
+        errors of the model and the calibration.
     ax : `~matplotlib.axes.Axes` or pair of them, optional
         Where to draw. One gets no residuals; without, a new figure is made.
     title : str, optional
@@ -197,6 +213,9 @@ def plot_sed_fit(
     flux = _value(flux, u.uJy)
     err = _value(flux_err, u.uJy)
     model = _value(model_flux, u.uJy)
+    measured = None
+    if measured_err is not None:
+        measured = _value(measured_err, u.uJy)
     is_used = row_mask(used, wave.size, True)
     limit = row_mask(limit, wave.size, False)
     have = np.isfinite(flux) & np.isfinite(err)
@@ -219,10 +238,14 @@ def plot_sed_fit(
     for rows, label, style in points:
         rows = rows & have & (flux > 0)
         ax.errorbar(wave[rows], flux[rows], err[rows], zorder=4, label=label, **style)
+        if measured is not None:
+            heavy = {"fmt": "none", "ecolor": style["color"], "elinewidth": 3.0, "zorder": 4}
+            ax.errorbar(wave[rows], flux[rows], measured[rows], **heavy)
     negative = have & ~(flux > 0) & ~limit
     bound = have & limit
     _draw_undetected(ax, wave, flux, err, low, negative, bound)
     ax.set(xscale="log", xlim=(0.7 * wave.min(), 1.4 * wave.max()))
+    _label_wavelengths(ax)
     ax.set(yscale="log", ylim=(low, high), ylabel="flux density (µJy)")
     if parts or groups is not None:
         legend(ax)
@@ -236,6 +259,14 @@ def plot_sed_fit(
     pull = np.where(with_error, (flux - model) / np.where(with_error, err, 1.0), np.nan)
     _draw_residuals(residual_ax, wave, pull, points, bound)
     return AxesArray([ax, residual_ax])
+
+
+def _label_wavelengths(ax):
+    """Label a logarithmic axis of wavelengths in um with plain numbers."""
+    low, high = ax.get_xlim()
+    shown = _WAVELENGTHS[(_WAVELENGTHS >= low) & (_WAVELENGTHS <= high)]
+    ax.set_xticks(shown, [f"{wave:g}" for wave in shown])
+    ax.tick_params(axis="x", which="minor", labelbottom=False)
 
 
 def _flux_range(flux, model):
@@ -284,7 +315,7 @@ def _draw_residuals(ax, wave, pull, points, limit):
 def _points(groups, is_used, limit):
     """Return the rows, label and style of the measured bands of each group, fitted (full) and not (open)."""
     if groups is None:
-        names = np.full(is_used.size, "")
+        names = np.full(is_used.size, "measured")
     else:
         names = np.asarray(groups, str)
     points = []

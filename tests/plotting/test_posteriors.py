@@ -98,6 +98,12 @@ def test_photometry_with_and_without_residuals(ax, pair):
     assert top.get_title() == "x"
     assert plot_sed_fit(WAVE, flux, err, model, ax=ax) is ax
     assert ax.get_legend() is None
+    # the errors of the measurement are heavy bars over those of the fit
+    ax.clear()
+    plot_sed_fit(WAVE, flux, err, model, measured_err=0.5 * err, ax=ax)
+    (_, low, high), (_, measured_low, measured_high) = error_bars(ax)[:2]
+    assert_allclose((low, high), ([0.9], [1.1]))
+    assert_allclose((measured_low, measured_high), ([0.95], [1.05]))
 
 
 def test_photometry_without_axes_gets_a_figure_of_two():

@@ -99,7 +99,8 @@ def plot_sed(results, ax=None, *, model=None, filters=None, components=False, **
     """
     Draw photometry, upper limits (as arrows), best model and residuals of a single object.
 
-    Bands that are wrong with a probability above a half have another symbol.
+    Heavy bars are the measured errors, light ones those of the fit, with the errors of the model and the
+    calibration. Bands that are wrong with a probability above a half have another symbol.
 
     Parameters
     ----------
@@ -137,8 +138,9 @@ def plot_sed(results, ax=None, *, model=None, filters=None, components=False, **
             kwargs.setdefault("parts", parts)
     in_fit = np.isfinite(results.sigma)
     if results.outlier is not None and np.any(results.outlier > 0.5):
-        kwargs.setdefault("groups", np.where(results.outlier > 0.5, "looks wrong", "fluxes"))
+        kwargs.setdefault("groups", np.where(results.outlier > 0.5, "looks wrong", "measured"))
     text = f"{plain_text(results.ids)}: z = {results.best['redshift'].value:.3f}"
+    kwargs.setdefault("measured_err", np.maximum(results.flux_err, 0.0) * FNU)
     kwargs.setdefault("title", f"{text}, chi2 = {results.chi2:.1f} in {results.n_bands} bands")
     return plot_sed_fit(
         u.Quantity(filters.pivots)[order],
