@@ -168,8 +168,8 @@ class ShapeFitter(ShapeModels):
             What is known of its shape, at its brightness; `expected` if not given.
         start : `Shape`, optional
             A profile to begin with; several sizes are tried without.
-        beside : `Neighbors`, optional
-            Neighbors that were fitted with it, whose light is taken off.
+        neighbors : `Neighbors`, optional
+            Sources that were fitted with it, whose light is taken off.
         nodes : bool, optional
             Whether it is looked at what else the source may be; otherwise the best profile is returned.
 
