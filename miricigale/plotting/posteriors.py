@@ -25,7 +25,7 @@ _SPECTRA = (
     ("C8", "-"),
 )
 #: Wavelengths in um that an axis of photometry is labeled with.
-_WAVELENGTHS = np.array([0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000])
+_WAVELENGTHS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 def _value(quantity, unit=None):
@@ -264,7 +264,7 @@ def plot_sed_fit(
 def _label_wavelengths(ax):
     """Label a logarithmic axis of wavelengths in um with plain numbers."""
     low, high = ax.get_xlim()
-    shown = _WAVELENGTHS[(_WAVELENGTHS >= low) & (_WAVELENGTHS <= high)]
+    shown = [wave for wave in _WAVELENGTHS if low <= wave <= high]
     ax.set_xticks(shown, [f"{wave:g}" for wave in shown])
     ax.tick_params(axis="x", which="minor", labelbottom=False)
 
