@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import astropy.units as u
 import numpy as np
 from numpy.polynomial import polynomial as poly
 
@@ -12,7 +13,17 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_least, check_positive, check_that
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.units import frozen_array
+from miricigale.utils.units import frozen_array, to_array
+
+#: Units of the figures of a detector, the gain first, which turns electrons into counts.
+_UNITS = {
+    "gain": u.electron / u.adu,
+    "read_noise": u.adu,
+    "dark_current": u.electron / u.s,
+    "full_well": u.electron,
+    "bias": u.adu,
+    "pixel_pitch": u.um,
+}
 
 # Our own detector is one and the same everywhere: its pixels are drawn with this seed
 _SEED = 56075
@@ -25,15 +36,15 @@ class DetectorProperties:
 
     Parameters
     ----------
-    gain : float
+    gain : float or `~astropy.units.Quantity`
         Electrons per DN; one value for noise and photometric conversion.
-    read_noise : float
-        Of one frame, DN.
-    dark_current : float
+    read_noise : float or `~astropy.units.Quantity`
+        Of one frame, DN, or in electrons with a unit.
+    dark_current : float or `~astropy.units.Quantity`
         Electrons per second.
-    full_well : float
+    full_well : float or `~astropy.units.Quantity`
         Electrons.
-    bias : float
+    bias : float or `~astropy.units.Quantity`
         Level of an empty pixel, DN.
     nonlinearity : tuple of float
         Coefficients, lowest power first, of the polynomial that turns measured DN above
@@ -42,7 +53,7 @@ class DetectorProperties:
         Share of a pixel's signal seen by each horizontal, vertical and diagonal neighbor.
     reference_columns : int
         Columns without light on each side of the full frame.
-    pixel_pitch : float
+    pixel_pitch : float or `~astropy.units.Quantity`
         In um.
     cosmic_ray_flux : float
         Hits per um2 per second.
@@ -57,6 +68,8 @@ class DetectorProperties:
     ValueError
         If gain, full well, pixel pitch or bits are not positive, another figure is negative, or the non-linearity
         polynomial does not rise up to the full well.
+    `~astropy.units.UnitsError`
+        If a unit is of something else.
 
     Examples
     --------
@@ -80,6 +93,13 @@ class DetectorProperties:
     response: tuple = ()
 
     def __post_init__(self):
+        for name, unit in _UNITS.items():
+            value = getattr(self, name)
+            if isinstance(value, u.Quantity):
+                number = float(
+                    to_array(value, unit, name, ndim=0, equivalencies=self._counts(unit))
+                )
+                object.__setattr__(self, name, number)
         for name in ("gain", "full_well", "pixel_pitch", "adc_bits"):
             check_positive(getattr(self, name), name)
         for name in ("read_noise", "dark_current", "bias", "cosmic_ray_flux", "reference_columns"):
@@ -102,6 +122,13 @@ class DetectorProperties:
             raise argument_error("nonlinearity", "rising up to the full well", self.nonlinearity)
 
     replace = dataclasses.replace
+
+    def _counts(self, unit):
+        """Equivalencies of counts: DN and adu are the same, and electrons are counts times the gain."""
+        if unit == _UNITS["gain"]:
+            return [(u.electron / u.DN, unit)]
+        gain = self.gain
+        return [(u.DN, u.adu), (u.electron, u.adu, lambda n: n / gain, lambda n: n * gain)]
 
     @property
     def saturation_dn(self):

@@ -2,7 +2,12 @@
 
 import numbers
 
+import numpy as np
+
 from miricigale.utils.exceptions import argument_error, data_error, unknown_name
+
+#: Letters of what came that a message shows; of anything longer it has the class.
+_LONGEST = 80
 
 
 def check_that(good, name, wanted, got):
@@ -76,7 +81,11 @@ def check_names(names, kind, available):
 def check_kind(value, name, kind):
     """Refuse what is neither None nor of a class (a `ValueError`)."""
     if value is not None and not isinstance(value, kind):
-        raise argument_error(name, f"a {kind.__name__}", repr(value))
+        # of arrays and tables the values would fill the screen
+        got = repr(value)
+        if np.ndim(value) > 0 or len(got) > _LONGEST:
+            got = type(value).__name__
+        raise argument_error(name, f"of the class {kind.__name__}", got)
 
 
 def check_type(value, name, kinds, wanted):

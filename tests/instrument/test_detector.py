@@ -1,5 +1,6 @@
 """What the detector is."""
 
+import astropy.units as u
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -42,6 +43,17 @@ def test_linearity_against_a_square_root():
     detector = DetectorProperties(nonlinearity=(0, 1, 1e-6))
     dn = np.linspace(0, 60_000, 50)
     assert_allclose(detector.delinearize(dn), (np.sqrt(1 + 4e-6 * dn) - 1) / 2e-6, atol=1e-6)
+
+
+def test_figures_may_have_units():
+    """Electrons are counts times the gain, and DN the counts of astropy's adu."""
+    gain = 5.5 * u.electron / u.DN
+    detector = DetectorProperties(gain=gain, read_noise=11 * u.electron, bias=9000 * u.DN)
+    assert (detector.gain, detector.read_noise, detector.bias) == (5.5, 2.0, 9000.0)
+    assert detector.replace(full_well=4e4 * u.adu).full_well == 22e4
+    assert detector.replace(pixel_pitch=0.018 * u.mm).pixel_pitch == pytest.approx(18)
+    refuses("'dark_current' must be convertible to electron / s", DetectorProperties,
+            dark_current=1 * u.electron, error=u.UnitsError)  # fmt: skip
 
 
 def test_interpixel_capacitance_moves_and_loses_nothing():
