@@ -28,8 +28,8 @@ from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.photometry.images.sky_noise import warn_of_background
 from miricigale.photometry.templates.placement import Placement
 from miricigale.photometry.templates.sources import SourceTemplates
-from miricigale.psf import KernelField, MatchingKernel, as_kernel
-from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
+from miricigale.psf import MODEL_FILTERS, KernelField, MatchingKernel, as_kernel
+from miricigale.utils.exceptions import PhotometryWarning, PSFWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.named_values import field_values
@@ -374,6 +374,7 @@ class ForcedPhotometer(Interactive):
             wanted = f"{len(self.kernel)} exposures, one for each kernel"
             raise argument_error("image", wanted, "one image")
         image = own_pixels(as_mosaic(image, "image"))
+        self._warn_of_total(image)
         arrays = fit_arrays(image, "image")
         prior, sources = self._sources(image, highres, segmentation, catalog, templates)
         if self.psf_stars is not False and not self.bare:
@@ -406,6 +407,18 @@ class ForcedPhotometer(Interactive):
         if isinstance(self.kernel, SampledPSFs):
             return self.replace(kernel=self.kernel.kernel(image, highres))
         return self
+
+    def _warn_of_total(self, image):
+        """Warn of a PSF that may lack wings, where the model of the image's filter would tell."""
+        kernel = self.kernel
+        filter = image.meta.get("filter")
+        is_assumed = isinstance(kernel, MatchingKernel) and "total_assumed" in kernel.meta
+        if is_assumed and filter in MODEL_FILTERS:
+            msg = (
+                f"the PSF is taken to hold all of the light; ForcedPhotometer(psf=psf, filter={filter!r}) takes "
+                "from the model of the image's filter how much of it such a stamp holds"
+            )
+            warn(msg, PSFWarning)
 
     def _measure_or_find(self, image, templates):
         """

@@ -333,7 +333,7 @@ class ForcedPhotometryResult(Tabular):
         Helene 1983, Nucl. Instr. Meth. 212, 319, eq. 4.
         """
         if not (is_number(confidence) and 0 < confidence < 1):
-            raise argument_error("confidence", "between 0 and 1", confidence)
+            raise argument_error("confidence", "between 0 and 1 (0.9987 for 3 sigma)", confidence)
         return self.flux - ndtri((1 - confidence) * ndtr(self.snr)) * self.flux_err
 
     def _row(self, key):

@@ -6,6 +6,7 @@ from typing import ClassVar
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
+from astropy.table import Table
 from photutils.psf import ImagePSF
 from photutils.segmentation import SegmentationImage
 
@@ -17,7 +18,7 @@ from miricigale.photometry.detection.catalogs import (
     sersic_rows,
 )
 from miricigale.photometry.detection.cutouts import Cutout, own_segments, saturated_cores
-from miricigale.photometry.detection.prior_catalog import check_labels
+from miricigale.photometry.detection.prior_catalog import check_labels, read_catalog
 from miricigale.photometry.images.arrays import (
     image_arrays,
     nearest_values,
@@ -223,10 +224,10 @@ class SourceTemplates:
 
         Parameters
         ----------
-        catalog : `~astropy.table.QTable`
-            As for `from_images`; for profiles with ``half_light_radius``, ``sersic_index``,
-            ``axis_ratio`` and ``position_angle``, and if there is one ``profile``: rows in
-            which it is not ``"sersic"`` are points.
+        catalog : `~astropy.table.QTable`, path-like or other
+            As for `from_images`, or with positions as `ForcedPhotometer.measure` takes them. For profiles with
+            ``half_light_radius``, ``sersic_index``, ``axis_ratio`` and ``position_angle``, and if there is one
+            ``profile``: rows in which it is not ``"sersic"`` are points.
         template : {"psf", "sersic"}, optional
             Which of the two.
         wcs : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or image, optional
@@ -243,6 +244,9 @@ class SourceTemplates:
             If an input does not fit; the message says which.
         """
         check_choice(template, "template", ("psf", "sersic"))
+        has_positions = isinstance(catalog, Table) and "sky" in catalog.colnames
+        if not has_positions:
+            catalog = read_catalog(catalog, wcs)
         columns = catalog_sources(catalog)
         rows = None
         if template == "sersic":
