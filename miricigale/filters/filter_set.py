@@ -15,6 +15,7 @@ from miricigale.filters.spectra import are_spectra, check_wave, spectrum_arrays
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import FNU, WAVE, ab_magnitude
 
 
@@ -163,6 +164,7 @@ class FilterSet(WithTable):
             weights.append(band.weights(wave, tolerance=tolerance))
         return np.stack(weights)
 
+    @takes_other_keywords
     def synthetic_fluxes(self, sed, flux=None):
         """
         Return the mean flux densities of a spectrum; see `Filter.synthetic_flux`.
@@ -190,6 +192,7 @@ class FilterSet(WithTable):
         wave, fnu = spectrum_arrays(sed if flux is None else (sed, flux), self.filters)
         return self.weights(wave) @ fnu * FNU
 
+    @takes_other_keywords
     def synthetic_magnitudes(self, sed, flux=None):
         """Return the AB magnitudes of a spectrum, NaN where the flux is not positive; see `synthetic_fluxes`."""
         return ab_magnitude(self.synthetic_fluxes(sed, flux)) * u.ABmag

@@ -484,7 +484,10 @@ class SEDModel(Interactive):
         """
         if values is not None:
             check_that(
-                isinstance(values, Mapping), "values", "a dict of parameters by name", repr(values)
+                isinstance(values, Mapping),
+                "values",
+                "a dict of parameters by name",
+                self._columns_in_words(values),
             )
             twice = sorted(set(values) & set(parameters))
             check_that(not twice, "values", "without those given by keyword", twice)
@@ -494,6 +497,15 @@ class SEDModel(Interactive):
         return tables.spectra(self, self.values(parameters))
 
     __call__ = evaluate
+
+    def _columns_in_words(self, values):
+        """Say what is no dict of parameters; of a table, the call that takes its columns."""
+        columns = getattr(values, "colnames", getattr(values, "columns", None))
+        if columns is None:
+            return repr(values)
+        names = [name for name in columns if name in self.parameters]
+        columns = ", ".join(f"{name}=table[{name!r}]" for name in names)
+        return f"a {type(values).__name__}: evaluate({columns}) takes its columns"
 
     def derived(self, **parameters):
         """Return the derived quantities of one model: dict of name to `~astropy.units.Quantity`."""

@@ -24,7 +24,7 @@ from miricigale import photometry, psf
 #: What the calls name besides the objects of the fixture.
 MODULES = {
     "copy": copy, "pickle": pickle, "pd": pd, "np": np, "u": u, "m": m, "psf": psf,
-    "photometry": photometry, "Table": Table, "NDData": NDData, "MoffatPSF": MoffatPSF,
+    "photometry": photometry, "Table": Table, "QTable": QTable, "NDData": NDData, "MoffatPSF": MoffatPSF,
     "Gaussian2DKernel": Gaussian2DKernel,
 }  # fmt: skip
 #: Messages of Python about code, which say nothing of what is wanted.
