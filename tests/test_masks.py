@@ -636,6 +636,7 @@ EXEMPT = {
         "instrument.v2v3_to_sky.matrix",
         "instrument.write_image.planes",
         "photometry.MosaicFile.read.added",
+        "photometry.MosaicFile.read.added_variance",
         "photometry.SourceTemplates.drawn.xy",
         "reduction.RampFit.noise_correction.kernel",
         "reduction.Reducer.combine.planes",

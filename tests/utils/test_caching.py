@@ -80,7 +80,7 @@ ELSEWHERE = {
     "workflow.stages.exposures._file_pattern",
     "workflow.stages.exposures._pointings",
     "workflow.stages.exposures.all_exposures",
-    "workflow.stages.grids._whole",
+    "workflow.stages.grids._field_wcs",
     "workflow.stages.grids._patches",
     "psf.miri._miri_data",
     "pages.rendering._environment",
@@ -212,7 +212,7 @@ CALLS = {
     "dust._alpha_tables": lambda: dust._alpha_tables(locate("dust.dl07")),
     "load_lines": lambda: igm.load_lines(locate("igm.inoue2014")),
     "load_nebular": lambda: nebular.load_nebular(locate("nebular.cloudy")),
-    "grids._whole": lambda: grids._whole(exposure_sections(load_config("goodss")), 0.11),
+    "grids._field_wcs": lambda: grids._field_wcs(exposure_sections(load_config("goodss")), 0.11),
     "all_exposures": lambda: all_exposures(*exposure_sections(load_config("goodss"))),
 }
 

@@ -146,7 +146,7 @@ class MockResult:
     >>> mock
     <MockResult of 2 objects, 2 fitted>
     >>> mock.true("redshift").round(2)
-    <Quantity [0.49, 1.01]>
+    <Quantity [0.5, 1. ]>
     """
 
     truth: object
@@ -317,7 +317,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     >>> fitter = BayesFitter(model, bands, axes=axes)
     >>> leave_out(fitter, photometry, ["irac.ch1"]).pull.round(1)
     array([[-1. ],
-           [ 1.5]])
+           [ 1.4]])
     """
     check_type(fitter, "fitter", BayesFitter, "a BayesFitter")
     if isinstance(bands, str) or not len(bands):
