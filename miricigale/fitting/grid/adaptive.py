@@ -26,7 +26,7 @@ ROUND_SIZE = 512
 #: Largest number of places in a round of those that results rest on.
 _MAX_ROUND_SIZE = 2048
 #: Largest number of places for each of the effective number that is wanted.
-_MAX_PLACES_EACH = 60
+_MAX_PLACES_EACH = 80
 #: Smallest value of the largest number of places of an object.
 _MIN_MAX_PLACES = 1 << 14
 #: Number of places that there is memory for to begin with; most objects need no more.
