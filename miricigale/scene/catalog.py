@@ -122,7 +122,8 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
         With positions (see `~miricigale.utils.positions.as_positions`) and fluxes, whose columns are called
         by their filter (``"miri.f770w"``), those of errors end on ``_err``. The other columns of
         `CATALOG_COLUMNS` may be there, ids must (`miricigale.utils.ids.id_column`). Without ``profile`` sources
-        with a complete shape are Sersic profiles and the others points. ``star`` (bool) says which are stars.
+        with a complete shape are Sersic profiles and the others points. Where ``profile`` says ``"sersic"``,
+        radii and indices are needed; profiles are round without ``axis_ratio``. ``star`` (bool) marks stars.
     filters : iterable of str, optional
         Flux columns that must be there.
     wcs : `~astropy.wcs.WCS`, optional
@@ -243,6 +244,17 @@ def _check_stars(star, argument):
 def _fill_columns(table, argument):
     """Add missing columns of redshifts and profiles to a table; yield what has become a point, and why."""
     missing = [name for name in _SHAPE if name not in table.colnames]
+    if "profile" in table.colnames and "sersic" in set(map(str, table["profile"])):
+        if "axis_ratio" in missing:
+            # round, in which case no angle is needed
+            table["axis_ratio"] = 1.0
+            missing.remove("axis_ratio")
+        needed = [name for name in missing if name != "position_angle"]
+        is_round = np.all(plain_floats(table["axis_ratio"], "axis_ratio", argument) == 1.0)
+        if "position_angle" in missing and not is_round:
+            needed.append("position_angle")
+        wanted = f"a table with the columns {needed}, for its Sersic profiles"
+        check_that(not needed, argument, wanted, f"columns {table.colnames}")
     for name in ("redshift", *missing):
         if name not in table.colnames:
             table[name] = np.full(len(table), np.nan) * (CATALOG_COLUMNS[name] or u.one)
