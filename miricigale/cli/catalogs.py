@@ -191,7 +191,13 @@ def _image_paths(args):
     The prior is None where a catalog is given with a single image, or with images by option.
     """
     if args.positional and not (args.image or args.highres):
+        from miricigale.photometry.detection.prior_catalog import is_catalog
+
         *paths, prior = args.positional
+        if paths and args.catalog is None and is_catalog(prior):
+            # a table in the place of the prior
+            args.catalog = prior
+            return paths, None
         if paths:
             return paths, prior
         if args.catalog is not None:

@@ -246,6 +246,7 @@ def _scaled(psf, expected, filter_, argument):
         f"{width:.3g} arcsec, as the model of {filter_} does ({expected:.3f})"
     )
     if abs(enclosed - held) > 0.01:
+        msg += f": fluxes are {held / enclosed:.3f} times those of a PSF that holds {held:.3g}"
         warn(msg, PSFWarning)
     else:
         _log.info(msg)

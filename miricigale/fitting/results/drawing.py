@@ -80,6 +80,10 @@ def best_sed(results, model=None, **changes):
     if model is None:
         model = results.model
     check_that(model is not None, "model", "an SEDModel (these results know none)", "None")
+    wanted = (
+        "an SEDModel (results[0].best_sed() is that of a row, results.best_sed(id) that of an id)"
+    )
+    check_that(hasattr(model, "evaluate"), "model", wanted, repr(model))
     sed = model.evaluate(**best_parameters(results, model) | changes)
     if results.distance is None or not np.isfinite(results.distance) or "redshift" in changes:
         return sed
