@@ -47,8 +47,7 @@ def psf_pair(
     """
     The sharp PSF, of unit sum, and the wide one, of what it holds or of unit sum, on the pixels of an image.
 
-    Two arrays, (n, n), n odd, centered, and ``energy``, ``held`` and ``centering`` of the kernel's meta, with
-    ``total_assumed`` where it is not known what part of the light the wide PSF holds.
+    Two arrays, (n, n), n odd, centered, and ``energy``, ``held`` and ``centering`` of the kernel's meta.
     Parameters are those of `~miricigale.psf.MatchingKernel.from_psfs`, ``scale`` the pixel in arcsec,
     ``angles`` those of the two.
     """
@@ -80,7 +79,6 @@ def psf_pair(
             _on_grid(psf, name, angle, grid_angle, scale, n, resampling if name == "lo" else None)
         )
     held = [float(image.sum()) for image in images]
-    is_assumed = normalize is None and not psfs["lo"].total_known
     if normalize is None:
         # templates are of unit sum through the sharp PSF, whatever that holds
         normalize = not psfs["lo"].total_known
@@ -95,8 +93,6 @@ def psf_pair(
     if not normalize:
         energy = held[1]
     mended = {"energy": energy, "held": held, "centering": centering}
-    if is_assumed:
-        mended["total_assumed"] = True
     return images[0] / held[0], images[1] * (energy / held[1]), mended
 
 

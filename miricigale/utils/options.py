@@ -85,7 +85,10 @@ def check_kind(value, name, kind):
         got = repr(value)
         if np.ndim(value) > 0 or len(got) > _LONGEST:
             got = type(value).__name__
-        raise argument_error(name, f"of the class {kind.__name__}", got)
+        article = "a"
+        if kind.__name__[0] in "AEIOU":
+            article = "an"
+        raise argument_error(name, f"{article} {kind.__name__}", got)
 
 
 def check_type(value, name, kinds, wanted):

@@ -75,7 +75,7 @@ def effective_psf(scale, width=1.0, size=201):
     transfer *= (np.sinc(PIXEL * along) * np.sinc(PIXEL * across)) ** 2
     transfer *= np.sinc(scale * fx) * np.sinc(scale * fy)
     psf = np.fft.fftshift(np.fft.ifft2(transfer).real)
-    return make_psf(psf / psf.sum(), pixel_scale=FINE * u.arcsec)
+    return make_psf(psf, pixel_scale=FINE * u.arcsec, enclosed=1.0)
 
 
 def is_poor(result):
@@ -112,7 +112,7 @@ def image_with_scatter(scatter, scale=0.08, n=250):
     transfer = np.exp(-2 * (np.pi * FWHM / 2.3548) ** 2 * (fx**2 + fy**2))
     transfer *= np.sinc(scale * fx) * np.sinc(scale * fy)
     psf = np.fft.fftshift(np.fft.ifft2(transfer).real)
-    psf = make_psf(psf / psf.sum(), pixel_scale=FINE * u.arcsec)
+    psf = make_psf(psf, pixel_scale=FINE * u.arcsec, enclosed=1.0)
     return ForcedPhotometer(psf=psf).measure(as_image(light, SIGMA, wcs, rng), sky)
 
 

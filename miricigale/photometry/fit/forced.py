@@ -19,7 +19,12 @@ from miricigale.photometry.detection.prior_catalog import (
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels, are_exposures
 from miricigale.photometry.fit.fit_loop import fit_image
 from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package, warn_of_none
-from miricigale.photometry.fit.sampled_psfs import SampledPSFs, compared_psf, is_sampled
+from miricigale.photometry.fit.sampled_psfs import (
+    SampledPSFs,
+    compared_psf,
+    is_sampled,
+    marked_kernel,
+)
 from miricigale.photometry.fit.stars import with_stars
 from miricigale.photometry.images.arrays import fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.images.flags import ForcedFlags
@@ -258,9 +263,9 @@ class ForcedPhotometer(Interactive):
         if kernel is None and (is_sampled(psf) or is_sampled(highres_psf)):
             kernel = SampledPSFs(psf, highres_psf, filter)
         elif kernel is None and highres_psf is None:
-            kernel = MatchingKernel.identity(compared_psf(psf, filter))
+            kernel = marked_kernel(MatchingKernel.identity(compared_psf(psf, filter)))
         elif kernel is None:
-            kernel = MatchingKernel.from_psfs(highres_psf, compared_psf(psf, filter))
+            kernel = marked_kernel(MatchingKernel.from_psfs(highres_psf, compared_psf(psf, filter)))
         if psf is not None and highres_psf is None and template == "auto":
             template = "psf"
         # the kernel that all have in common: the mean, with PSFs in any case

@@ -74,19 +74,27 @@ class SampledPSFs:
         image = as_mosaic(image, "image")
         psf = compared_psf(_on_pixels(self.psf, image), self.filter)
         if self.highres_psf is None:
-            return MatchingKernel.identity(psf)
+            return marked_kernel(MatchingKernel.identity(psf))
         wanted = "given to measure() where 'highres_psf' does not state its pixels"
         sampled = is_sampled(self.highres_psf)
         check_that(highres is not None or not sampled, "highres", wanted, "None")
         if highres is None:
-            return MatchingKernel.from_psfs(self.highres_psf, psf)
+            return marked_kernel(MatchingKernel.from_psfs(self.highres_psf, psf))
         highres = as_mosaic(highres, "highres")
-        return MatchingKernel.from_psfs(
+        kernel = MatchingKernel.from_psfs(
             _on_pixels(self.highres_psf, highres),
             psf,
             pixel_scale=pixel_scale(highres.wcs) * ANGLE,
             grid_angle=grid_angle(highres.wcs, highres.shape),
         )
+        return marked_kernel(kernel)
+
+
+def marked_kernel(kernel):
+    """Note in the meta of a kernel that its PSF was taken to hold all of the light, for a warning."""
+    if kernel.meta.get("energy") == 1.0:
+        kernel.meta["total_assumed"] = True
+    return kernel
 
 
 def compared_psf(psf, filter):
