@@ -244,17 +244,10 @@ def _check_stars(star, argument):
 def _fill_columns(table, argument):
     """Add missing columns of redshifts and profiles to a table; yield what has become a point, and why."""
     missing = [name for name in _SHAPE if name not in table.colnames]
-    if "profile" in table.colnames and "sersic" in set(map(str, table["profile"])):
-        if "axis_ratio" in missing:
-            # round, in which case no angle is needed
-            table["axis_ratio"] = 1.0
-            missing.remove("axis_ratio")
-        needed = [name for name in missing if name != "position_angle"]
-        is_round = np.all(plain_floats(table["axis_ratio"], "axis_ratio", argument) == 1.0)
-        if "position_angle" in missing and not is_round:
-            needed.append("position_angle")
-        wanted = f"a table with the columns {needed}, for its Sersic profiles"
-        check_that(not needed, argument, wanted, f"columns {table.colnames}")
+    if "profile" in table.colnames:
+        sersic = _checked_profiles(table["profile"], argument) == "sersic"
+        if missing and sersic.any():
+            _complete_sersic(table, missing, sersic, argument)
     for name in ("redshift", *missing):
         if name not in table.colnames:
             table[name] = np.full(len(table), np.nan) * (CATALOG_COLUMNS[name] or u.one)
@@ -271,6 +264,20 @@ def _fill_columns(table, argument):
         if missing:
             why = f"no column {missing[0]!r}"
         yield f"{n} of {len(table)} sources are points ({why})"
+
+
+def _complete_sersic(table, missing, sersic, argument):
+    """Make Sersic profiles without an axis ratio round; refuse a table that lacks what these rows need."""
+    if "axis_ratio" in missing:
+        table["axis_ratio"] = 1.0
+        missing.remove("axis_ratio")
+    needed = [name for name in missing if name != "position_angle"]
+    # round profiles need no angle
+    ratio = plain_floats(table["axis_ratio"], "axis_ratio", argument)
+    if "position_angle" in missing and np.any(ratio[sersic] != 1.0):
+        needed.append("position_angle")
+    wanted = f"a table with the columns {needed}, for its Sersic profiles"
+    check_that(not needed, argument, wanted, f"columns {table.colnames}")
 
 
 def _flags(catalog):

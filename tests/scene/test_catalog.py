@@ -57,6 +57,22 @@ def test_unusable_rows_are_flagged(table):
     assert check_catalog(table)["flags"].tolist() == wanted
 
 
+def test_sersic_profiles_are_round_without_an_axis_ratio_and_need_what_draws_them(table):
+    """The points of the table need none of it."""
+    table.remove_column("position_angle")
+    refuses("columns .'position_angle'., for its Sersic profiles", check_catalog, table)
+    table["axis_ratio"] = [1.0, np.nan]
+    assert check_catalog(table)["flags"].tolist() == [0, 0]
+    table.remove_column("axis_ratio")
+    catalog = check_catalog(table)
+    assert catalog["axis_ratio"][0] == 1
+    assert catalog["flags"].tolist() == [0, 0]
+    table.remove_column("sersic_index")
+    refuses("columns .'sersic_index'., for its Sersic profiles", check_catalog, table)
+    table["profile"] = "point"
+    assert check_catalog(table)["flags"].tolist() == [0, 0]
+
+
 NOWHERE = SkyCoord([53, np.nan], [-27, -27], unit="deg")
 
 
