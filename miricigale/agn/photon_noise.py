@@ -228,6 +228,4 @@ def photon_noise(file, image):
     facts = file.read_photon_facts()
     if facts["variance"] is None or image.uncertainty is None:
         return PhotonNoise.of_header(facts["unit"], facts["keywords"], facts["factor"])
-    noise = image.meta.get("noise", "")
-    in_errors = noise.startswith(("error (extension", "variance (extension"))
-    return PhotonNoise.of_variance(image, facts["variance"], in_errors=in_errors)
+    return PhotonNoise.of_variance(image, facts["variance"], in_errors=facts["own_errors"])

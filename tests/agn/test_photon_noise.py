@@ -133,3 +133,7 @@ def test_files_state_it(tmp_path):
     assert_allclose(grown, 100.0 / (RATE * 50.0), rtol=0.3)
     same = brighter.uncertainty.array == image.uncertainty.array
     assert np.count_nonzero(~same) == 1
+    # errors by a map of weights are those of the sky, whatever the file has besides
+    fits.writeto(tmp_path / "weight.fits", 1e-6 / variance, wcs.to_header())
+    weighted = MosaicFile(path, filter="F770W", weight=tmp_path / "weight.fits")
+    assert not photon_noise(weighted, weighted.read()).in_errors

@@ -296,7 +296,8 @@ class MosaicFile:
         -------
         facts : dict
             ``variance``, that of the extension VAR_POISSON in (MJy/sr)^2, or None; ``factor``, MJy/sr of the
-            pixels' unit; this ``unit``, or None; ``keywords``: EXPTIME, and GAIN by any of its usual names.
+            pixels' unit; this ``unit``, or None; ``keywords``: EXPTIME, and GAIN by any of its usual names;
+            ``own_errors``, whether errors are those of the file itself, not weights nor another map.
 
         Raises
         ------
@@ -304,21 +305,30 @@ class MosaicFile:
             As `read` does.
         """
         header = self.header
+        # a unit given by the caller holds for the maps too
+        stated_unit = header.unit
+        if self.unit is not None:
+            stated_unit = ""
         with open_image(self.path, "an image") as (hdus, _):
             factor = self._factor()[0]
             variance = None
             hdu = companion(hdus, header.index, "VAR_POISSON")
             if hdu is not None and plane_shape(hdu) == plane_shape(hdus[header.index]):
-                stated_unit = "" if self.unit is not None else header.unit
                 values = self._in_unit(hdu, "variance", stated_unit, self.path)
                 variance = values * np.square(factor)
+            own_errors = False
+            if all(getattr(self, kind) is None for kind in NOISE_MAPS):
+                usable = np.isfinite(plane_data(hdus[header.index], self.section))
+                own_kind = self._own_noise_map(hdus, header, usable, stated_unit)[0]
+                own_errors = own_kind in ("error", "variance")
             own = hdus[header.index].header
             keywords = {"EXPTIME": header.keywords["EXPTIME"], "GAIN": None}
             for name in _GAINS:
                 if keywords["GAIN"] is None:
                     keywords["GAIN"] = own.get(name, hdus[0].header.get(name))
         unit = parsed_unit(header.unit)
-        return {"variance": variance, "factor": factor, "unit": unit, "keywords": keywords}
+        facts = {"variance": variance, "factor": factor, "unit": unit, "keywords": keywords}
+        return facts | {"own_errors": own_errors}
 
     def _factor(self):
         """Factor from the pixels' unit to MJy/sr, of each pixel where fluxes are in pixels; and what states it."""
