@@ -15,11 +15,11 @@ import numpy as np
 
 from miricigale.fitting import _core
 from miricigale.fitting.grid.labels import active_axes, labels_of_ranges
-from miricigale.fitting.grid.moves import move_places, systematic
 from miricigale.fitting.grid.place_sets import Collection, WeightedPlaces, fitted_groups
 from miricigale.fitting.grid.placed_models import PlacedModels, places_to_values, thinned
 from miricigale.fitting.grid.points import quasi_random
 from miricigale.fitting.grid.proposals import MIN_WEIGHT, Places, fit_mixture
+from miricigale.fitting.grid.tempering import TemperedPlaces, prior_mixture, temper
 
 #: Number of places in a round.
 ROUND_SIZE = 512
@@ -33,8 +33,6 @@ _MIN_MAX_PLACES = 1 << 14
 _SIZE_TO_BEGIN = 1 << 13
 #: Largest number of rounds whose places mixtures are fitted to before results are collected.
 _ADAPTING_ROUNDS = 6
-#: The same where labels are pursued.
-_PURSUING_ROUNDS = 9
 #: Effective number, over that wanted in all, at which these rounds end.
 _FIRST_GOAL = 0.3
 #: Number of places after which a mixture is judged.
@@ -49,14 +47,6 @@ _EFFECTIVE_PART = 0.05
 _MIN_EFFECTIVE = 30
 #: Smallest number of places with weights that results rest on.
 _MIN_RESULT_PLACES = 2048
-#: Part of the draws to begin with above which a label in a peak is pursued.
-_MIN_PURSUED = 0.01
-#: Share of the places that it has until its shape is found.
-_PURSUED_SHARE = 0.06
-#: Effective number of its places above which its shape is seen.
-_SEEN = 10
-#: Weight of a label below which it is pursued no more after the rounds of labels that are not.
-_MIN_PURSUED_WEIGHT = 1e-3
 #: Share of a mixture that is divided evenly among the labels, whatever their weight.
 _GUARD = 0.05
 #: Smallest share of each peak of the nodes.
@@ -71,14 +61,10 @@ _MAX_FLAT = 150
 _LEAST_FLAT = 0.003
 #: Number of narrow parts that are added to each label and peak where weights are large.
 _N_LOCAL = 16
-#: Part of the effective number that is wanted, above which places keep their weights and are not moved.
+#: Part of the effective number that is wanted, below which the power of the likelihood is raised instead.
 _MIN_WEIGHED = 0.5
-#: Number of places that are moved where weights stay too unequal.
-_N_MOVED = 768
-#: Smallest number of them in each label and peak.
-_MIN_MOVED = 48
-#: Weight of labels and peaks below which none are.
-_MIN_MOVED_WEIGHT = 1e-3
+#: Number of places from each of the mixtures that this begins with.
+_N_BROAD = 4096
 #: Distance of labels by which places are sorted, beyond all scores.
 _APART = 1e6
 #: Weight of the models that are left out of results.
@@ -110,14 +96,13 @@ class AdaptiveSampler:
         Effective number that is wanted.
     scramble : int
         Seed of the quasi-random points.
-    pursue : bool
-        Whether each label of the draws to begin with is followed until its shape is found, whatever weight it
-        seems to have before that: where errors are small, the label in which a good model is found first would
-        take all places from the others.
+    is_narrow : bool
+        Whether errors are so small that the draws to begin with are of larger ones: places then come from a
+        likelihood whose power rises (`~miricigale.fitting.grid.tempering`).
     """
 
     def __init__(
-        self, space, labels, work, target, borders, peaks, *, wanted, scramble=1, pursue=False
+        self, space, labels, work, target, borders, peaks, *, wanted, scramble=1, is_narrow=False
     ):
         self.space = space
         self.labels = labels
@@ -130,17 +115,15 @@ class AdaptiveSampler:
         parts = [table[members].ravel() for members in labels_of_ranges(labels)]
         # each label, each peak, and each range of a component
         self.sets = _core.make_group_sets([*table, *table.T, *parts])
-        self.pursue = pursue
+        self.is_narrow = is_narrow
         self.scramble = scramble
         n_axes = len(space.size)
         max_places = max(_MAX_PLACES_EACH * wanted, _MIN_MAX_PLACES)
-        self.n_rounds = _ADAPTING_ROUNDS
-        if pursue:
-            self.n_rounds = _PURSUING_ROUNDS
         # at least those that parts are fitted to, and a first try
-        max_places = max(max_places, self.n_rounds * ROUND_SIZE + _N_TRIAL)
+        max_places = max(max_places, _ADAPTING_ROUNDS * ROUND_SIZE + _N_TRIAL)
         self.max_places = max_places
-        self.points = quasi_random(n_axes, int(np.ceil(np.log2(max_places))), scramble)
+        n_points = max_places + 2 * _N_BROAD
+        self.points = quasi_random(n_axes, int(np.ceil(np.log2(n_points))), scramble)
         size = _SIZE_TO_BEGIN
         self.label = np.empty(size, np.int64)
         self.score = np.empty((size, n_axes))
@@ -157,6 +140,8 @@ class AdaptiveSampler:
         #: What results rest on.
         self.collection = None
         self._first_wanted = wanted
+        #: `PlacedModels` of places of a rising likelihood.
+        self._tempered = None
 
     def run(self, label, score, peak):
         """
@@ -175,9 +160,12 @@ class AdaptiveSampler:
             None if no place has a probability above 0.
         """
         share = np.bincount(self._groups(label, peak), minlength=self.n_groups)
-        self.pursued = (share > _MIN_PURSUED * share.sum()) & self.pursue
         parts = self._fit(Places(label, score, peak, np.ones(len(label))))
-        adapted = self._adapt(parts, share)
+        self._broad = parts.shared(self._guarded(share))
+        if self.is_narrow:
+            adapted = self._temper()
+        else:
+            adapted = self._adapt(parts, share)
         if adapted is None:
             return None
         self.collection = Collection(*adapted, self)
@@ -195,17 +183,16 @@ class AdaptiveSampler:
         Returns
         -------
         models : `PlacedModels` or None
-            Converged if they reach the number wanted before, which places of large weight that are met now may
-            undo; None if that was not reached before.
+            Converged if they reach the number wanted at first, which places of large weight that are met now may
+            undo; None if the number wanted before was not reached.
         """
         if not self.collection.is_enough:
             return None
         self.collection.is_enough = False
-        first_wanted = self.wanted
-        self.wanted = int(factor * first_wanted)
+        self.wanted = int(factor * self.wanted)
         sample = self._reach()
         if sample is not None:
-            sample = replace(sample, enough=sample.effective >= first_wanted)
+            sample = replace(sample, enough=sample.effective >= self._first_wanted)
         return self._models_of(sample)
 
     def _reach(self):
@@ -229,12 +216,12 @@ class AdaptiveSampler:
         return collection.sample
 
     def _models_of(self, sample):
-        """Make `PlacedModels` of `WeightedPlaces`; None of none."""
-        if sample is None:
-            return None
-        if sample.effective >= _MIN_WEIGHED * self._first_wanted:
+        """Make `PlacedModels` of `WeightedPlaces` if they are enough, or of places of a rising likelihood."""
+        if sample is not None and sample.effective >= _MIN_WEIGHED * self._first_wanted:
             return self._models(sample)
-        return self._moved(sample)
+        if self._tempered is None:
+            self._temper()
+        return self._tempered
 
     def _adapt(self, parts, share):
         """
@@ -244,8 +231,8 @@ class AdaptiveSampler:
         """
         mixtures = []
         ends = []
-        total = np.zeros((1, self.n_rounds * ROUND_SIZE))
-        for turn in range(self.n_rounds):
+        total = np.zeros((1, _ADAPTING_ROUNDS * ROUND_SIZE))
+        for turn in range(_ADAPTING_ROUNDS):
             mixture = parts.shared(self._guarded(share))
             mixtures.append(mixture)
             new = self._add_round(mixture, ROUND_SIZE)
@@ -261,12 +248,10 @@ class AdaptiveSampler:
                 return None
             n_flat = min(_MAX_FLAT, _FLAT_EACH * len(mixtures))
             places = self._places(n_flat)
-            is_long = turn + 1 >= _ADAPTING_ROUNDS
-            if self.pursued.any():
-                self._end_pursuit(sample, is_long=is_long)
-            share = self._pursuing(sample.wanted)
-            good = sample.effective >= _FIRST_GOAL * self.wanted or is_long
-            if good and not self.pursued.any():
+            share = sample.wanted
+            if sample.effective >= _FIRST_GOAL * self.wanted:
+                break
+            if turn + 1 == _ADAPTING_ROUNDS:
                 break
             parts = self._fit(places)
         return self._fit(places, n_local=_N_LOCAL), share
@@ -339,24 +324,19 @@ class AdaptiveSampler:
         """
         Select `Places` for a fit of parts.
 
-        Weights of each peak are made flat enough to say what its shape is, or those of each label that has weight:
-        to an effective number of ``n_flat``.
+        Weights of each peak are made flat enough to say what its shape is, to an effective number of ``n_flat``.
         """
         rows = slice(0, self.n)
         log = self.evaluated[rows, 0] - np.log(self.density[rows])
         weight = np.exp(np.maximum(log - log.max(), -700.0))
-        group = self.peak[rows]
+        peak = self.peak[rows]
         is_wanted = np.ones(len(self.peaks), bool)
-        if self.pursue:
-            group = self.group[rows]
-            share = np.bincount(group, weight, minlength=self.n_groups)
-            is_wanted = self.pursued | (share > MIN_WEIGHT * share.sum())
-        chosen = fitted_groups(is_wanted, np.bincount(group, minlength=is_wanted.size))
+        chosen = fitted_groups(is_wanted, np.bincount(peak, minlength=is_wanted.size))
         return Places(
             label=self.label[rows],
             score=self.score[rows],
-            peak=self.peak[rows],
-            flat=self._flatten(log, group, chosen, n_flat),
+            peak=peak,
+            flat=self._flatten(log, peak, chosen, n_flat),
             weight=weight,
             log_target=self.evaluated[rows, 0],
         )
@@ -364,20 +344,6 @@ class AdaptiveSampler:
     def _fit(self, places, n_local=0):
         """Fit parts to places: `FittedParts`."""
         return fit_mixture(self.labels, len(self.peaks), places, n_local)
-
-    def _pursuing(self, share):
-        """Raise the shares of labels whose shape is still to be found, whatever their weight."""
-        min_share = _PURSUED_SHARE * share.sum()
-        return np.where(self.pursued, np.maximum(share, min_share), share)
-
-    def _end_pursuit(self, sample, *, is_long):
-        """Pursue labels no more that have been seen, and after long those without weight."""
-        group = self.group[sample.rows]
-        share = np.bincount(group, sample.weight, minlength=self.n_groups)
-        square = np.bincount(group, np.square(sample.weight), minlength=self.n_groups)
-        self.pursued &= np.square(share) < _SEEN * square
-        if is_long:
-            self.pursued &= share > _MIN_PURSUED_WEIGHT * share.sum()
 
     def _weigh(self, rows):
         """Weigh places by the posterior over the density of the proposal; None if none is possible."""
@@ -469,22 +435,16 @@ class AdaptiveSampler:
         even_share = share.sum(axis=0) / len(share)
         return ((1.0 - _GUARD) * share + _GUARD * even_share).ravel()
 
-    def _flatten(self, log, group, chosen, n_flat):
-        """
-        Flatten weights for a fit, in each of some groups enough to show its shape.
-
-        A label whose own weights need not be made flat is no longer pursued: its weight can be believed.
-        """
+    def _flatten(self, log, peak, chosen, n_flat):
+        """Flatten weights for a fit, in each of some peaks enough to show its shape."""
         flat = np.zeros(self.n)
         for j in chosen:
-            rows = np.flatnonzero(group == j)
+            rows = np.flatnonzero(peak == j)
             flat_weight = np.empty(rows.size)
-            power, _ = _core.flatten(log[rows], min(float(n_flat), 0.5 * rows.size), flat_weight)
+            _core.flatten(log[rows], min(float(n_flat), 0.5 * rows.size), flat_weight)
             # most places have next to no weight, and parts take as long to fit to them as to others
             flat_weight[flat_weight < _LEAST_FLAT * flat_weight.mean()] = 0.0
             flat[rows] = flat_weight / flat_weight.sum()
-            if self.pursue and power == 1.0 and min(n_flat, 0.5 * rows.size) >= _MAX_FLAT:
-                self.pursued[j] = False
         return flat
 
     def _models(self, sample):
@@ -508,12 +468,14 @@ class AdaptiveSampler:
             self.flux[rows],
             weight / weight.sum(),
             self.points[1][rows],
-            sample,
+            sample.log_mean,
             converged=sample.enough,
         )
 
-    def _placed(self, place, evaluated, flux, weight, uniform, sample, *, converged):
-        """Make `PlacedModels` of evaluated places and their weights; ``sample`` has the evidence."""
+    def _placed(
+        self, place, evaluated, flux, weight, uniform, log_evidence, *, converged, lineage=None
+    ):
+        """Make `PlacedModels` of evaluated places and their weights."""
         _, scale, variance, power, log_likelihood = evaluated.T
         return PlacedModels(
             place=place,
@@ -524,56 +486,82 @@ class AdaptiveSampler:
             flux=flux,
             log_likelihood=log_likelihood,
             uniform=uniform,
-            log_evidence=sample.log_mean,
+            log_evidence=log_evidence,
             converged=converged,
+            lineage=lineage,
         )
 
-    def _moved(self, sample):
+    def _temper(self):
         """
-        Move places to the posterior where weights are too unequal for results: `PlacedModels`.
+        Raise the power of the likelihood from where places are spread.
 
-        Labels and peaks keep the weights that the sample gives them; places begin from all that there are.
+        They begin from places of the prior and of the draws to begin with, half of each. Returned are parts that
+        are fitted to where they end, and shares of labels and peaks; None if no place is possible.
         """
-        rows = sample.rows
-        index = self.group[rows]
-        share = np.bincount(index, sample.weight, minlength=self.n_groups)
-        share = share / share.sum()
-        share[share < _MIN_MOVED_WEIGHT] = 0.0
-        share = share / share.sum()
-        group = self.group[: self.n]
-        log = self.evaluated[: self.n, 0] - np.log(self.density[: self.n])
-        picked = []
-        weight = []
-        for j in np.flatnonzero(share):
-            members = np.flatnonzero(group == j)
-            n = max(int(np.rint(share[j] * _N_MOVED)), _MIN_MOVED)
-            flat = np.empty(members.size)
-            _core.flatten(log[members], float(min(_MAX_FLAT, 0.5 * members.size)), flat)
-            picked.append(members[systematic(flat, n)])
-            weight.append(np.full(n, share[j] / n))
-        picked = np.concatenate(picked)
-        label = self.label[picked]
-        score = self.score[picked]
-        evaluated = self.evaluated[picked]
-        place = self.place[picked]
-        flux = self.flux[picked]
-        active = active_axes(self.labels)[label]
-        peaks = self.peak[picked]
+        broad, log_density = self._broad_places()
+        if not np.any(broad.evaluated[:, 0] > 0.5 * _core.NEVER):
+            return None
+        n_bands = self.flux.shape[1]
 
-        def evaluate(rows, new):
-            place_new = np.empty(new.shape)
-            evaluated_new = np.empty((len(new), 5))
-            self._evaluate(label[rows], new, place_new, evaluated_new, flux[rows])
-            if self.borders.size:
-                # weights are those of the peaks, which places must not leave
-                peak_new = np.searchsorted(self.borders, self._redshift(place_new[:, 0]))
-                evaluated_new[peak_new != peaks[rows], 0] = _core.NEVER
-            return evaluated_new, place_new
+        def evaluate(label, score):
+            place = np.empty(score.shape)
+            evaluated = np.empty((len(score), 5))
+            self._evaluate(label, score, place, evaluated, np.empty((len(score), n_bands)))
+            return evaluated, place
 
-        move_places(evaluate, group[picked], active, score, evaluated, place, self.scramble)
-        # fluxes of the places at which they ended
-        self._evaluate(label, score, place, evaluated, flux)
-        uniform = self.points[1][: len(picked)]
-        return self._placed(
-            place, evaluated, flux, np.concatenate(weight), uniform, sample, converged=False
+        rng = np.random.default_rng(self.scramble)
+        tempered = temper(evaluate, broad, log_density, active_axes(self.labels), rng)
+        # neighbors in redshift, label by label
+        order = np.lexsort((tempered.place[:, 0], tempered.label))
+        tempered = tempered.chosen(order, tempered.log_evidence)
+        n = len(order)
+        place = np.empty(tempered.place.shape)
+        evaluated = np.empty((n, 5))
+        flux = np.empty((n, n_bands))
+        self._evaluate(tempered.label, tempered.score, place, evaluated, flux)
+        self._tempered = self._placed(
+            place,
+            evaluated,
+            flux,
+            np.full(n, 1.0 / n),
+            self.points[1][:n],
+            tempered.log_evidence,
+            converged=True,
+            lineage=tempered.lineage,
         )
+        peak = np.zeros(n, np.int64)
+        if self.borders.size:
+            peak = np.searchsorted(self.borders, self._redshift(place[:, 0]))
+        equal = np.ones(n)
+        places = Places(tempered.label, tempered.score, peak, equal, equal, evaluated[:, 0])
+        share = np.bincount(self._groups(tempered.label, peak), minlength=self.n_groups)
+        return self._fit(places, n_local=_N_LOCAL), share
+
+    def _broad_places(self):
+        """Draw places of the prior and of the draws to begin with: `TemperedPlaces`, and ln of their density."""
+        first = self.n
+        mixtures = (prior_mixture(self.labels), self._broad)
+        ends = []
+        for mixture in mixtures:
+            for _ in range(_N_BROAD // ROUND_SIZE):
+                ends.append(self._add_round(mixture, ROUND_SIZE))
+        ends = np.concatenate(ends) - first
+        rows = slice(first, self.n)
+        total = np.zeros((1, self.n - first))
+        column = np.zeros(max(len(mixture.share) for mixture in mixtures), np.int64)
+        for mixture in mixtures:
+            _core.add_density(
+                self.labels, mixture, column, ends, self.score[rows], self.scratch, total
+            )
+        self.density[rows] = total[0] / len(mixtures)
+        with np.errstate(divide="ignore"):
+            log_density = np.log(self.density[rows])
+        places = TemperedPlaces(
+            self.label[rows],
+            self.score[rows],
+            self.evaluated[rows],
+            self.place[rows],
+            np.arange(self.n - first),
+            0.0,
+        )
+        return places, log_density

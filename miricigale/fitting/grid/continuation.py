@@ -29,6 +29,8 @@ _MAX_ERROR = 0.2
 _MAIN_QUANTITIES = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")
 #: Largest ratio of these errors whose square is the factor on the effective number of models.
 _MAX_RATIO = 2.0
+#: Number of times that models are added for them.
+_MAX_EXTENSIONS = 2
 #: Fluxes of galaxies that differ by less than this part, along an axis, are the same.
 _SAME_FLUX = 1e-6
 
@@ -255,7 +257,7 @@ class Continuation(Frozen):
             borders, weights = redshift_peaks(self.engine.grid.redshift, start.zf.sum(axis=1))
         given = self.space, labels.kernel, self._work(), one, borders, weights
         sampler = AdaptiveSampler(
-            *given, wanted=n_effective, scramble=self.scramble, pursue=start.larger_errors
+            *given, wanted=n_effective, scramble=self.scramble, is_narrow=start.larger_errors
         )
         label, score = labels.of_nodes(self._cells_of(start.index))
         peak = np.searchsorted(borders, self.engine.grid.redshift[start.index[:, 0]])
@@ -264,14 +266,17 @@ class Continuation(Frozen):
             return None
         quantities = self._quantities(models, one)
         error = quantities.percentile_error()
-        if error > _GOOD_ERROR:
+        for _ in range(_MAX_EXTENSIONS):
+            if error <= _GOOD_ERROR:
+                break
             # errors fall as the root of the number
             factor = min(error / _GOOD_ERROR, _MAX_RATIO) ** 2
             more_models = sampler.extend(factor)
-            if more_models is not None:
-                models = more_models
-                quantities = self._quantities(models, one)
-                error = quantities.percentile_error()
+            if more_models is None:
+                break
+            models = more_models
+            quantities = self._quantities(models, one)
+            error = quantities.percentile_error()
         if error > _MAX_ERROR:
             models = replace(models, converged=False)
         return self._describe(models, quantities, one, known, nuclei)
@@ -329,7 +334,7 @@ class Continuation(Frozen):
             values["redshift"] = np.full(len(models.weight), one.redshift)
         scale = self.engine.drawn_scale(models.scale, models.variance, models.uniform)
         derived = self.models.describe(values, values["redshift"], models.power, scale)
-        return _Quantities(values, node, derived, scale, models.weight)
+        return _Quantities(values, node, derived, scale, models.weight, models.lineage)
 
     def _describe(self, models, quantities, one, known, nuclei):
         """Make the `BetweenPosterior` of models and their `_Quantities`."""
@@ -439,6 +444,8 @@ class _Quantities:
         Parameters, nodes and derived quantities.
     scale, weight : `~numpy.ndarray`, shape (n,)
         Scales, drawn from those that are possible, and weights.
+    lineage : `~numpy.ndarray` of int or None, shape (n,)
+        See `~miricigale.fitting.grid.placed_models.PlacedModels`.
     """
 
     values: dict
@@ -446,6 +453,7 @@ class _Quantities:
     derived: dict
     scale: np.ndarray
     weight: np.ndarray
+    lineage: np.ndarray | None
 
     def percentile_error(self):
         """
@@ -462,7 +470,8 @@ class _Quantities:
             if numbers is None:
                 numbers = self.derived.get(name)
             if numbers is not None:
-                largest = max(largest, percentile_error(numbers, self.weight))
+                error = percentile_error(numbers, self.weight, self.lineage)
+                largest = max(largest, error)
         return largest
 
 

@@ -1,11 +1,7 @@
-"""Moves of many places to a posterior, for objects whose weights stay too unequal."""
+"""Moves of many places by differences of others, and choices among them by weight."""
 
 import numpy as np
 
-#: Largest number of sweeps over all places, in each of which half of them are moved, then the other half.
-N_SWEEPS = 100
-#: Number of sweeps over which the mean of ln(posterior) is taken: they end when it is no larger than before.
-_N_MEAN = 20
 #: Smallest step, a part of the difference of two places, over the one that is best for normal distributions.
 _MIN_PART = 0.4
 #: Share of steps by the whole difference, from one peak to another.
@@ -16,14 +12,13 @@ _JITTER = 1e-4
 _MIN_PLACES_PER_AXIS = 4
 
 
-def move_places(evaluate, group, active, score, evaluated, place, seed):
+class Moves:
     """
-    Move places to the posterior in their labels by differential evolution.
+    Moves of places to a posterior in their groups by differential evolution.
 
     A place is tried at itself plus a difference of two others of its group, and moved there by the rule of
     Metropolis (ter Braak 2006, Statistics and Computing 16, 239); half of the places are moved at once by
-    differences of the other half (Goodman & Weare 2010, CAMCoS 5, 65). Sweeps end when the mean of ln(posterior)
-    over the places rises no more.
+    differences of the other half (Goodman & Weare 2010, CAMCoS 5, 65).
 
     Parameters
     ----------
@@ -36,44 +31,52 @@ def move_places(evaluate, group, active, score, evaluated, place, seed):
         Axes that have an effect.
     score, evaluated, place : `~numpy.ndarray`, shapes (n, n_axes), (n, 5) and (n, n_axes)
         Scores, what `_core.evaluate_places` says of them, and places in unit intervals; they change.
-    seed : int
-        Seed of the moves.
+    power : float, optional
+        Power of the likelihood in the posterior.
     """
-    rng = np.random.default_rng(seed)
-    n = len(group)
-    n_active = active.sum(axis=1)
-    # step of the highest efficiency for normal distributions (ter Braak 2006)
-    best = 2.38 / np.sqrt(2.0 * np.maximum(n_active, 1))
-    size = np.bincount(group)
-    movable = size[group] >= _MIN_PLACES_PER_AXIS * (n_active + 1)
-    mean_log = np.empty(N_SWEEPS)
-    for sweep in range(N_SWEEPS):
-        order = np.lexsort([rng.random(n), group])
-        order = order[movable[order]]
+
+    def __init__(self, evaluate, group, active, score, evaluated, place, power=1.0):
+        self.evaluate = evaluate
+        self.group = group
+        self.active = active
+        self.score = score
+        self.evaluated = evaluated
+        self.place = place
+        self.power = power
+        n_active = active.sum(axis=1)
+        # step of the highest efficiency for normal distributions (ter Braak 2006)
+        self._best_part = 2.38 / np.sqrt(2.0 * np.maximum(n_active, 1))
+        size = np.bincount(group)
+        self._is_movable = size[group] >= _MIN_PLACES_PER_AXIS * (n_active + 1)
+
+    def log_target(self, evaluated):
+        """Compute ln of the posterior with the power of the likelihood, (m,)."""
+        return evaluated[:, 0] - (1.0 - self.power) * evaluated[:, 4]
+
+    def sweep(self, rng):
+        """Try to move half of all places, and then the other half, by random numbers of a generator."""
+        group = self.group
+        order = np.lexsort([rng.random(len(group)), group])
+        order = order[self._is_movable[order]]
         for parity in (0, 1):
-            rows = order[parity::2]
-            partners = order[1 - parity :: 2]
-            first = _partners_of_group(group, rows, partners, rng)
-            second = _partners_of_group(group, rows, partners, rng)
-            factor = best[rows] * (_MIN_PART + (1.0 - _MIN_PART) * rng.random(rows.size))
-            factor[rng.random(rows.size) < _WHOLE_SHARE] = 1.0
-            change = factor[:, None] * (score[first] - score[second])
-            change += _JITTER * rng.standard_normal(change.shape)
-            new = score[rows] + np.where(active[rows], change, 0.0)
-            evaluated_new, place_new = evaluate(rows, new)
-            accepted = np.log(rng.random(rows.size)) < evaluated_new[:, 0] - evaluated[rows, 0]
-            rows = rows[accepted]
-            score[rows] = new[accepted]
-            evaluated[rows] = evaluated_new[accepted]
-            place[rows] = place_new[accepted]
-        # it rises until places that began too wide have the distribution, and then goes up and down
-        mean_log[sweep] = evaluated[:, 0].mean()
-        n_done = sweep + 1
-        if n_done >= 2 * _N_MEAN:
-            last = mean_log[n_done - _N_MEAN : n_done].mean()
-            before = mean_log[n_done - 2 * _N_MEAN : n_done - _N_MEAN].mean()
-            if last <= before:
-                break
+            self._move(order[parity::2], order[1 - parity :: 2], rng)
+
+    def _move(self, rows, partners, rng):
+        """Try to move places by differences of ``partners``, which are sorted by group."""
+        first = _partners_of_group(self.group, rows, partners, rng)
+        second = _partners_of_group(self.group, rows, partners, rng)
+        part = self._best_part[rows] * (_MIN_PART + (1.0 - _MIN_PART) * rng.random(rows.size))
+        part[rng.random(rows.size) < _WHOLE_SHARE] = 1.0
+        change = part[:, None] * (self.score[first] - self.score[second])
+        change += _JITTER * rng.standard_normal(change.shape)
+        score = self.score[rows] + np.where(self.active[rows], change, 0.0)
+        evaluated, place = self.evaluate(rows, score)
+        gain = self.log_target(evaluated) - self.log_target(self.evaluated[rows])
+        accepted = np.log(rng.random(rows.size)) < gain
+        rows = rows[accepted]
+        self.score[rows] = score[accepted]
+        self.evaluated[rows] = evaluated[accepted]
+        self.place[rows] = place[accepted]
 
 
 def _partners_of_group(group, rows, partners, rng):

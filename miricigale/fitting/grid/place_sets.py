@@ -154,7 +154,7 @@ def fitted_groups(is_wanted, number):
     Parameters
     ----------
     is_wanted : `~numpy.ndarray` of bool, shape (n_groups,)
-        Groups that have weight, or that are pursued whatever their weight.
+        Groups that have weight.
     number : `~numpy.ndarray` of int, shape (n_groups,)
         Number of places of each.
 

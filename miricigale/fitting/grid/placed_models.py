@@ -28,6 +28,8 @@ class PlacedModels:
         Ln of the mean likelihood over the priors, but for the constant of the likelihoods.
     converged : bool
         Whether the effective number is what was asked for.
+    lineage : `~numpy.ndarray` of int or None, shape (n,)
+        Models of the same number come from one place; None if each has a place of its own.
     """
 
     place: np.ndarray
@@ -40,6 +42,7 @@ class PlacedModels:
     uniform: np.ndarray
     log_evidence: float
     converged: bool
+    lineage: np.ndarray | None = None
 
 
 def thinned(index, weight, always, most):

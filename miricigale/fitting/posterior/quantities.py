@@ -89,7 +89,7 @@ def _sorted_draws(value, weight, with_log):
     return table, moments
 
 
-def percentile_error(values, weight):
+def percentile_error(values, weight, lineage=None):
     """
     Estimate the largest error of the 16th, 50th and 84th percentiles of a finite number of weighted draws.
 
@@ -97,6 +97,8 @@ def percentile_error(values, weight):
     ----------
     values, weight : `~numpy.ndarray`, shape (n,)
         The draws, and their weights, which sum to 1.
+    lineage : `~numpy.ndarray` of int, shape (n,), optional
+        Draws of the same number come from one, and have their weight together. By default each is on its own.
 
     Returns
     -------
@@ -109,20 +111,35 @@ def percentile_error(values, weight):
     those above. The percentiles at shares that are a standard error smaller and larger say what that means for the
     value, also between two peaks, where there is no density to divide by.
     """
-    (values, middles, square_upto), _ = _sorted_draws(values, weight, with_log=False)
-    low, high = np.interp(_INTERVAL[[0, -1]], middles, values)
+    (ascending, middles, square_upto), _ = _sorted_draws(values, weight, with_log=False)
+    percentiles = np.interp(_INTERVAL, middles, ascending)
+    low = percentiles[0]
+    high = percentiles[-1]
     half_width = 0.5 * (high - low)
     # values that differ by rounding are one
     if not half_width > _SAME * max(abs(low), abs(high)):
         return 0.0
-    below = np.interp(_INTERVAL, middles, square_upto)
-    above = square_upto[-1] - below
-    share_error = np.sqrt(np.square(1.0 - _INTERVAL) * below + np.square(_INTERVAL) * above)
-    smaller = np.interp(_INTERVAL - share_error, middles, values)
-    larger = np.interp(_INTERVAL + share_error, middles, values)
+    if lineage is None:
+        below = np.interp(_INTERVAL, middles, square_upto)
+        above = square_upto[-1] - below
+        share_error = np.sqrt(np.square(1.0 - _INTERVAL) * below + np.square(_INTERVAL) * above)
+    else:
+        share_error = _share_error_of_lineages(values, weight, lineage, percentiles)
+    smaller = np.interp(_INTERVAL - share_error, middles, ascending)
+    larger = np.interp(_INTERVAL + share_error, middles, ascending)
     spread = 0.5 * np.max(larger - smaller)
     # half an interval may be as good as nothing, where most models have no dust
     return float(min(spread, _LARGEST_ERROR * half_width) / half_width)
+
+
+def _share_error_of_lineages(values, weight, lineage, percentiles):
+    """Compute the standard error of the share of draws below each percentile of the interval, (3,)."""
+    share_error = np.empty(len(_INTERVAL))
+    for i, level in enumerate(_INTERVAL):
+        excess = weight * ((values <= percentiles[i]) - level)
+        sums = np.bincount(lineage, excess)
+        share_error[i] = np.sqrt(np.sum(sums * sums))
+    return share_error
 
 
 def put_draws(results, new, i, values):
