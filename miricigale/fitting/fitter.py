@@ -27,6 +27,8 @@ from miricigale.fitting.survey.defaults import (
     errors_and_priors,
     models_and_bands,
     own_curves,
+    warn_of_changed_axes,
+    warn_of_few_models,
 )
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.sed.presets import grid_name
@@ -86,9 +88,10 @@ class BayesFitter(CatalogFits):
         How the posterior is found: on a grid, or by a sampler. A callable is a sampler of the
         user's; see `miricigale.fitting.samplers.get_sampler`.
     axes : dict or str, optional
-        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`); or the name of one:
-        ``"survey"``, ``"far-infrared"``, ``"yang2021"`` (of simulations) or ``"yang2021-quick"``. By default the
-        model's own (`~miricigale.sed.SEDModel.named_axes`).
+        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`), whose other
+        parameters have one value, their default; without ``model``, in place of those of the grid ``"survey"``,
+        whose other axes stay. Or the name of a grid: ``"survey"``, ``"far-infrared"``, ``"yang2021"`` (of
+        simulations) or ``"yang2021-quick"``. By default the model's own (`~miricigale.sed.SEDModel.named_axes`).
     model_error, error_floor : float or dict of str to float, optional
         Part of the measured flux that is added to its error in quadrature, 0.1 where there is no calibration, and
         least relative error of a flux, for all or by filter.
@@ -104,7 +107,7 @@ class BayesFitter(CatalogFits):
         Of a grid: zero points and errors of the bands, by which fluxes and errors are multiplied (so are those in
         the results), and in place of what is not given here, priors, ``template_error``, ``model_error``,
         ``outliers`` and ``mass_function`` of the settings. None: no calibration. By default, for the axes
-        ``"survey"`` unless ``model_error``, ``template_error`` or ``compat`` is given,
+        ``"survey"`` (at any redshifts) unless ``model_error``, ``template_error`` or ``compat`` is given,
         `SurveyCalibration.survey` with the errors of bands of which nothing was measured: in MIRI 3.3 times those
         of the catalog and 15 % of the flux, in others 2 % of the flux (`calibrate_bands` measures them); and none
         for other axes.
@@ -155,6 +158,13 @@ class BayesFitter(CatalogFits):
     ValueError
         If an option is of the wrong kind or of another engine, a prior is none, or leaves values that
         the libraries of the model do not have; or if ``finer`` of the settings did not make the grid.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.FitWarning`
+        If ``axes`` that change those of the grid ``"survey"`` leave it without calibration, and none was asked
+        for; or if ``axes`` of `SEDModel.survey <miricigale.sed.SEDModel.survey>` lack ``age``, ``tau`` or ``ebv``,
+        so that all galaxies have one value.
 
     References
     ----------
@@ -210,7 +220,11 @@ class BayesFitter(CatalogFits):
         on_grid = engine == "grid"
         if isinstance(axes, str):
             axes = grid_name(axes)
-        model, filters = models_and_bands(model, filters, axes)
+        model, filters, default_axes = models_and_bands(model, filters, axes)
+        changed_axes = None
+        if on_grid and default_axes is not axes:
+            changed_axes = axes
+            axes = default_axes
         self.curves = own_curves(filters)
         self._options = {
             "model": model,
@@ -231,15 +245,19 @@ class BayesFitter(CatalogFits):
         }
         settings = chosen_settings(engine, settings)
         self.grid_name = None
+        self._calibrated_as = None
         if on_grid:
-            axes, self.grid_name = axes_of(model, axes)
+            axes, self.grid_name, self._calibrated_as = axes_of(model, axes)
         if on_grid and compat is None:
             catalog_bands = filters
             if filters is None and isinstance(model, ModelGrid):
                 catalog_bands = model.filters
+            is_default = isinstance(calibration, str) and model_error is None
             calibration = chosen_calibration(
-                calibration, self.grid_name, model_error, template_error, bands=catalog_bands
+                calibration, self._calibrated_as, model_error, template_error, bands=catalog_bands
             )
+            if changed_axes and is_default and calibration is None and template_error is None:
+                warn_of_changed_axes(changed_axes)
         elif isinstance(calibration, str):
             calibration = None
         of_grid = {"axes": axes, "compat": compat, "calibration": calibration}
@@ -280,6 +298,7 @@ class BayesFitter(CatalogFits):
                 model, filters, priors, settings, scale_error=scale_error, **of_grid
             )
             self.grid = self.backend.grid
+            warn_of_few_models(model, axes, self.grid)
         else:
             self.backend = SamplerFit.of_model(
                 model, filters, priors, settings, scale_error=scale_error, sampler=engine
@@ -380,20 +399,21 @@ class BayesFitter(CatalogFits):
     def replace(self, **options):
         """Return a fitter of the same models with other options, named as for `BayesFitter`."""
         arguments = self._options | options
-        if self.waits:
+        if self.waits or options.get("axes") is not None:
             return type(self)(**arguments)
         if self.grid is not None:
             arguments |= {"model": self.grid, "axes": None}
             if arguments["compat"] is None:
                 arguments["calibration"] = chosen_calibration(
                     arguments["calibration"],
-                    self.grid_name,
+                    self._calibrated_as,
                     arguments["model_error"],
                     arguments["template_error"],
                     bands=arguments["filters"] or self.bands,
                 )
         new = type(self)(**arguments)
         new.grid_name = self.grid_name
+        new._calibrated_as = self._calibrated_as
         new.model = self.model
         # errors that are given later take the place of a calibration by default
         new._options["calibration"] = (self._options | options)["calibration"]

@@ -90,6 +90,11 @@ def _other_names(label):
     return declared("miricigale.utils", "other_keywords.toml").get(label, {})
 
 
+def _names_of_values(label):
+    """Our keywords of a label whose values are a dict or a text, by those that are usual elsewhere."""
+    return declared("miricigale.utils", "other_keywords.toml")["values"].get(label, {})
+
+
 def _our_keywords(keywords, label, names, settings):
     """Keywords of a call by our names."""
     other_names = _other_names(label)
@@ -97,6 +102,9 @@ def _our_keywords(keywords, label, names, settings):
     values = {}
     for keyword, value in keywords.items():
         name = keyword if keyword in names else other_names.get(keyword, keyword)
+        if isinstance(value, (dict, str)) and keyword in other_names:
+            # such as the axes of a grid in place of the grid
+            name = _names_of_values(label).get(keyword, name)
         owners = [part for part, kind in settings.items() if name in _field_names(kind)]
         if name in names:
             if name in ours:
@@ -144,7 +152,11 @@ def _with_call(message, label):
 
 def _given_twice(name, label):
     """Return what to say of an argument that is given by its place and by its name."""
-    return _with_call(f"{label}() got {name!r} twice, by its place and by its name", label)
+    message = f"{label}() got {name!r} twice, by its place and by its name"
+    sentence = _sentences(label).get(f"{name} twice")
+    if sentence is not None:
+        return f"{message}; {sentence}"
+    return _with_call(message, label)
 
 
 def _too_many(label, names, n_args):

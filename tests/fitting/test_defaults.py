@@ -124,6 +124,51 @@ def test_models_bands_and_calibration_by_default():
     assert changed.model is fitters[0].model
 
 
+def test_axes_without_a_model_change_those_of_the_survey():
+    """Other redshifts keep its other axes and its calibration, which has nothing by redshift."""
+    redshift = [0.5, 1.0, 1.5, 2.0]
+    whole = SEDModel.survey_axes()
+    n_others = np.prod([values.size for name, values in whole.items() if name != "redshift"])
+    changed = {"redshift": redshift}
+    fitters = [
+        BayesFitter(BANDS, axes=changed),
+        BayesFitter(axes=changed).for_bands(BANDS),
+        BayesFitter(BANDS, grid=changed),
+        BayesFitter(filters=BANDS, nodes=changed),
+        BayesFitter(SEDModel.survey(), BANDS, axes=whole | changed),
+        BayesFitter(SEDModel.survey().grid(whole | changed, BANDS)),
+    ]
+    usual = BayesFitter(BANDS)
+    # not the grid that was made
+    assert usual.replace(axes=whole | changed).grid.redshift.size == 4
+    for fitter in fitters:
+        assert fitter.grid.n_models == 4 * n_others
+        assert fitter.grid_name is None
+        assert fitter.model_errors == usual.model_errors
+        assert_array_equal(fitter.template_error.error, usual.template_error.error)
+        assert_allclose(fitter.priors.axes["age"].weights, usual.priors.axes["age"].weights)
+        assert fitter.replace(n_bands_min=3).calibration.name == "CEERS"
+    assert BayesFitter(grid="yang2021-quick").grid_name == "yang2021-quick"
+
+
+def test_axes_that_lose_the_calibration_or_most_models_warn():
+    text = "other values than the grid 'survey' has for age, inclination: there is no calibration"
+    axes = {"age": [1.0], "inclination": [30.0, 70.0], "redshift": [0.5, 1.0]}
+    with pytest.warns(FitWarning, match=text):
+        fitter = BayesFitter(axes=axes)
+    # once, and not where errors are given
+    fitter = fitter.for_bands(BANDS)
+    assert fitter.calibration is None
+    assert fitter.grid.redshift.size == 2
+    assert BayesFitter(BANDS, axes=axes, model_error=0.1).grid.n_models == fitter.grid.n_models
+    assert BayesFitter(BANDS, axes=axes, calibration=None).calibration is None
+    # axes of a model are all that it has
+    text = "a grid of 2 models, whose galaxies all have tau=1, age=1, ebv=0.3; axes=SEDModel.survey"
+    with pytest.warns(FitWarning, match=text):
+        BayesFitter(SEDModel.survey(), BANDS, axes={"redshift": [0.5, 1.0]})
+    refuses("takes the place of the model", BayesFitter, BANDS, grid=fitter.grid, error=TypeError)
+
+
 def test_a_fitter_says_what_it_fits():
     """Models, bands, and errors with priors: those that are not flat in the nodes."""
     fitter = BayesFitter(BANDS)

@@ -16,7 +16,9 @@ from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 
 DECLARED = declared("miricigale.utils", "other_keywords.toml")
-OTHER_KEYWORDS = {label: names for label, names in DECLARED.items() if label != "hints"}
+OTHER_KEYWORDS = {
+    label: names for label, names in DECLARED.items() if label not in ("hints", "values")
+}
 
 
 def called(label):
@@ -37,6 +39,14 @@ def test_other_keywords_are_of_arguments(label):
         assert other not in parameters, other
         is_setting = label == "Reducer" and ours in MosaicSettings.__dataclass_fields__
         assert ours in parameters or is_setting, (other, ours)
+
+
+@pytest.mark.parametrize("label", DECLARED["values"])
+def test_keywords_of_dicts_are_of_arguments_too(label):
+    parameters = inspect.signature(called(label)).parameters
+    for other, ours in DECLARED["values"][label].items():
+        assert other in OTHER_KEYWORDS[label]
+        assert ours in parameters
 
 
 @pytest.mark.parametrize("label", DECLARED["hints"])

@@ -1,16 +1,20 @@
 """What is fitted where nothing else is said: models of real galaxies, their grid and their calibration."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from miricigale.filters import FilterSet, find_filter
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.sed.presets import GRIDS, grid_axes
 from miricigale.utils.caching import cached
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import FitWarning, argument_error, warn
 from miricigale.utils.options import check_that
 
 #: For a calibration: that of the models.
 DEFAULT = "default"
+#: Axes without which the galaxies of a survey are all alike.
+_OF_GALAXIES = ("tau", "age", "ebv")
 
 
 def models_and_bands(model, filters, axes):
@@ -32,6 +36,8 @@ def models_and_bands(model, filters, axes):
         As given, or `SEDModel.for_axes` where only bands or nothing was given.
     filters : list of str, `FilterSet` or None
         Bands.
+    axes : dict, str or None
+        As given; a dict without a model has the other axes of the grid ``"survey"`` too.
     """
     if isinstance(model, (list, tuple, FilterSet)):
         check_that(filters is None, "filters", "left out where 'model' is a list of bands", filters)
@@ -47,7 +53,10 @@ def models_and_bands(model, filters, axes):
         if isinstance(axes, str):
             grid_name = axes
         model = SEDModel.for_axes(grid_name)
-    return model, filters
+        if isinstance(axes, Mapping):
+            # nodes of some parameters of the default grid
+            axes = model.named_axes() | dict(axes)
+    return model, filters, axes
 
 
 def own_curves(filters):
@@ -74,6 +83,8 @@ def axes_of(model, axes):
         Parameters to values.
     name : str or None
         Name of the grid; None if they are of no grid of ours.
+    calibrated_as : str or None
+        Name of the grid whose calibration by default it has: its own, or that of a grid with other redshifts.
 
     Raises
     ------
@@ -81,14 +92,18 @@ def axes_of(model, axes):
         If no axes were given for a model that has none of its own, or the name is that of another chain.
     """
     if isinstance(model, ModelGrid):
-        return axes, _name_of(model.axes, model.preset, model.n_agn > 0)
+        chain = (model.preset, model.n_agn > 0)
+        name = _name_of(model.axes, *chain)
+        return axes, name, _calibrated_as(name, model.axes, *chain)
     if not isinstance(model, SEDModel):
-        return axes, None
+        return axes, None, None
     if axes is None:
-        return model.named_axes(axes), model.preset
+        return model.named_axes(axes), model.preset, model.preset
     if isinstance(axes, str):
-        return model.named_axes(axes), axes
-    return axes, _name_of(axes, model.preset, model.has_agn)
+        return model.named_axes(axes), axes, axes
+    chain = (model.preset, model.has_agn)
+    name = _name_of(axes, *chain)
+    return axes, name, _calibrated_as(name, axes, *chain)
 
 
 def _name_of(axes, preset, has_agn):
@@ -99,13 +114,57 @@ def _name_of(axes, preset, has_agn):
     return None
 
 
+def _calibrated_as(name, axes, preset, has_agn):
+    """
+    Name of the grid whose calibration by default is that of a grid; None if there is none.
+
+    Errors of models by rest wavelength, and priors of parameters, hold at any redshifts: the grid ``"survey"`` may
+    have others.
+    """
+    if name is not None or preset != "survey" or not isinstance(axes, Mapping):
+        return name
+    own = grid_axes("survey", agn=has_agn)
+    if "redshift" in axes and _are_same({**axes, "redshift": own["redshift"]}, own):
+        return "survey"
+    return None
+
+
+def warn_of_changed_axes(axes):
+    """Warn that a calibration by default is none, of axes of the survey's grid that were changed."""
+    own = grid_axes("survey", agn=True)
+    own["redshift"] = axes.get("redshift", own["redshift"])
+    changed = [name for name in axes if name not in own or not _same_values(axes, own, name)]
+    msg = (
+        f"'axes' have other values than the grid 'survey' has for {', '.join(changed)}: there is no "
+        "calibration, errors of models are 10 % of the flux and all nodes are equally likely; "
+        "calibration=SurveyCalibration.survey() has the survey's, calibration=None takes none"
+    )
+    warn(msg, FitWarning)
+
+
+def warn_of_few_models(model, axes, grid):
+    """Warn of axes for the models of a survey without those of age, star formation or dust."""
+    if model.preset != "survey" or not isinstance(axes, Mapping):
+        return
+    missing = [name for name in _OF_GALAXIES if name not in axes]
+    if missing:
+        values = ", ".join(f"{name}={model.defaults[name]:g}" for name in missing)
+        msg = (
+            f"'axes' make a grid of {grid.n_models:,} models, whose galaxies all have {values}; "
+            "axes=SEDModel.survey_axes() | {...} has the other axes of the survey too"
+        )
+        warn(msg, FitWarning)
+
+
 def _are_same(axes, grid_axes_of_name):
     """Whether axes are those of a named grid."""
     if not isinstance(axes, dict) or axes.keys() != grid_axes_of_name.keys():
         return False
-    return all(
-        np.array_equal(np.asarray(axes[name]), values) for name, values in grid_axes_of_name.items()
-    )
+    return all(_same_values(axes, grid_axes_of_name, name) for name in grid_axes_of_name)
+
+
+def _same_values(axes, other_axes, name):
+    return np.array_equal(np.asarray(axes[name]), other_axes[name])
 
 
 @cached(copies=True)
