@@ -11,6 +11,77 @@ _IN_STAMP = 0.995  # of the light lies within the isophote that a stamp holds
 SERSIC_INDEX_RANGE = (0.2, 10.0)
 
 
+def sersic_faults(radius, index, ratio, angle):
+    """
+    Find what is wrong with the numbers of Sersic profiles.
+
+    Parameters
+    ----------
+    radius, index, ratio, angle : `~numpy.ndarray`, shape (n,)
+        Half-light radii, indices, axis ratios and position angles; NaN where one is missing.
+
+    Returns
+    -------
+    faults : dict of str to `~numpy.ndarray` of bool, shape (n,)
+        By the name of the column of a catalog: which radii are not positive, indices outside `SERSIC_INDEX_RANGE`,
+        axis ratios outside (0, 1], and angles not finite of profiles that are not round.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.profiles import sersic_faults
+    >>> radius, index = np.array([0.3, 0.0]), np.array([np.nan, 4.0])
+    >>> sersic_faults(radius, index, ratio=np.ones(2), angle=np.zeros(2))["half_light_radius"]
+    array([False,  True])
+    """
+    low, high = SERSIC_INDEX_RANGE
+    return {
+        "half_light_radius": ~(np.isfinite(radius) & (radius > 0)),
+        "sersic_index": ~((index >= low) & (index <= high)),
+        "axis_ratio": ~((ratio > 0) & (ratio <= 1)),
+        "position_angle": ~np.isfinite(angle) & (ratio != 1),
+    }
+
+
+def describe_faults(faults, sersic):
+    """
+    Say how many Sersic profiles are drawn as points, and why; an empty text if none is.
+
+    Parameters
+    ----------
+    faults : dict of str to `~numpy.ndarray` of bool, shape (n,)
+        As of `sersic_faults`.
+    sersic : `~numpy.ndarray` of bool, shape (n,)
+        Which rows are Sersic profiles.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.profiles import describe_faults
+    >>> faults = {"half_light_radius": np.array([True, False]), "axis_ratio": np.zeros(2, bool)}
+    >>> describe_faults(faults, np.ones(2, bool))
+    '1 of 2 Sersic profiles are drawn as points: half_light_radius is missing or not positive in 1'
+    """
+    low, high = SERSIC_INDEX_RANGE
+    wrong = {
+        "half_light_radius": "not positive",
+        "sersic_index": f"outside {low:g} to {high:g}",
+        "axis_ratio": "not in (0, 1]",
+        "position_angle": "not finite",
+    }
+    drawn_as_point = np.any(list(faults.values()), axis=0) & sersic
+    if not drawn_as_point.any():
+        return ""
+    reasons = []
+    for name, rows in faults.items():
+        n = np.count_nonzero(rows & sersic)
+        if n:
+            reasons.append(f"{name} is missing or {wrong[name]} in {n}")
+    n_points = np.count_nonzero(drawn_as_point)
+    n_sersic = np.count_nonzero(sersic)
+    return f"{n_points} of {n_sersic} Sersic profiles are drawn as points: {', '.join(reasons)}"
+
+
 def sersic_bn(n):
     """
     The constant b_n that makes R_e enclose half the light.

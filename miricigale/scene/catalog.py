@@ -6,7 +6,7 @@ from astropy.table import QTable, Table
 
 from miricigale.filters.photometry_table import as_photometry
 from miricigale.filters.surveys import flux_bands, is_band
-from miricigale.profiles import SERSIC_INDEX_RANGE
+from miricigale.profiles import describe_faults, sersic_faults
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.ids import id_column, likely_ids
@@ -61,6 +61,15 @@ class CatalogFlags(Flags):
     def unusable_profile(cls):
         """Return the bits that make a Sersic profile be drawn as a point."""
         return cls.BAD_RADIUS | cls.BAD_INDEX | cls.BAD_AXIS_RATIO | cls.BAD_ANGLE
+
+
+#: Flag of a column that makes no Sersic profile.
+_OF_SHAPE = {
+    "half_light_radius": CatalogFlags.BAD_RADIUS,
+    "sersic_index": CatalogFlags.BAD_INDEX,
+    "axis_ratio": CatalogFlags.BAD_AXIS_RATIO,
+    "position_angle": CatalogFlags.BAD_ANGLE,
+}
 
 
 def _plain_column(table, name, unit, argument):
@@ -150,7 +159,8 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     Warns
     -----
     `~miricigale.utils.exceptions.CatalogWarning`
-        If there is no column ``profile``, with the number of sources that are points.
+        If there is no column ``profile``, with the number of sources that are points; and of Sersic profiles that
+        are drawn as points, with their numbers by the column that is missing or wrong.
 
     Examples
     --------
@@ -192,6 +202,9 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     _check_stars(catalog["star"], argument)
     catalog["flags"] = _flags(catalog)
     catalog["flags"].info.description = CatalogFlags.describe()
+    faults = describe_faults(_sersic_faults(catalog), catalog["profile"] == "sersic")
+    if faults:
+        points.append(f"{faults} (flagged)")
     for text in points:
         warn(f"{argument}: {text}", CatalogWarning)
     return catalog
@@ -280,18 +293,21 @@ def _complete_sersic(table, missing, sersic, argument):
     check_that(not needed, argument, wanted, f"columns {table.colnames}")
 
 
+def _sersic_faults(catalog):
+    """Which rows of a checked catalog have numbers that make no Sersic profile, by column."""
+    return sersic_faults(
+        radius=catalog["half_light_radius"].value,
+        index=catalog["sersic_index"],
+        ratio=catalog["axis_ratio"],
+        angle=catalog["position_angle"].value,
+    )
+
+
 def _flags(catalog):
     flags = np.zeros(len(catalog), dtype=int)
     sersic = catalog["profile"] == "sersic"
-    radius = catalog["half_light_radius"].value
-    ratio = catalog["axis_ratio"]
-    angle = catalog["position_angle"].value
-    low, high = SERSIC_INDEX_RANGE
-    index = catalog["sersic_index"]
-    flags[sersic & ~(np.isfinite(radius) & (radius > 0))] |= CatalogFlags.BAD_RADIUS
-    flags[sersic & ~((index >= low) & (index <= high))] |= CatalogFlags.BAD_INDEX
-    flags[sersic & ~((ratio > 0) & (ratio <= 1))] |= CatalogFlags.BAD_AXIS_RATIO
-    flags[sersic & ~np.isfinite(angle) & (ratio != 1)] |= CatalogFlags.BAD_ANGLE
+    for name, rows in _sersic_faults(catalog).items():
+        flags[sersic & rows] |= _OF_SHAPE[name]
     flags[~(catalog["redshift"] > 0)] |= CatalogFlags.NO_REDSHIFT
     if bands := flux_bands(catalog.colnames):
         usable = np.any([_usable(catalog, name) for name in bands], axis=0)

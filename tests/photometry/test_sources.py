@@ -107,6 +107,27 @@ def test_rows_off_the_image_change_nothing(tools, scene):
     assert_equal_values("rows", templates[rows], all_of[rows], skip=other)
 
 
+def test_profiles_of_a_catalog_that_lack_numbers_are_points(tools):
+    """Each has the number of its fault; a round one needs no angle."""
+    catalog = QTable({"id": np.arange(5), "sky": tools.places(np.linspace(-2, 2, 5))})
+    catalog["half_light_radius"] = [np.nan, 0.3, 0.3, 0.3, 0.3] * u.arcsec
+    catalog["sersic_index"] = [1.0, np.nan, 1.0, 1.0, 1.0]
+    catalog["axis_ratio"] = [0.5, 0.5, 0.5, 1.0, 0.5]
+    catalog["position_angle"] = [0.0, 0.0, 0.0, np.nan, 0.0] * u.deg
+    catalog["profile"] = ["sersic", "sersic", "sersic", "sersic", "point"]
+    text = (
+        "2 of 4 Sersic profiles are drawn as points: half_light_radius is missing or not positive "
+        "in 1, sersic_index is missing or outside 0.2 to 10 in 1"
+    )
+    templates = warned(text, SourceTemplates.from_catalog, catalog, template="sersic")
+    assert templates.kind.tolist() == ["point", "point", "sersic", "sersic", "point"]
+    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (200, 200))
+    xy = np.stack(wcs.world_to_pixel(catalog["sky"]), axis=1)
+    light = templates.drawn(wcs, xy)
+    assert [stamp is None for stamp in light] == [True, True, False, False, True]
+    assert np.isfinite(light[3].data).all()
+
+
 def test_components_of_one_source(tools):
     # a galaxy with a point in its middle, each given by hand, on a noiseless image
     wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (200, 200))

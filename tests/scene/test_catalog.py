@@ -6,7 +6,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import MaskedColumn, QTable, Table
 
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from helpers.scenes import catalog_at
 from miricigale.scene import CatalogFlags, check_catalog, read_catalog
 from miricigale.utils.exceptions import DataError
@@ -54,7 +54,12 @@ def test_unusable_rows_are_flagged(table):
     table["redshift"][4] = np.nan
     f = CatalogFlags
     wanted = [f.BAD_RADIUS, f.BAD_INDEX, f.BAD_AXIS_RATIO, f.BAD_ANGLE, f.NO_REDSHIFT]
-    assert check_catalog(table)["flags"].tolist() == wanted
+    text = (
+        r"^catalog: 4 of 5 Sersic profiles are drawn as points: half_light_radius is missing or not "
+        r"positive in 1, sersic_index is missing or outside 0.2 to 10 in 1, axis_ratio .* in 1, "
+        r"position_angle .* in 1 \(flagged\)$"
+    )
+    assert warned(text, check_catalog, table)["flags"].tolist() == wanted
 
 
 def test_sersic_profiles_are_round_without_an_axis_ratio_and_need_what_draws_them(table):
@@ -168,7 +173,8 @@ def test_masked_values_are_missing_in_either_of_astropys_ways(table, kind):
     table["half_light_radius"], table["sersic_index"] = [0.3, 0.2] * u.arcsec, [1.0, 4.0]
     table = kind(table, masked=True)
     table["sersic_index"].mask = table["miri.f770w"].mask = [True, False]
-    catalog = check_catalog(table, filters=["miri.f770w"])
+    text = "1 of 2 Sersic profiles are drawn as points: sersic_index is missing"
+    catalog = warned(text, check_catalog, table, filters=["miri.f770w"])
     assert catalog["flags"].tolist() == [CatalogFlags.BAD_INDEX | CatalogFlags.NO_FLUX, 0]
     assert np.isnan(catalog["miri.f770w"].value).tolist() == [True, False]
     assert catalog["sersic_index"][1] == 4
@@ -185,7 +191,7 @@ def test_numbers_that_stand_for_no_value_are_missing(table, code, dtype):
     table["redshift"] = np.array([code, 2.0], dtype=dtype)
     table["half_light_radius"][0] = code * u.arcsec
     table["position_angle"] = [-99, -99.0] * u.deg
-    catalog = check_catalog(table)
+    catalog = warned("1 of 1 Sersic profiles are drawn as points", check_catalog, table)
     for name in ("miri.f770w", "miri.f770w_err", "half_light_radius"):
         assert np.isnan(catalog[name].value).tolist() == [True, False]
     assert np.isnan(catalog["redshift"]).tolist() == [True, False]
@@ -194,6 +200,7 @@ def test_numbers_that_stand_for_no_value_are_missing(table, code, dtype):
     assert catalog["position_angle"].value.tolist() == [-99, -99]
     # what is no code stays, in whatever unit
     table["miri.f770w"] = [-0.099, -98.0] * u.mJy
+    table["profile"] = "point"
     np.testing.assert_allclose(check_catalog(table)["miri.f770w"].value, [-99, -98000])
 
 

@@ -109,7 +109,11 @@ def test_flags_say_what_happened(wcs, psf):
     columns = {"flux": [10.0, np.nan, 10.0, -1.0], "index": [8.0, 1.0, 20.0, 1.0], "radius": 1.0}
     catalog = scenes.make_catalog(wcs, x, y, profile="sersic", **columns)
     text = f"2 of 4 sources are not painted: fluxes in '{FILTER}' are 1 NaN, 1 negative .*no_flux"
-    with pytest.warns(MiricigaleWarning, match=text):
+    points = "1 of 4 Sersic profiles are drawn as points: sersic_index is missing or outside"
+    with (
+        pytest.warns(MiricigaleWarning, match=points),
+        pytest.warns(MiricigaleWarning, match=text),
+    ):
         scene = make_scene(catalog, wcs, psf, max_radius=4 * u.arcsec)
     truth = scene.truth
     f = SceneFlags

@@ -5,7 +5,8 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.profiles import describe_faults, sersic_faults
+from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing_values import floats, mask_of
 from miricigale.utils.options import check_that, check_type
@@ -56,7 +57,11 @@ def catalog_sources(catalog, epoch=None):
 
 
 def sersic_rows(catalog):
-    """Return half-light radius (arcsec), index, axis ratio and angle (rad), (n, 4); NaN for points."""
+    """
+    Return half-light radius (arcsec), index, axis ratio and angle (rad), (n, 4); NaN for points.
+
+    Profiles with a number that is missing or of no profile are points too; a `CatalogWarning` says how many.
+    """
     units = {"half_light_radius": u.arcsec, "position_angle": u.deg}
     names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
     require_columns(catalog, names, "catalog", units=units)
@@ -65,8 +70,17 @@ def sersic_rows(catalog):
     index = floats(catalog["sersic_index"])
     ratio = floats(catalog["axis_ratio"])
     rows = np.stack([radius, index, ratio, angle], axis=1)
+    sersic = np.ones(len(catalog), dtype=bool)
     if "profile" in catalog.colnames:
-        rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan
+        sersic = np.asarray(catalog["profile"]) == "sersic"
+    faults = sersic_faults(radius, index, ratio, angle)
+    text = describe_faults(faults, sersic)
+    if text:
+        warn(f"catalog: {text}", CatalogWarning)
+    points = ~sersic | np.any(list(faults.values()), axis=0)
+    rows[points] = np.nan
+    # the angle of a round profile is of no use
+    rows[~points & ~np.isfinite(angle), 3] = 0.0
     return rows
 
 

@@ -242,6 +242,11 @@ class SourceTemplates:
         ------
         ValueError, TypeError, `~astropy.units.UnitsError`
             If an input does not fit; the message says which.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.CatalogWarning`
+            If profiles are points, because a number of them is missing or of no profile: how many, by column.
         """
         check_choice(template, "template", ("psf", "sersic"))
         has_positions = isinstance(catalog, Table) and "sky" in catalog.colnames
