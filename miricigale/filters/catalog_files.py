@@ -178,6 +178,55 @@ def codes_of(table, bands):
     return coded
 
 
+def count_negative_errors(table, bands):
+    """
+    Count the errors of fluxes that are negative, without those that stand for no value.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Fluxes by band and their errors, whatever the unit.
+    bands : iterable of str
+        The bands; those whose columns hold no plain numbers are skipped.
+
+    Returns
+    -------
+    counts : `collections.Counter`
+        By band.
+    """
+    counts = Counter()
+    for name in bands:
+        error = error_column(name)
+        if not {name, error} <= set(table.colnames):
+            continue
+        try:
+            values = plain_floats(table[name], name, "photometry")
+            errors = plain_floats(table[error], error, "photometry")
+        except ValueError:
+            # the reader of these columns raises the error
+            continue
+        missing, no_error = without_codes(values, errors)
+        is_measured = np.isfinite(values) & ~missing & ~no_error
+        n_negative = np.count_nonzero(is_measured & (errors < 0))
+        if n_negative:
+            counts[name] = n_negative
+    return counts
+
+
+def negative_error_message(counts):
+    """Say what becomes of negative errors, and how to read them as limits; an empty text if there is none."""
+    if not counts:
+        return ""
+    parts = [f"{name} {n}" for name, n in counts.items()]
+    if len(parts) > _FEW:
+        parts = parts[:_FEW] + [f"and {len(parts) - _FEW} more bands"]
+    return (
+        f"fluxes with a negative error are not fitted: {', '.join(parts)}; where it marks an upper "
+        "limit, as in CIGALE, read_catalog_photometry(path, limits=True), or limits = true in the "
+        "file of --map, reads it as one"
+    )
+
+
 def without_codes_of(table, coded):
     """
     Return the table with missing fluxes and errors where `codes_of` found numbers for no value.

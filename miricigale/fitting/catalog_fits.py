@@ -5,6 +5,7 @@ import logging
 import numpy as np
 
 from miricigale.filters import as_photometry
+from miricigale.filters.catalog_files import count_negative_errors, negative_error_message
 from miricigale.fitting.data.likelihood import (
     FitFlags,
     PhotometryReader,
@@ -89,6 +90,9 @@ class CatalogFits(Interactive):
                 table[error_column(name)] = np.full(len(table), np.nan) * FNU
         warn_of_duplicates(read_ids(table), "photometry")
         self._warn_of_bands(table)
+        text = negative_error_message(count_negative_errors(table, self._reader.fitted(table)))
+        if text:
+            warn(text, FitWarning)
         return table
 
     def _read_bands(self, photometry, bands):

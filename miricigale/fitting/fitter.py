@@ -513,7 +513,9 @@ class BayesFitter(CatalogFits):
             flux density that have an error) that the grid lacks, or that no filter here belongs to. Bands that are
             not fitted are also in ``meta["fit"]["unused_bands"]`` of the results. A further warning counts, by
             band, numbers that stand for no value, such as -99, or 99 with an error of 99: they are missing bands,
-            whatever the unit and wherever it is given. Another one names bands whose fluxes of S/N above 5, 30 at
+            whatever the unit and wherever it is given, and another the negative errors that may mark upper limits
+            (such fluxes are left out; ``read_catalog_photometry(path, limits=True)`` reads limits). Another one
+            names bands whose fluxes of S/N above 5, 30 at
             least, scatter about what the other bands predict by more than 1.5 times their errors
             (`miricigale.fitting.results.pulls`).
 

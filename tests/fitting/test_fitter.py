@@ -44,7 +44,12 @@ def test_rows_that_cannot_be_fitted_stay_in_place(grid):
     table["band0"][6] *= 1e4
     table["band0_err"][6] = 1e-3 * table["band0"][6]
     fitter = node_fitter(grid, model_error=0.0)
-    with pytest.warns(CatalogWarning, match="1 row has an id that occurred before"):
+    with (
+        pytest.warns(CatalogWarning, match="1 row has an id that occurred before"),
+        pytest.warns(
+            FitWarning, match="fluxes with a negative error are not fitted: band3 1; where"
+        ),
+    ):
         results = fitter.fit(table)
     names = [FitFlags.names(f) for f in results.flags]
     assert [names[i] for i in (0, 1, 4)] == [["no_band"], ["few_bands"], ["duplicate_id"]]

@@ -312,7 +312,10 @@ def test_the_page_says_how_redshifts_compare_and_what_is_left_out(catalog, tmp_p
     table["irac.ch2_err"][1] = -1.0 * u.uJy
     table["miri.f999w"], table["miri.f999w_err"] = table["irac.ch1"], table["irac.ch1_err"]
     table.write(tmp_path / "cat.fits")
-    with pytest.warns(MiricigaleWarning, match=r"not fitted.*miri\.f999w"):
+    with (
+        pytest.warns(MiricigaleWarning, match=r"not fitted.*miri\.f999w"),
+        pytest.warns(MiricigaleWarning, match=r"cat.fits: .* negative error .*: irac\.ch2 1;"),
+    ):
         results = fit_catalog(tmp_path / "cat.fits", tmp_path / "out", axes="yang2021-quick")
     page = fit_page(results, tmp_path / "cat.fits").to_html()
     for text in (

@@ -15,7 +15,7 @@ from helpers.grids import draw_photometry, node_fitter
 from helpers.results import assert_joined, assert_same, assert_same_tables
 from miricigale.fitting import FitFlags, FitResults, fit_file, open_results
 from miricigale.fitting.results.io import FitFolder
-from miricigale.utils.exceptions import CatalogWarning, DataError
+from miricigale.utils.exceptions import CatalogWarning, DataError, FitWarning
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.table_files import read_table
 
@@ -89,6 +89,30 @@ def in_pieces(fitter, tmp_path):
         return fit_file(fitter, path, tmp_path / "out", **options)
 
     return fit
+
+
+def test_negative_errors_of_all_pieces_are_counted(fitter, catalog, in_pieces):
+    """Those that stand for no value are not: they are taken as missing, and counted as such."""
+    measured = np.isfinite(catalog["band0"]) & np.isfinite(catalog["band1"])
+    near, code, middle, far = np.flatnonzero(measured)[[20, 25, 50, 90]]
+    catalog["band0_err"][[near, far]] *= -1
+    catalog["band1_err"][middle] *= -1
+    catalog["band1_err"][code] = -99 * u.uJy
+    text = r"fluxes with a negative error are not fitted: band0 2, band1 1; .*limits=True"
+    codes = "taken as missing, by the number that stands there: band1 1 of 150"
+    for call in (in_pieces, fitter.fit):
+        with (
+            pytest.warns(FitWarning, match=text),
+            pytest.warns(CatalogWarning, match=codes),
+        ):
+            results = call(catalog)
+        parts = [results]
+        if call is in_pieces:
+            parts = results.parts()
+        flags = np.concatenate([part.flags for part in parts])
+        bad = np.flatnonzero(flags & FitFlags.BAD_ERROR)
+        assert {near, middle, far} <= set(bad)
+        assert code not in bad
 
 
 @pytest.mark.slow

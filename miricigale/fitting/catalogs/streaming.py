@@ -7,12 +7,18 @@ import logging
 import os
 import sqlite3
 import threading
-from collections import deque
+from collections import Counter, deque
 from functools import partial
 
 import numpy as np
 
-from miricigale.filters.catalog_files import catalog_messages, codes_of, without_codes_of
+from miricigale.filters.catalog_files import (
+    catalog_messages,
+    codes_of,
+    count_negative_errors,
+    negative_error_message,
+    without_codes_of,
+)
 from miricigale.filters.photometry_table import unit_of_fluxes
 from miricigale.fitting.catalogs.catalog_rows import give_units, open_catalog
 from miricigale.fitting.data.fitted_bands import bands_with_errors, warn_of_unfitted
@@ -31,7 +37,13 @@ from miricigale.fitting.results.io import (
 from miricigale.fitting.results.pulls import warn_of_pulls
 from miricigale.fitting.results.sample_flags import chi2_limit, chi2_step
 from miricigale.utils.content_hash import content_sha256
-from miricigale.utils.exceptions import CatalogWarning, OtherResultsError, argument_error, warn
+from miricigale.utils.exceptions import (
+    CatalogWarning,
+    FitWarning,
+    OtherResultsError,
+    argument_error,
+    warn,
+)
 from miricigale.utils.files import PARTIAL
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.ids import Duplicates
@@ -168,13 +180,19 @@ def fit_file(
     fluxes = set(flux_columns(named))
     take = row_pieces(rows, options, unit, fluxes, fitter.bands)
     kinds = set()
+    n_negative = Counter()
     for i in range(rows.n_chunks):
         with _noted(rows, i):
-            ids = ascii_ids(read_ids(rows.chunk(i)), "photometry")
+            chunk = rows.chunk(i)
+            n_negative.update(count_negative_errors(chunk, fitter.filters or fitter.bands))
+            ids = ascii_ids(read_ids(chunk), "photometry")
             if ids.size:
                 kinds.add(ids.dtype.kind)
             got = "whole numbers in earlier rows, and others here"
             check_that(len(kinds) < 2, "photometry", "a table with ids of one kind", got)
+    text = negative_error_message(n_negative)
+    if text:
+        warn(f"{rows.path.name}: {text}", FitWarning)
     catalog_settings = {"hdu": hdu, "flux_unit": None}
     if unit is not None:
         catalog_settings["flux_unit"] = unit.to_string()
