@@ -17,7 +17,12 @@ from miricigale.fitting.fitter_options import (
 )
 from miricigale.fitting.grid.grid_fit import GridFit
 from miricigale.fitting.results.pulls import warn_of_pulls
-from miricigale.fitting.results.sample_flags import chi2_limit, chi2_step, with_high_chi2
+from miricigale.fitting.results.sample_flags import (
+    chi2_limit,
+    chi2_step,
+    warn_of_unconverged,
+    with_high_chi2,
+)
 from miricigale.fitting.samplers import get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.fitting.survey.defaults import (
@@ -517,7 +522,8 @@ class BayesFitter(CatalogFits):
             (such fluxes are left out; ``read_catalog_photometry(path, limits=True)`` reads limits). Another one
             names bands whose fluxes of S/N above 5, 30 at
             least, scatter about what the other bands predict by more than 1.5 times their errors
-            (`miricigale.fitting.results.pulls`).
+            (`miricigale.fitting.results.pulls`). The last one counts fits that are not converged
+            (``NOT_CONVERGED``).
 
         Raises
         ------
@@ -553,6 +559,7 @@ class BayesFitter(CatalogFits):
             parallel={"executor": executor, "progress_bar": progress_bar},
         )
         warn_of_pulls(results)
+        warn_of_unconverged(results)
         sample = results.reduced_chi2[:: chi2_step(len(results))]
         return with_high_chi2(results, chi2_limit(sample))
 

@@ -24,6 +24,7 @@ from miricigale.fitting.posterior.quantities import (
     percentile_error,
 )
 from miricigale.sed import ModelGrid
+from miricigale.utils.exceptions import FitWarning
 
 BANDS = tuple(f"band{i}" for i in range(6))
 PLACE = np.linspace(-1.0, 1.0, len(BANDS))
@@ -214,8 +215,14 @@ def test_what_is_not_converged_is_flagged(grid, table, monkeypatch):
     monkeypatch.setattr("miricigale.fitting.grid.adaptive._MAX_PLACES_EACH", 1)
     monkeypatch.setattr("miricigale.fitting.grid.adaptive._MIN_MAX_PLACES", 512)
     fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=1000))
-    flags = fitter.fit(table).flags
+    n = len(table)
+    with pytest.warns(
+        FitWarning, match=f"^{n} of {n} fits are not converged .*interpolate="
+    ) as caught:
+        flags = fitter.fit(table).flags
     assert np.all(flags & int(FitFlags.NOT_CONVERGED))
+    # once, not by object
+    assert len(caught) == 1
 
 
 def _labels(n_axes):

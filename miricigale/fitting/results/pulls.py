@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 
+from miricigale.fitting.results.sample_flags import NOT_CONVERGED_TEXT
 from miricigale.utils.exceptions import CatalogWarning, FitWarning, warn
 
 #: Signal-to-noise ratio of the fluxes that count.
@@ -115,7 +116,8 @@ def without_scatter_warnings():
 
 @contextlib.contextmanager
 def without_warnings():
-    """Silence warnings of catalogs and of `warn_of_pulls`, for fits that measure errors themselves."""
+    """Silence warnings of catalogs, `warn_of_pulls` and flags, for fits that measure errors themselves."""
     with without_scatter_warnings():
+        warnings.filterwarnings("ignore", f".*{NOT_CONVERGED_TEXT}", FitWarning)
         warnings.simplefilter("ignore", CatalogWarning)
         yield

@@ -4,7 +4,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from miricigale.fitting.data.likelihood import HIGH_CHI2, FitFlags
+from miricigale.fitting.data.settings import GridSettings
+from miricigale.utils.exceptions import FitWarning, warn
 
+#: What a warning of fits that are not converged begins with, after their number.
+NOT_CONVERGED_TEXT = "fits are not converged"
 #: Smallest number of fits that are a sample.
 _MIN_SAMPLE = 50
 #: Largest number of fits that are looked at.
@@ -73,6 +77,20 @@ def with_high_chi2(results, limit):
     flags = np.array(results.flags)
     flags[poor] |= int(FitFlags.HIGH_CHI2)
     return results._changed(flags=flags)
+
+
+def warn_of_unconverged(results):
+    """Warn of fits with the flag ``NOT_CONVERGED``, once, with their number and what can be done."""
+    n_flagged = np.count_nonzero(results.flags & int(FitFlags.NOT_CONVERGED))
+    if n_flagged:
+        n_fitted = np.count_nonzero(results.fitted)
+        n_asked = results.meta["fit"].get("interpolate", GridSettings.interpolate)
+        msg = (
+            f"{n_flagged} of {n_fitted} {NOT_CONVERGED_TEXT} (flag NOT_CONVERGED): their percentiles "
+            "are uncertain; settings=GridSettings(interpolate=...) of a larger number than "
+            f"{n_asked} evaluates more models"
+        )
+        warn(msg, FitWarning)
 
 
 def worst_bands(results):
