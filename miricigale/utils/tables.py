@@ -34,9 +34,19 @@ class Flags(enum.IntFlag):
         bits = ", ".join(f"{m.value} {m.name.lower().replace('_', ' ')}" for m in cls if m.value)
         return f"bit flags (sum): {bits}; 0 good"
 
+    def __str__(self):
+        return ", ".join(self.names(self)) or "0"
+
+    def __format__(self, spec):
+        if spec:
+            return format(int(self), spec)
+        return str(self)
+
     @classmethod
     def names(cls, value):
-        """Names of the bits set in ``value``, lower case."""
+        """Names of the bits set in ``value``, lower case; of an array or a column, a list for each value."""
+        if np.ndim(value):
+            return [cls.names(element) for element in value]
         return [m.name.lower() for m in cls if m.value and int(value) & m.value]
 
     @classmethod

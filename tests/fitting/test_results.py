@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.grids import node_fitter, photometry_table
-from miricigale.fitting import FitResults
+from miricigale.fitting import FitFlags, FitResults
 from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import DataError
@@ -165,6 +165,13 @@ def test_rows_ids_and_columns(results, tmp_path):
     assert summary.colnames[:3] == ["id", "flags", "chi2_best"]
     assert len(results + results) == 2 * len(results)
     assert len(results.flag_names()) == len(results)
+    flags = np.zeros(len(results), int)
+    flags[1] = FitFlags.FEW_BANDS | FitFlags.HIGH_CHI2
+    flagged = results._changed(flags=flags)
+    assert str(flagged.flags[1]) == str(flagged[1].flags) == "few_bands, high_chi2"
+    assert repr(flagged[1]).endswith("bands, few_bands, high_chi2>")
+    assert repr(flagged[0]).endswith("bands>")
+    assert flagged.to_table()["flags"].dtype.kind == "i"
     results.write(tmp_path / "a.csv")
     back = QTable.read(tmp_path / "a.csv")
     assert_allclose(back["mass_p50"], table["mass_p50"].value)

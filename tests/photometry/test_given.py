@@ -20,6 +20,7 @@ from miricigale.filters import Filter
 from miricigale.instrument import Exposure, north_up_wcs, pixel_area_map
 from miricigale.photometry import (
     ErrorModel,
+    ForcedFlags,
     ForcedPhotometer,
     SourceTemplates,
     detect_sources,
@@ -167,6 +168,8 @@ def test_results_are_indexed_like_their_table(images, psfs, sky):
     assert_allclose(result.magnitude.value, 23.9 - 2.5 * np.log10(result.flux.value))
     assert_allclose(result.mag_err.value, 1.0857362 / result.snr, rtol=1e-6)
     assert result.flag_names()[0] == []
+    assert result.flags[0] is ForcedFlags(0)
+    assert not result.flags.flags.writeable
     assert "sources: 16" in result.summary()
     # on the pixels of the image
     x, y = images[0].wcs.world_to_pixel(sky)

@@ -7,6 +7,7 @@ from dataclasses import field
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.posterior.posterior import (
     FitRows,
     cell_edges,
@@ -21,6 +22,7 @@ from miricigale.fitting.results.result_tables import flux_table, reduced_chi2, r
 from miricigale.fitting.results.sample_flags import worst_bands
 from miricigale.fitting.results.table_columns import OUTLIER, TEXTS
 from miricigale.utils.file_formats import read_write
+from miricigale.utils.flag_arrays import FlagField
 from miricigale.utils.object_rows import ArraysByName, PerObject, PerObjectDict, of_id
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.values import value_class
@@ -223,7 +225,11 @@ class FitResults(FitRows):
             bands += f", errors and priors of {calibration}"
         if self.isscalar:
             key = np.asarray(self.ids).item()
-            return f"<FitResults of {key!r}, chi2 {self.chi2:.4g} in {self.n_bands} of {bands}>"
+            flags = ""
+            if self.flags:
+                flags = f", {self.flags}"
+            text = f"chi2 {self.chi2:.4g} in {self.n_bands} of {bands}{flags}"
+            return f"<FitResults of {key!r}, {text}>"
         good = int(np.count_nonzero(self.fitted))
         n = len(self)
         return f"<FitResults of {n} object{'s' * (n != 1)}, {good} fitted, {bands}>"
@@ -613,3 +619,6 @@ class FitResults(FitRows):
     plot_corner = of_id(drawing.plot_corner)
     plot_redshift = drawing.plot_redshift
     plot_sfh = of_id(histories.plot_sfh)
+
+
+FlagField.add_to(FitResults, "flags", FitFlags)

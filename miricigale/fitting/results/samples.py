@@ -18,6 +18,7 @@ from miricigale.fitting.results.percentile_columns import LEVELS, suffix
 from miricigale.sed import grid_spectra
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
+from miricigale.utils.flag_arrays import FlagField
 from miricigale.utils.object_rows import PerObject, PerObjectDict
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.tables import described_table, error_column
@@ -168,7 +169,10 @@ model : `~miricigale.sed.SEDModel`, optional
 
     def __repr__(self):
         if self.isscalar:
-            return f"<Samples of {np.asarray(self.ids).item()!r}, {self.n_draws} draws>"
+            flags = ""
+            if self.flags:
+                flags = f", {self.flags}"
+            return f"<Samples of {np.asarray(self.ids).item()!r}, {self.n_draws} draws{flags}>"
         n = len(self)
         return f"<Samples of {n} object{'s' * (n != 1)}, {self.n_draws} draws each>"
 
@@ -588,3 +592,6 @@ model : `~miricigale.sed.SEDModel`, optional
                     values[i] = np.log10(values[i])
             labels.append(label)
         return plot_corner(labels, marginals, joints, truths=values, figure=figure)
+
+
+FlagField.add_to(Samples, "flags", FitFlags)

@@ -24,9 +24,10 @@ from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.photometry.templates.normal_equations import correlated_draws
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
+from miricigale.utils.flag_arrays import FlagField
 from miricigale.utils.interactive import Tabular
 from miricigale.utils.missing_values import floats
-from miricigale.utils.named_values import field_values
+from miricigale.utils.named_values import field_names
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed
@@ -230,7 +231,9 @@ class ForcedPhotometryResult(Tabular):
     def __post_init__(self):
         # a column refers to its table, and does not pickle
         object.__setattr__(self, "sky", self.sky.copy())
-        for value in field_values(self).values():
+        # not views of them
+        for name in field_names(self):
+            value = self.__dict__[name]
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
 
@@ -532,3 +535,6 @@ class ForcedPhotometryResult(Tabular):
         model = self.model_image.data[part]
         residual = self.residual_image.data[part]
         return plot_model_residual(residual + model, model, ax=ax, pixel_scale=scale, **kwargs)
+
+
+FlagField.add_to(ForcedPhotometryResult, "flags", ForcedFlags)
