@@ -26,6 +26,8 @@ _SPECTRA = (
 )
 #: Wavelengths in um that an axis of photometry is labeled with.
 _WAVELENGTHS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+#: Part of the largest density above which an axis shows a posterior, and of all its weight for a single value.
+_SHOWN = 0.01
 
 
 def _value(quantity, unit=None):
@@ -38,6 +40,10 @@ def _value(quantity, unit=None):
 def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kwargs):
     """
     Draw a one-dimensional posterior as density over its cells; a cell of no width is a line with its weight.
+
+    The axis reaches from the first to the last cell whose density is 0.01 of the largest one or more, with the
+    margin of the axes; axes with several posteriors hold all of them. All cells are drawn: ``ax.set_xlim(...)``,
+    before or after, shows others.
 
     Parameters
     ----------
@@ -66,10 +72,15 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     weights = np.asarray(weights, dtype=float)
     width = np.diff(np.log10(np.maximum(edges, 1e-300)) if log else edges)
     density = np.divide(weights, width, out=np.zeros(weights.size), where=width > 0)
+    drawn_before = ax.dataLim.intervalx.copy()
     ax.stairs(density, edges, **{"fill": True, "alpha": 0.5, **kwargs})
+    _limit_data(ax, drawn_before, _occupied(edges, weights, density))
     # the probability of a single value, such as that a component is absent
     for i in np.flatnonzero((np.diff(edges) == 0) & (weights > 0)):
+        limits = ax.dataLim.intervalx.copy()
         ax.axvline(edges[i], linewidth=3, alpha=0.5)
+        if weights[i] < _SHOWN * weights.sum():
+            _limit_data(ax, limits, [])
         text = f"P({edges[i]:g}) = {weights[i]:.2f}"
         ax.annotate(
             text,
@@ -78,6 +89,7 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
             va="top",
             xycoords=("data", "axes fraction"),
             textcoords="offset points",
+            annotation_clip=True,
         )
     if log:
         ax.set_xscale("log")
@@ -91,6 +103,22 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     ax.set_ylabel("probability density" + (" per dex" if log else ""))
     ax.set_ylim(0, None, auto=True)
     return ax
+
+
+def _occupied(edges, weights, density):
+    """Return the ends of the cells that hold the posterior; all of them if no cell has a width."""
+    is_dense = density >= _SHOWN * density.max(initial=0.0)
+    cells = np.flatnonzero(is_dense & (density > 0))
+    if not cells.size:
+        return edges[[0, -1]]
+    return edges[[cells[0], cells[-1] + 1]]
+
+
+def _limit_data(ax, *intervals):
+    """Let the x axis of axes that scale themselves hold some intervals, and nothing else that was drawn."""
+    ends = np.concatenate(intervals)
+    ends = ends[np.isfinite(ends)]
+    ax.dataLim.intervalx = (ends.min(), ends.max())
 
 
 def plot_pdf_2d(

@@ -47,6 +47,43 @@ def test_cells_without_width_have_no_density(ax):
     assert ax.patches[0].get_data().values.tolist() == [0.0]
 
 
+def test_the_axis_is_where_the_probability_is(ax):
+    """A normal density falls to 0.01 of its maximum at sqrt(2 ln 100) = 3.03 sigma."""
+    edges = np.linspace(0.0, 10.0, 2001)
+    centers = 0.5 * (edges[1:] + edges[:-1])
+    weights = np.exp(-0.5 * ((centers - 3.0) / 0.1) ** 2)
+    plot_pdf(edges, weights, ax=ax)
+    half = 0.1 * np.sqrt(2 * np.log(100))
+    margin = 1 + 2 * ax.margins()[0]
+    assert_allclose(ax.get_xlim(), (3 - margin * half, 3 + margin * half), atol=0.006)
+    # all cells are there for other limits
+    assert_array_equal(ax.patches[0].get_data().edges, edges)
+    # several posteriors, and a truth
+    plot_pdf(edges, np.roll(weights, 200), ax=ax)
+    assert_allclose(ax.get_xlim(), (3 - half, 4 + half), atol=0.12)
+    plot_pdf(edges, weights, ax=ax, truth=8.0)
+    assert_allclose(ax.get_xlim()[1], 8.0, atol=0.3)
+    ax.set_xlim(0, 10)
+    plot_pdf(edges, weights, ax=ax)
+    assert ax.get_xlim() == (0, 10)
+
+
+def test_a_value_of_little_weight_does_not_widen_the_axis(ax):
+    edges = np.array([0.0, 0.0, 0.5, 0.6, 0.7, 1.0])
+    plot_pdf(edges, [0.001, 0.0, 0.5, 0.499, 0.0], ax=ax)
+    assert 0.45 < ax.get_xlim()[0] < 0.5
+    assert 0.7 < ax.get_xlim()[1] < 0.75
+    plot_pdf(edges, [0.1, 0.0, 0.5, 0.4, 0.0], ax=ax)
+    assert ax.get_xlim()[0] < 0
+
+
+def test_limits_of_a_logarithmic_axis(ax):
+    plot_pdf(10.0 ** np.arange(7), [0, 0, 0.5, 0.5, 0, 0], ax=ax, log=True)
+    low, high = np.log10(ax.get_xlim())
+    assert 1.8 < low < 2
+    assert 4 < high < 4.2
+
+
 def test_outline_holds_the_stated_part(ax):
     weights = np.zeros((5, 4))
     weights[2, 1] = 0.7
