@@ -15,7 +15,7 @@ from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, replacing, write_fits
 from miricigale.utils.meta import json_meta
 from miricigale.utils.options import check_data, check_that
-from miricigale.utils.units import with_adu
+from miricigale.utils.units import header_unit, with_adu
 
 #: Steps of rounded values in the median error of an image: with its dither that adds less than 1e-3
 #: of its error to a flux.
@@ -99,7 +99,7 @@ def write_planes(image, path, *, planes, rounded, overwrite=False):
         header = image.wcs.to_header(relax=True)
     else:
         header = fits.Header()
-    header["BUNIT"] = image.unit.to_string("fits")
+    header["BUNIT"] = header_unit(image.unit)
     header["META"] = json_meta(image.meta)
     data = np.asarray(image.data, np.float32)
     error = None

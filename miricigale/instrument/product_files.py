@@ -26,7 +26,7 @@ from miricigale.utils.files import replacing, write_fits
 from miricigale.utils.meta import json_meta
 from miricigale.utils.named_values import without_none
 from miricigale.utils.options import check_that
-from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, with_adu
+from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, header_unit, with_adu
 
 #: How files of products of JWST are called.
 _PRODUCT_NAME = re.compile(
@@ -221,7 +221,7 @@ def _product_unit(unit):
     for product_unit, name in ((RATE, "DN/s"), (SURFACE_BRIGHTNESS, "MJy/sr")):
         if with_adu(unit).is_equivalent(product_unit):
             return name, np.float32(with_adu(unit).to(product_unit))
-    return unit.to_string("fits"), np.float32(1)
+    return header_unit(unit), np.float32(1)
 
 
 def _add_sky(science, wcs, shape):

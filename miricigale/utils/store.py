@@ -11,6 +11,7 @@ from miricigale.utils.exceptions import data_error, file_errors
 from miricigale.utils.files import open_fits, replacing, write_fits
 from miricigale.utils.fits_tables import table_hdu
 from miricigale.utils.meta import plain_value, undated
+from miricigale.utils.units import header_unit
 
 _TEXT = "TEXT"
 
@@ -58,7 +59,7 @@ def write_parts(path, layout, *, shown=None, text=None, arrays=None, tables=None
         if array.size:
             hdu = fits.ImageHDU(array.astype(np.uint8) if array.dtype == bool else array, name=name)
             if unit is not None:
-                hdu.header["BUNIT"] = unit.to_string("fits")
+                hdu.header["BUNIT"] = header_unit(unit)
             hdus.append(hdu)
     for name, table in (tables or {}).items():
         if not isinstance(table, Table):

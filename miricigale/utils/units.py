@@ -80,6 +80,34 @@ def with_adu(unit):
     return unit
 
 
+def header_unit(unit):
+    """
+    Return the text of a unit for ``BUNIT`` of a header: DN for adu, as jwst calls counts.
+
+    Parameters
+    ----------
+    unit : `~astropy.units.UnitBase`
+        Of an image. Units that the standard of FITS does not have are written as astropy reads them.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.utils.units import header_unit
+    >>> header_unit(u.adu / u.s), header_unit(u.DN / u.s), header_unit(u.MJy / u.sr)
+    ('DN/s', 'DN/s', 'MJy sr-1')
+    >>> header_unit(u.electron / u.s)
+    'electron / s'
+    """
+    if with_adu(unit) == RATE:
+        return "DN/s"
+    if with_adu(unit) == DN:
+        return "DN"
+    try:
+        return unit.to_string("fits")
+    except ValueError:
+        return unit.to_string()
+
+
 def flux_unit(unit):
     """
     Return the unit that a name of a flux density means beyond those of astropy.

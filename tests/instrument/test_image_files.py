@@ -30,6 +30,29 @@ def test_images_survive_the_file(tmp_path):
     assert back.wcs.pixel_to_world(1, 2).separation(wcs.pixel_to_world(1, 2)) < 1e-6 * u.arcsec
 
 
+@pytest.mark.parametrize(
+    ("unit", "text", "wanted"),
+    [
+        ("adu/s", "DN/s", u.adu / u.s),
+        ("DN/s", "DN/s", u.adu / u.s),
+        ("DN", "DN", u.adu),
+        ("electron/s", "electron / s", u.electron / u.s),
+        ("uJy/pix", None, u.uJy / u.pix),
+        (0.01 * u.adu / u.s, None, 0.01 * u.adu / u.s),
+        (u.Unit("3.5 DN/s"), None, 3.5 * u.adu / u.s),
+    ],
+)
+def test_counts_have_the_name_of_jwst_and_any_unit_comes_back(tmp_path, unit, text, wanted):
+    """DN is not of the standard of FITS, and astropy reads it all the same."""
+    image = CCDData(np.ones((3, 4)), unit=u.Unit(unit))
+    write_image(image, tmp_path / "image.fits")
+    header = fits.getheader(tmp_path / "image.fits", "SCI")
+    assert text is None or header["BUNIT"] == text
+    assert u.Unit(header["BUNIT"]).is_equivalent(image.unit) or "DN" in header["BUNIT"]
+    back = read_image(tmp_path / "image.fits")
+    assert back.unit.to(u.Unit(wanted)) == pytest.approx(1.0)
+
+
 def test_the_same_image_makes_the_same_bytes(tmp_path):
     image = CCDData(np.arange(12.0).reshape(3, 4), unit=u.MJy / u.sr, mask=np.zeros((3, 4), bool))
     write_image(image, tmp_path / "first.fits", planes={"dq": np.ones((3, 4), np.uint32)})
