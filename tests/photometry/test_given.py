@@ -153,6 +153,32 @@ def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
     refuses("'catalog' must be given without a high-resolution", points.measure, images[0])
 
 
+@pytest.mark.parametrize("unit", ["nJy", "uJy/pix", "uJy/arcsec2", "0.5 MJy/sr"])
+def test_model_and_residual_are_in_the_unit_that_is_asked_for(images, psfs, sky, unit):
+    """In that of the image they add up to it, and models of points to their fluxes."""
+    image = images[0]
+    unit = u.Unit(unit)
+    result = ForcedPhotometer(psf=psfs["psf"]).measure(image, sky)
+    brightness = result.model_image.unit
+    scale = brightness.to(unit) if unit.is_equivalent(brightness) else None
+    if scale is None:
+        pixel = u.pix if u.pix in unit.bases else u.one
+        area = pixel_area_map(image.wcs, image.shape) * u.sr
+        scale = (brightness * area).to_value(unit * pixel)
+    model, residual = result.images_in(unit)
+    assert model.unit == residual.unit == unit
+    assert_allclose(model.data, result.model_image.data * scale)
+    assert_allclose(residual.uncertainty.array, result.residual_image.uncertainty.array * scale)
+    assert_array_equal(residual.mask, result.residual_image.mask)
+    if unit == u.nJy:
+        assert_allclose(model.data.sum(), 1e3 * result.flux.value.sum(), rtol=0.05)
+    # in the unit of the image they add up to it
+    model, residual = result.images_in(image)
+    assert residual.unit == image.unit
+    assert_allclose(model.data + residual.data, image.data, rtol=1e-5, atol=1e-4)
+    refuses("'unit' must be convertible", result.images_in, "DN/s", error=u.UnitsError)
+
+
 def test_results_are_indexed_like_their_table(images, psfs, sky):
     result = ForcedPhotometer(psf=psfs["psf"]).measure(images[0], sky)
     assert_array_equal(result["flux"].value, result.flux.value)

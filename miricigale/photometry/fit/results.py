@@ -9,12 +9,13 @@ import numpy as np
 import scipy.ndimage
 import scipy.sparse
 from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData
+from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import QTable
 from scipy.special import ndtr, ndtri
 
 from miricigale.evaluation.match import associate
+from miricigale.instrument import pixel_area_map
 from miricigale.instrument.image import Image
 from miricigale.photometry.detection.prior_catalog import read_catalog
 from miricigale.photometry.fit.offsets import OffsetMap
@@ -22,7 +23,7 @@ from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.photometry.images.fields import SmoothField
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.photometry.templates.normal_equations import correlated_draws
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.flag_arrays import FlagField
 from miricigale.utils.interactive import Tabular
@@ -33,7 +34,7 @@ from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed
 from miricigale.utils.region_files import circles, write_circles
 from miricigale.utils.tables import described_table
-from miricigale.utils.units import ANGLE, FNU, check_count, is_number, positive
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, check_count, is_number, positive
 from miricigale.utils.values import value_class
 
 #: Columns of which a band's name takes the place of flux.
@@ -134,7 +135,7 @@ class ForcedPhotometryResult(Tabular):
     x, y : `~numpy.ndarray`, shape (n,)
         Positions on the image; NaN far outside.
     model_image, residual_image : `~astropy.nddata.CCDData`
-        MJy/sr, on the image's grid.
+        On the image's grid, in MJy/sr whatever unit the image had; `images_in` has them in another unit.
     noise_correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1), or None
         Measured covariance of the noise in units of sigma^2 by separation; None where
         the noise was taken as white.
@@ -171,7 +172,7 @@ class ForcedPhotometryResult(Tabular):
     >>> import astropy.units as u
     >>> import numpy as np
     >>> from astropy.coordinates import SkyCoord
-    >>> from astropy.nddata import CCDData
+    >>> from astropy.nddata import CCDData, StdDevUncertainty
     >>> from miricigale.instrument import north_up_wcs
     >>> from miricigale.photometry import ForcedPhotometer
     >>> from miricigale.psf import gaussian_psf, psf_image
@@ -282,6 +283,56 @@ class ForcedPhotometryResult(Tabular):
         weight = scipy.ndimage.gaussian_filter(usable.astype(float), width, mode="constant")
         chi2 = np.divide(total, weight, out=np.full(total.shape, np.nan), where=usable)
         return Image(chi2, unit="", wcs=image.wcs, mask=~usable, meta=dict(image.meta))
+
+    def images_in(self, unit):
+        """
+        Return model and residual in another unit, such as that of the image that was measured.
+
+        Parameters
+        ----------
+        unit : unit-like, quantity or `~astropy.nddata.CCDData`
+            A unit of surface brightness, or of the flux in a pixel (``"nJy"``, ``"uJy/pix"``); an image stands for
+            its unit. Of counts, the quantity that one count is: ``0.4 * u.MJy / u.sr``.
+
+        Returns
+        -------
+        model, residual : `~astropy.nddata.CCDData`
+            The residual has its mask and uncertainty. Fluxes in pixels are surface brightness times the solid
+            angle of each pixel.
+
+        Raises
+        ------
+        `~astropy.units.UnitsError`
+            If the unit is none of these.
+
+        Examples
+        --------
+        >>> model, residual = result.images_in("nJy")  # doctest: +SKIP
+        >>> model, residual = result.images_in(image)  # doctest: +SKIP
+        """
+        if isinstance(unit, CCDData):
+            unit = unit.unit
+        unit = u.Unit(unit)
+        area = 1.0
+        for pixel in (u.dimensionless_unscaled, u.pix):
+            if (unit * pixel).is_equivalent(FNU):
+                area = pixel_area_map(self.model_image.wcs, self.model_image.shape)
+                factor = u.MJy.to(unit * pixel)
+                break
+        else:
+            if not unit.is_equivalent(SURFACE_BRIGHTNESS):
+                wanted = f"convertible to {SURFACE_BRIGHTNESS} or {FNU}"
+                raise units_error("unit", wanted, unit)
+            factor = SURFACE_BRIGHTNESS.to(unit)
+        scale = factor * area
+        images = []
+        for image in (self.model_image, self.residual_image):
+            uncertainty = None
+            if image.uncertainty is not None:
+                uncertainty = StdDevUncertainty(image.uncertainty.array * scale)
+            options = {"mask": image.mask, "meta": dict(image.meta), "uncertainty": uncertainty}
+            images.append(Image(image.data * scale, unit=unit, wcs=image.wcs, **options))
+        return tuple(images)
 
     def sample(self, size, *, seed=None):
         """
