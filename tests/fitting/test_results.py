@@ -94,6 +94,10 @@ def test_views_agree_with_the_catalog(results):
         results.loc[99]
     refuses("no parameter 'mood'; known: accretion_power", results.mean, "mood", error=KeyError)
     refuses("'levels' must be all between 0 and 1", results.percentile, "mass", [0.5, 16])
+    # fractions and percentages, or small percentages: which is meant is not guessed
+    text = r"on both sides of 1 take parts, \[0.001, 0.999\] for percentages, got \[ ?0.1 99.9\]"
+    refuses(text, results.percentile, "mass", [0.1, 99.9])
+    refuses(r"\[0.01, 0.5\] for percentages", results.percentile, "mass", [1, 50])
 
 
 def test_prediction_of_the_best_model(results, grid):
