@@ -11,12 +11,12 @@ from miricigale.utils.options import check_that
 def _key_values(args, command):
     """Return values of the keys of the configuration for which options stand, where they are given."""
     values = {}
-    if args.seed is not None:
+    if getattr(args, "seed", None) is not None:
         values[f"{command}.seed"] = args.seed
-    if args.n_threads is not None:
+    if getattr(args, "n_threads", None) is not None:
         values[f"{command}.threads"] = args.n_threads
     for flags, option in declarations()[command]["options"].items():
-        value = getattr(args, destination(flags, option))
+        value = getattr(args, destination(flags, option), None)
         if "key" in option and value is not None and value is not False:
             values[option["key"]] = value
     return values
@@ -85,11 +85,34 @@ _COMPARED = [
 ]  # fmt: skip
 
 
-def plan(args):
-    """Tabulate exposures, or compare plans."""
+def depth(args):
+    """Tabulate the depth and saturation of exposures."""
+    from miricigale.planning import depth_table, load_plan, plan_table
+
+    _take_bands(args)
+    # a plan of these exposures alone
+    args.config = None
+    args.sets = None
+    args.settings = []
+    values = _key_values(args, "plan")
+    if not values and args.bands is None and args.position is None:
+        plan_table().pprint_all()
+        return 0
+    values = _plan_values(args, values)
+    depth_table(load_plan(None, overrides=_settings(args, values))).pprint_all()
+    return 0
+
+
+def _take_bands(args):
+    """Take bands without an option as those of ``--bands``."""
     if args.positional:
         check_that(args.bands is None, "bands", "left out beside bands without it", args.bands)
         args.bands = args.positional
+
+
+def plan(args):
+    """Tabulate exposures, or compare plans."""
+    _take_bands(args)
     values = _key_values(args, "plan")
     has_files = args.config is not None or args.output is not None
     has_options = args.bands is not None or args.position is not None or args.settings

@@ -1,3 +1,4 @@
+from .commands import depth_table as depth_table
 from .commands import plan_table as plan_table
 from .commands import write_plan as write_plan
 from .compare import area_table as area_table

@@ -55,6 +55,42 @@ def plan_table(*, quick=False):
     return QTable(rows)[order]
 
 
+def depth_table(config):
+    """
+    Return the exposures of all bands of a plan: time, filling of the well by the sky, limits and saturation.
+
+    Parameters
+    ----------
+    config : `~miricigale.planning.PlanConfig`
+        The plan.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each band, with the columns of `plan_table` but ``limit_proposal``; ``background``, the sky; and
+        ``saturation``, the AB magnitude at which a point source saturates.
+
+    Examples
+    --------
+    >>> from miricigale.planning import depth_table, load_plan
+    >>> exposures = {"bands": ["miri.f770w"], "time": [3600.0], "dithers": [4]}
+    >>> table = depth_table(load_plan(None, overrides={"exposures": exposures}))
+    >>> table["time"][0].round()
+    <Quantity 3596. s>
+    """
+    from miricigale.instrument import psf_fwhm
+    from miricigale.planning.planner import Planner
+
+    planner = Planner(config)
+    bands = config.exposures.bands
+    rows = []
+    for name, plan in planner.band_plans(planner.share(bands), bands).items():
+        row = plan.numbers()
+        row["saturation"] = np.round(plan.saturation, 2)
+        rows.append(row | {"fwhm": psf_fwhm(name)})
+    return QTable(rows)
+
+
 def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=False):
     """
     Work out a plan and write it.

@@ -98,6 +98,28 @@ def test_filters_and_exposures_are_listed(capsys):
     assert all(word in text for word in ("miri.f2100w", "1665.0", "4662.0"))
 
 
+def test_depths_of_exposures_are_those_of_the_function(capsys):
+    """Of the same frames; a brighter sky is shallower, and nothing is fitted."""
+    from miricigale.depth import sensitivity
+
+    words = ("depth", "F770W,F1500W", "--time", "1h", "--dithers", "8")
+    lines = command(capsys, *words).out.splitlines()
+    names = lines[0].split()
+    rows = [dict(zip(names, line.split(), strict=True)) for line in lines[3:]]
+    assert [row["filter"] for row in rows] == ["miri.f770w", "miri.f1500w"]
+    for row in rows:
+        time = float(row["time"]) * u.s
+        assert abs(time - 1 * u.hour) < 60 * u.s
+        frames = {"n_groups": int(row["groups"]), "n_dithers": int(row["dithers"])}
+        limit = sensitivity(row["filter"], time, **frames).to_value("mag(AB)")
+        assert float(row["limit"]) == pytest.approx(limit, abs=0.0051)
+        assert float(row["saturation"]) < float(row["limit_etc"]) < float(row["limit"])
+    bright = command(capsys, *words, "--background", "high").out.splitlines()[3].split()
+    assert float(bright[names.index("limit")]) < float(rows[0]["limit"])
+    # without options those of CEERS, as of plan
+    assert command(capsys, "depth").out == command(capsys, "plan").out
+
+
 def test_the_plans_own_limits_lie_between_the_calculators_and_those_without_a_residual():
     from miricigale.depth import sensitivity
     from miricigale.planning import plan_table
@@ -200,7 +222,12 @@ def test_help_names_presets_and_surveys(capsys):
         (["fit", "a.fits", "--ncores", "4"], "did you mean '--threads'?"),
         (["fit", "a.fits", "--zzz", "4"], "--zzz 4 (see miricigale fit --help)"),
         (["photometry", "a.fits"], "give the images and, last, the high-resolution image"),
-        (["sensitivity", "F770W"], "did you mean 'plan'?"),
+        (["sensitivity", "F770W"], "did you mean 'depth'?"),
+        (
+            ["depth", "F770W", "--bands", "F1000W"],
+            "--bands must be left out beside bands without it",
+        ),
+        (["depth", "F444W"], "no imaging filter 'F444W'"),
         (
             ["run", "goodss", "--quick", "--plan", "--until", "mosaic"],
             "--until is 'mosaic', which is no",
