@@ -3,6 +3,8 @@
 import collections
 import re
 
+from miricigale.utils.package_tables import declared
+
 #: Journals: how citations name them, the macro of ADS, and their code in the identifiers of ADS.
 _JOURNALS = {
     "ApJ": (r"\apj", "ApJ.."),
@@ -38,8 +40,9 @@ def bibtex(citations):
     Returns
     -------
     text : str
-        An ``@article`` of each paper in a journal, with its page in ADS, which has all authors, the title and the
-        DOI; a ``@misc`` of everything else, whose note is the citation. Each is there once.
+        An ``@article`` of each paper in a journal, with its page in ADS, which has all authors; with title and DOI
+        where ``papers.toml`` has them. A ``@misc`` of everything else, whose note is the citation. Each is there
+        once.
 
     Examples
     --------
@@ -48,6 +51,8 @@ def bibtex(citations):
     @article{yang2021,
       author = {Yang and others},
       year = {2021},
+      title = {{JWST/MIRI} Simulated Imaging: Insights into ... Galaxies in Deep Surveys},
+      doi = {10.3847/1538-4357/abd6c1},
       journal = {\apj},
       volume = {908},
       pages = {144},
@@ -72,14 +77,19 @@ def _entry(work):
     paper = re.sub(r"^by way of [^,]+, ", "", work)
     if match := _ARTICLE.match(paper):
         journal, code = _JOURNALS[match["journal"]]
-        fields = _dated_fields(match)
+        identifier = _ads_identifier(match, code)
+        fields = _dated_fields(match) | declared("miricigale.cli", "papers.toml").get(
+            identifier, {}
+        )
         fields |= {"journal": journal, "volume": match["volume"], "pages": match["page"]}
-        identifier = _ads_identifier(match, code).replace("&", "%26")
-        fields["adsurl"] = f"https://ui.adsabs.harvard.edu/abs/{identifier}"
+        address = identifier.replace("&", "%26")
+        fields["adsurl"] = f"https://ui.adsabs.harvard.edu/abs/{address}"
         return "article", fields
     if match := _PREPRINT.match(paper):
         fields = _dated_fields(match)
         fields |= {"eprint": match["number"], "archiveprefix": "arXiv"}
+        # arXiv registers a DOI of each preprint
+        fields["doi"] = f"10.48550/arXiv.{match['number']}"
         fields["url"] = f"https://arxiv.org/abs/{match['number']}"
         return "misc", fields
     fields = {}
