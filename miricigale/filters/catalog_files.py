@@ -223,7 +223,7 @@ def negative_error_message(counts):
     return (
         f"fluxes with a negative error are not fitted: {', '.join(parts)}; where it marks an upper "
         "limit, as in CIGALE, read_catalog_photometry(path, limits=True), or limits = true in the "
-        "file of --map, reads it as one"
+        "file of --map, reads it as one (a table has limits where <band>_limit is true, with their errors)"
     )
 
 

@@ -559,7 +559,8 @@ class BayesFitter(CatalogFits):
             parallel={"executor": executor, "progress_bar": progress_bar},
         )
         warn_of_pulls(results)
-        warn_of_unconverged(results)
+        n_asked = results.meta["fit"].get("interpolate")
+        warn_of_unconverged(results.flags, results.fitted, n_asked)
         sample = results.reduced_chi2[:: chi2_step(len(results))]
         return with_high_chi2(results, chi2_limit(sample))
 

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from helpers.errors import refuses
 from helpers.grids import draw_photometry, node_fitter
 from helpers.results import assert_joined, assert_same, assert_same_tables
-from miricigale.fitting import FitFlags, FitResults, fit_file, open_results
+from miricigale.fitting import FitFlags, FitResults, GridSettings, fit_file, open_results
 from miricigale.fitting.results.io import FitFolder
 from miricigale.utils.exceptions import CatalogWarning, DataError, FitWarning
 from miricigale.utils.row_files import write_rows
@@ -82,13 +82,28 @@ def on_disk(catalog, tmp_path):
 def in_pieces(fitter, tmp_path):
     """Fit a catalog from a file of some kind, in a folder that begins anew."""
 
-    def fit(catalog, *, kind="fits", chunk_rows=40, delimiter=None, **options):
+    def fit(catalog, *, kind="fits", chunk_rows=40, delimiter=None, fitter=fitter, **options):
         path = tmp_path / f"catalog.{kind}"
         catalog.write(path, overwrite=True, **({"delimiter": delimiter} if delimiter else {}))
         options = {"chunk_rows": chunk_rows, "resume": False, **options}
         return fit_file(fitter, path, tmp_path / "out", **options)
 
     return fit
+
+
+def test_fits_that_are_not_converged_are_counted_once(fitter, catalog, in_pieces, monkeypatch):
+    """Of all pieces together, as of the whole catalog."""
+    monkeypatch.setattr("miricigale.fitting.grid.adaptive._MAX_PLACES_EACH", 1)
+    monkeypatch.setattr("miricigale.fitting.grid.adaptive._MIN_MAX_PLACES", 512)
+    fitter = fitter.replace(settings=GridSettings(interpolate=1000))
+    catalog = catalog[:20]
+    texts = []
+    for call in (fitter.fit, lambda table: in_pieces(table, fitter=fitter, chunk_rows=7)):
+        with pytest.warns(FitWarning, match="fits are not converged") as caught:
+            call(catalog)
+        texts += [str(w.message) for w in caught if "not converged" in str(w.message)]
+    assert len(texts) == 2
+    assert texts[0] == texts[1]
 
 
 def test_negative_errors_of_all_pieces_are_counted(fitter, catalog, in_pieces):

@@ -30,12 +30,13 @@ from miricigale.fitting.results.io import (
     FitFolder,
     open_results,
     part_chi2,
+    part_flags,
     part_ids,
     part_name,
     write_part,
 )
 from miricigale.fitting.results.pulls import warn_of_pulls
-from miricigale.fitting.results.sample_flags import chi2_limit, chi2_step
+from miricigale.fitting.results.sample_flags import chi2_limit, chi2_step, warn_of_unconverged
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import (
     CatalogWarning,
@@ -205,6 +206,7 @@ def fit_file(
         # the limit depends on the whole sample
         folder.facts["chi2_limit"] = _chi2_limit(folder, rows.n_chunks)
         folder.write_manifest()
+        _warn_of_unconverged(fitter, folder, rows.n_chunks)
     return open_results(path_out, model=fitter.model, curves=fitter.curves)
 
 
@@ -213,6 +215,13 @@ def _chi2_limit(folder, n_parts):
     parts = [part_chi2(folder.path(part_name(i))) for i in range(n_parts)]
     step = chi2_step(sum(map(len, parts)))
     return chi2_limit(np.concatenate(parts)[::step])
+
+
+def _warn_of_unconverged(fitter, folder, n_parts):
+    """Warn of fits that are not converged, of all parts together."""
+    parts = [part_flags(folder.path(part_name(i))) for i in range(n_parts)]
+    flags, fitted = map(np.concatenate, zip(*parts, strict=True))
+    warn_of_unconverged(flags, fitted, fitter.settings().get("interpolate"))
 
 
 @contextlib.contextmanager

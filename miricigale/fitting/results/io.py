@@ -240,6 +240,13 @@ def part_ids(path):
         return native(np.array(hdus["RESULTS"].data["ids"]))
 
 
+def part_flags(path):
+    """Read the flags of the objects of a part and which were fitted, without the rest."""
+    with open_fits(path, wanted="fit results", memmap=True) as hdus:
+        data = hdus["RESULTS"].data
+        return native(np.array(data["flags"])), np.isfinite(native(np.array(data["chi2"])))
+
+
 def part_chi2(path):
     """Read the reduced chi2 of the objects of a part, without the rest; NaN of a single band."""
     with open_fits(path, wanted="fit results", memmap=True) as hdus:

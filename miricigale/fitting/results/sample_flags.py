@@ -4,7 +4,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from miricigale.fitting.data.likelihood import HIGH_CHI2, FitFlags
-from miricigale.fitting.data.settings import GridSettings
 from miricigale.utils.exceptions import FitWarning, warn
 
 #: What a warning of fits that are not converged begins with, after their number.
@@ -79,16 +78,25 @@ def with_high_chi2(results, limit):
     return results._changed(flags=flags)
 
 
-def warn_of_unconverged(results):
-    """Warn of fits with the flag ``NOT_CONVERGED``, once, with their number and what can be done."""
-    n_flagged = np.count_nonzero(results.flags & int(FitFlags.NOT_CONVERGED))
+def warn_of_unconverged(flags, fitted, n_asked):
+    """
+    Warn of fits with the flag ``NOT_CONVERGED``, once, with their number and what can be done.
+
+    Parameters
+    ----------
+    flags : `~numpy.ndarray` of int, shape (n,)
+        `FitFlags` of the objects.
+    fitted : `~numpy.ndarray` of bool, shape (n,)
+        Which were fitted.
+    n_asked : int
+        ``interpolate`` of the settings of the fit.
+    """
+    n_flagged = np.count_nonzero(np.asarray(flags) & int(FitFlags.NOT_CONVERGED))
     if n_flagged:
-        n_fitted = np.count_nonzero(results.fitted)
-        n_asked = results.meta["fit"].get("interpolate", GridSettings.interpolate)
         msg = (
-            f"{n_flagged} of {n_fitted} {NOT_CONVERGED_TEXT} (flag NOT_CONVERGED): their percentiles "
-            "are uncertain; settings=GridSettings(interpolate=...) of a larger number than "
-            f"{n_asked} evaluates more models"
+            f"{n_flagged} of {np.count_nonzero(fitted)} {NOT_CONVERGED_TEXT} (flag NOT_CONVERGED): "
+            "their percentiles are uncertain; settings=GridSettings(interpolate=...) or "
+            f"--interpolate of a larger number than {n_asked} evaluates more models"
         )
         warn(msg, FitWarning)
 
