@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-from astropy.utils.decorators import deprecated
 
 from miricigale.depth.saturation import SKY_FRACTION, SaturationForecast, saturation_forecast
 from miricigale.detector import level1b
@@ -147,11 +146,6 @@ class Detector(Interactive):
         check_names([e for e in effects if isinstance(e, str)], "set of effects", sets)
         parts = (map(effect_from_record, sets[e]) if isinstance(e, str) else [e] for e in effects)
         return cls(properties=properties).replace(*itertools.chain.from_iterable(parts))
-
-    @deprecated("1.0", alternative="replace")
-    def replaced(self, *effects):
-        """Return `replace` with the same effects."""
-        return self.replace(*effects)
 
     def replace(self, *effects, **properties):
         """

@@ -6,7 +6,6 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.nddata import NDData
-from astropy.utils.decorators import deprecated
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
@@ -153,11 +152,6 @@ class InstrumentPSF(ImagePSF):
         fraction : `~numpy.ndarray` or float
         """
         return enclosed_light(self, self.data, radius)
-
-    @deprecated("1.0", alternative="replace")
-    def replaced(self, data=None, *, meta=None, **changes):
-        """Return `replace` with the same changes."""
-        return self.replace(data, meta=meta, **changes)
 
     def replace(self, data=None, *, meta=None, **changes):
         """

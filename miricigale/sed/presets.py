@@ -174,8 +174,8 @@ def survey_axes(kind="survey"):
     kind : {"survey", "far-infrared"}, optional
         ``"far-infrared"``: dust at four U_min, three gamma and three q_PAH, flatter slopes of attenuation, color
         excesses from 0.1, no bursts; 15,552 galaxies, one AGN, four fractions. For a model error of 10 % of the
-        flux: `~miricigale.fitting.TemplateError.survey` was measured to 8 um and gives far-infrared
-        bands no weight.
+        flux: the template error of `~miricigale.fitting.SurveyCalibration.survey` was measured to 8 um and gives
+        far-infrared bands no weight.
 
     Returns
     -------

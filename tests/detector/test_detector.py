@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
-from astropy.utils.exceptions import AstropyDeprecationWarning
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
@@ -247,8 +246,6 @@ def test_effects_take_the_place_of_their_kind():
     for name in ("CosmicRays", "cosmic_rays", "cosmic rays"):
         assert detector.without(name).effects == detector.without(CosmicRays).effects
     refuses("no effect 'rays'; ", detector.without, "rays", error=KeyError)
-    with pytest.warns(AstropyDeprecationWarning, match="Use replace instead"):
-        assert detector.replaced(Dark(2.0)).effects == detector.replace(Dark(2.0)).effects
     # settings of the detector stay
     properties = miri_detector().replace(gain=2.0)
     assert Detector.miri_imager(properties=properties).without(Dark).properties is properties

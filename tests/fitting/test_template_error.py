@@ -6,8 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
-from astropy.utils.exceptions import AstropyDeprecationWarning
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from helpers.errors import refuses
 from helpers.grids import draw_photometry, make_grid, node_fitter, photometry_table
@@ -16,7 +15,6 @@ from miricigale.filters import FilterSet
 from miricigale.fitting import (
     BayesFitter,
     GridSettings,
-    SurveyCalibration,
     TemplateError,
     apply_zero_points,
     calibrate_zero_points,
@@ -37,16 +35,6 @@ PIVOTS = np.array([one.pivot.to_value(u.um) for one in FilterSet.from_names(BAND
 @pytest.fixture(scope="module")
 def grid():
     return replace(make_grid(7, n_z=5, n_tau=3, n_age=3), filters=BANDS)
-
-
-def test_the_former_name_of_the_survey_s_errors_is_deprecated():
-    with pytest.warns(
-        AstropyDeprecationWarning, match=r"SurveyCalibration.survey\(\).template_error"
-    ):
-        former = TemplateError.survey()
-    error = SurveyCalibration.survey().template_error
-    assert_array_equal(former.wave, error.wave)
-    assert_array_equal(former.error, error.error)
 
 
 def test_posterior_is_the_sum_over_models_with_the_errors_of_their_redshifts(grid):

@@ -2,13 +2,10 @@
 
 import astropy.units as u
 import numpy as np
-from astropy.utils.decorators import deprecated
 
 from miricigale.filters import FilterSet
-from miricigale.refdata import locate
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_kind, check_that
-from miricigale.utils.table_files import read_table
 from miricigale.utils.units import WAVE, are_not_negative, frozen_array, is_ascending, to_array
 from miricigale.utils.values import value_class
 
@@ -67,14 +64,6 @@ class TemplateError:
     def from_meta(cls, values):
         """Make the template error of the values ``um`` and ``error`` in the file of a `SurveyCalibration`."""
         return cls(values["um"] * WAVE, values["error"])
-
-    @classmethod
-    @deprecated("1.0", alternative="SurveyCalibration.survey().template_error")
-    def survey(cls):
-        """Load the template error of `~miricigale.sed.SEDModel.survey`: that of `SurveyCalibration.survey`."""
-        # the file is read here too: the calibration knows template errors, not the other way round
-        table = read_table(locate("survey.ceers"), wanted="a calibration", form="ascii.ecsv")
-        return cls.from_meta(table.meta["template_error"])
 
 
 def pivots(filters):
