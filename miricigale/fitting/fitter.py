@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-from astropy.utils.decorators import deprecated
-
 from miricigale.filters.band_names import known_filter
 from miricigale.fitting.catalog_fits import CatalogFits
 from miricigale.fitting.data import fitted_bands
@@ -294,35 +292,44 @@ class BayesFitter(CatalogFits):
         if on_grid and names is None and isinstance(model, SEDModel):
             # the grid is made for the bands of the photometry
             return
+        self._make_backend(model, filters, settings, of_grid)
+        self._make_reader()
+
+    def _make_backend(self, model, filters, settings, of_grid):
+        """Make what fits, of a grid or of the models for a sampler."""
+        options = self._options
+        scale_error = options["scale_error"]
         if scale_error is None:
-            scale_error = compat is None
-        else:
-            scale_error = bool(scale_error)
-        if on_grid:
-            self.backend = GridFit.of_model(
-                model, filters, priors, settings, scale_error=scale_error, **of_grid
-            )
+            scale_error = options["compat"] is None
+        arguments = (model, filters, options["priors"], settings)
+        self.grid = None
+        if self.engine == "grid":
+            self.backend = GridFit.of_model(*arguments, scale_error=bool(scale_error), **of_grid)
             self.grid = self.backend.grid
             warn_of_few_models(model, axes, self.grid)
         else:
             self.backend = SamplerFit.of_model(
-                model, filters, priors, settings, scale_error=scale_error, sampler=engine
+                *arguments, scale_error=bool(scale_error), sampler=self.engine
             )
-            self.grid = None
         self.bands = self.backend.filters
         self.priors = self.backend.priors
+
+    def _make_reader(self):
+        """Make the reader of photometry, with the errors and zero points of the bands."""
+        names = self.filters
         if names is not None:
             names = tuple(known_filter(name, self.bands, "filter of the grid") for name in names)
         self.filters = names
         error_bands = names
-        if on_grid:
+        if self.engine == "grid":
             error_bands = self.bands
+        model_error = self._options["model_error"]
         corrections = {}
-        if calibration is not None:
+        if self.calibration is not None:
             for name in ("zero_point", "error_factor"):
-                corrections[name] = calibration.of_bands(name, error_bands, 1.0)
+                corrections[name] = self.calibration.of_bands(name, error_bands, 1.0)
             if model_error is None:
-                model_error = calibration.of_bands("error_part", error_bands, 0.0)
+                model_error = self.calibration.of_bands("error_part", error_bands, 0.0)
                 part = errors_of_expected_flux(self.bands, model_error)
                 self.backend = self.backend.with_relative_errors(part)
                 corrections["added_later"] = tuple(part)
@@ -332,7 +339,7 @@ class BayesFitter(CatalogFits):
             self.bands,
             names,
             model_error=per_band(model_error, error_bands, "model_error"),
-            error_floor=per_band(error_floor, error_bands, "error_floor"),
+            error_floor=per_band(self._options["error_floor"], error_bands, "error_floor"),
             n_bands_min=self.n_bands_min,
             **corrections,
         )
@@ -395,11 +402,6 @@ class BayesFitter(CatalogFits):
         bands, unused = fitted_bands.bands_of(photometry)
         fitted_bands.warn_of_unfitted(unused)
         return self.for_bands(bands)
-
-    @deprecated("1.0", alternative="replace")
-    def changed(self, **options):
-        """Return `replace` with the same options."""
-        return self.replace(**options)
 
     def replace(self, **options):
         """Return a fitter of the same models with other options, named as for `BayesFitter`."""
@@ -537,20 +539,9 @@ class BayesFitter(CatalogFits):
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density, and ``unit`` does not say it.
         """
-        if self.waits:
-            return self.for_photometry(photometry).fit(
-                photometry,
-                unit=unit,
-                redshift=redshift,
-                redshift_prior=redshift_prior,
-                pairs=pairs,
-                seed=seed,
-                executor=executor,
-                progress_bar=progress_bar,
-                chunk_size=chunk_size,
-            )
-        results = self._fit_part(
-            self._table_of(photometry, unit),
+        fitter = self.for_photometry(photometry)
+        results = fitter._fit_part(
+            fitter._table_of(photometry, unit),
             redshift=redshift,
             redshift_prior=redshift_prior,
             pairs=pairs,
@@ -605,17 +596,6 @@ class BayesFitter(CatalogFits):
         ValueError
             See `fit`; or if the fitter has no grid: the results of a sampler hold draws.
         """
-        if self.waits:
-            return self.for_photometry(photometry).sample(
-                photometry,
-                n_draws,
-                seed=seed,
-                unit=unit,
-                redshift=redshift,
-                redshift_prior=redshift_prior,
-                executor=executor,
-                progress_bar=progress_bar,
-            )
         if self.engine != "grid":
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
@@ -624,14 +604,15 @@ class BayesFitter(CatalogFits):
             raise ValueError(msg)
         n_draws = check_count(n_draws, "n_draws")
         seed = check_seed(seed)
-        table = self._table_of(photometry, unit)
-        data, priors, settings = self._prepare(table, redshift, redshift_prior)
-        samples = self.backend.sample(
+        fitter = self.for_photometry(photometry)
+        table = fitter._table_of(photometry, unit)
+        data, priors, settings = fitter._prepare(table, redshift, redshift_prior)
+        samples = fitter.backend.sample(
             data, priors, n_draws, seed, executor=executor, progress_bar=progress_bar
         )
-        cited = self.backend.provenance()["citations"]
+        cited = fitter.backend.provenance()["citations"]
         meta = provenance(citations=cited, fit=settings, seed=seed)
-        return samples._changed(model=self.model, meta=meta)
+        return samples._changed(model=fitter.model, meta=meta)
 
     def settings(self, filters=None):
         """Return the settings of the fit, for the meta of results: a dict of plain values."""

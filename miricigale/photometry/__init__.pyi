@@ -24,12 +24,12 @@ from .fit.corrections import encircled_flux as encircled_flux
 from .fit.corrections import flux_scaling as flux_scaling
 from .fit.exposure_kernels import ExposureKernels as ExposureKernels
 from .fit.exposure_result import ExposureResults as ExposureResults
-from .fit.forced import ErrorSettings as ErrorSettings
 from .fit.forced import ForcedPhotometer as ForcedPhotometer
-from .fit.forced import MemorySettings as MemorySettings
 from .fit.offsets import OffsetMap as OffsetMap
 from .fit.results import ForcedPhotometryResult as ForcedPhotometryResult
 from .fit.results import crowded as crowded
+from .fit.settings import ErrorSettings as ErrorSettings
+from .fit.settings import MemorySettings as MemorySettings
 from .fit.yang2021 import Yang2021Photometer as Yang2021Photometer
 from .images.fields import SmoothField as SmoothField
 from .images.flags import ForcedFlags as ForcedFlags

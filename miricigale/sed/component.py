@@ -7,7 +7,7 @@ import astropy.units as u
 
 from miricigale.refdata import Registry, locate
 from miricigale.refdata.lookup import fingerprint_of
-from miricigale.sed.parameter import Parameter
+from miricigale.sed.parameter import MODEL_PARAMETERS, Parameter
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import ConfigError, argument_error, config_error
 from miricigale.utils.named_values import subset, without
@@ -275,11 +275,8 @@ class Component:
         return f"{type(self).__name__}({', '.join(values)})"
 
 
-def in_order(components):
-    """Return the components of a model in the order of their roles: what is lacking or there twice is refused."""
-    if isinstance(components, (str, Mapping)):
-        wanted = "a list of components or names (SEDModel.from_dict takes tables of them)"
-        raise argument_error("components", wanted, type(components).__name__)
+def made_components(components):
+    """Return components, those that are given by name with their defaults."""
     parts = []
     for component in components:
         if isinstance(component, str):
@@ -287,6 +284,15 @@ def in_order(components):
         wanted = "Component instances or names"
         check_that(isinstance(component, Component), "components", wanted, repr(component))
         parts.append(component)
+    return parts
+
+
+def in_order(components):
+    """Return the components of a model in the order of their roles: what is lacking or there twice is refused."""
+    if isinstance(components, (str, Mapping)):
+        wanted = "a list of components or names (SEDModel.from_dict takes tables of them)"
+        raise argument_error("components", wanted, type(components).__name__)
+    parts = made_components(components)
     components = tuple(sorted(parts, key=lambda part: ROLES.index(part.role)))
     roles = [component.role for component in components]
     for role, name in (("sfh", "age"), ("stellar", "metallicity")):
@@ -299,6 +305,26 @@ def in_order(components):
         good = role not in roles or needed_role in roles
         check_that(good, "components", f"with {needed_role!r} if there is {role!r}", roles)
     return components
+
+
+def chain_parameters(components):
+    """
+    Return the parameters of a model: those of its components in order, then its own.
+
+    Raises
+    ------
+    ValueError
+        If two components have a parameter of the same name, or one has that of the model.
+    """
+    parameters = {}
+    for component in components:
+        twice = set(component.parameters) & (set(parameters) | set(MODEL_PARAMETERS))
+        check_that(not twice, "components", "without shared parameter names", sorted(twice))
+        parameters.update(component.parameters)
+    parameters |= MODEL_PARAMETERS
+    if "dust" not in [component.role for component in components]:
+        del parameters["dust_excess"]
+    return parameters
 
 
 def read_config(config):

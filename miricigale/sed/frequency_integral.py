@@ -1,6 +1,22 @@
 """Integrals of spectra over frequency."""
 
 import numpy as np
+from astropy.constants import c
+
+from miricigale.utils.options import check_that
+from miricigale.utils.units import FNU, WAVE, to_array
+
+
+def integral_at_rest(sed, low, high):
+    """Integrate F_nu of a spectrum over the frequencies between two rest wavelengths: a quantity."""
+    check_that(low is not None, "low", "given with 'high'", low)
+    first = to_array(low, WAVE, "low") * (1.0 + sed.redshift)
+    last = to_array(high, WAVE, "high") * (1.0 + sed.redshift)
+    wave = sed.wave.value
+    is_inside = wave[0] <= first < last <= wave[-1]
+    span = f"{sed.rest_wavelength[0]:.4g} and {sed.rest_wavelength[-1]:.4g}"
+    check_that(is_inside, "low, high", f"in order, and within {span}", f"{low}, {high}")
+    return frequency_integral(wave, sed.fnu.value, first, last) * FNU * c / WAVE
 
 
 def frequency_integral(wave, fnu, first, last):

@@ -10,12 +10,17 @@ from miricigale.filters import FilterSet
 from miricigale.refdata import citations
 from miricigale.sed import gridding, parameter_names, presets, tables
 from miricigale.sed.chain import INFRARED, Chain
-from miricigale.sed.component import Component, in_order, named_component, read_config
+from miricigale.sed.component import (
+    chain_parameters,
+    in_order,
+    made_components,
+    read_config,
+)
 from miricigale.sed.cosmology import COSMOLOGY
 from miricigale.sed.derived import DERIVED, Derived
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
-from miricigale.sed.parameter import MODEL_PARAMETERS, default_values, parameter_table
+from miricigale.sed.parameter import default_values, parameter_table
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
@@ -75,15 +80,7 @@ class SEDModel(Interactive):
         if self.has_agn and not self.component("attenuation") and frac_agn_definition == "dust":
             wanted = "'3-1000um' where nothing attenuates: there is no dust luminosity to refer to"
             raise argument_error("frac_agn_definition", wanted, "'dust'")
-        merged = {}
-        for component in self.components:
-            twice = set(component.parameters) & (set(merged) | set(MODEL_PARAMETERS))
-            check_that(not twice, "components", "without shared parameter names", sorted(twice))
-            merged.update(component.parameters)
-        model_parameters = dict(MODEL_PARAMETERS)
-        if self.component("dust") is None:
-            del model_parameters["dust_excess"]
-        self._parameters = merged | model_parameters
+        self._parameters = chain_parameters(self.components)
         self._notes = ()
         self.preset = None
 
@@ -250,13 +247,7 @@ class SEDModel(Interactive):
         >>> SEDModel.yang2021(libraries="bundled", agn=False).replace("smc")
         <SEDModel delayed -> bc03 -> smc -> dl07_alpha -> meiksin2006>
         """
-        new = {}
-        for component in components:
-            if isinstance(component, str):
-                component = named_component(component)
-            wanted = "Component instances or names"
-            check_that(isinstance(component, Component), "components", wanted, component)
-            new[component.role] = component
+        new = {component.role: component for component in made_components(components)}
         unchanged = [component for component in self.components if component.role not in new]
         return self._of_components([*unchanged, *new.values()])
 
@@ -482,30 +473,12 @@ class SEDModel(Interactive):
         >>> print(f"{sed.derived['sfr_100myr']:.2f}")
         5.79 solMass / yr
         """
-        if values is not None:
-            check_that(
-                isinstance(values, Mapping),
-                "values",
-                "a dict of parameters by name",
-                self._columns_in_words(values),
-            )
-            twice = sorted(set(values) & set(parameters))
-            check_that(not twice, "values", "without those given by keyword", twice)
-            parameters = dict(values) | parameters
+        parameters = parameter_names.merged(values, parameters, self.parameters)
         if any(np.ndim(value) == 1 for value in parameters.values()):
             return [self.evaluate(model) for model in parameter_names.single_models(parameters)]
         return tables.spectra(self, self.values(parameters))
 
     __call__ = evaluate
-
-    def _columns_in_words(self, values):
-        """Say what is no dict of parameters; of a table, the call that takes its columns."""
-        columns = getattr(values, "colnames", getattr(values, "columns", None))
-        if columns is None:
-            return repr(values)
-        names = [name for name in columns if name in self.parameters]
-        columns = ", ".join(f"{name}=table[{name!r}]" for name in names)
-        return f"a {type(values).__name__}: evaluate({columns}) takes its columns"
 
     def derived(self, **parameters):
         """Return the derived quantities of one model: dict of name to `~astropy.units.Quantity`."""

@@ -1,6 +1,7 @@
 """Names of parameters: ours, those of CIGALE and other programs, and the logarithm of the mass."""
 
 from collections import Counter
+from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
@@ -183,6 +184,45 @@ def named_first(values, filters, named, argument):
         values is None, argument, f"left out beside values by name ({', '.join(named)})", "both"
     )
     return named, filters
+
+
+def merged(values, named, available):
+    """
+    Return parameters that are given in a dict and by name.
+
+    Parameters
+    ----------
+    values : dict or None
+        Values by name.
+    named : dict of str to object
+        Those of keywords, none of which may be among ``values``.
+    available : collection of str
+        Parameters of the model, for messages.
+
+    Raises
+    ------
+    ValueError
+        If ``values`` is no dict; of a table the message has the call that takes its columns.
+    """
+    if values is None:
+        return named
+    if not isinstance(values, Mapping):
+        raise argument_error(
+            "values", "a dict of parameters by name", _columns_in_words(values, available)
+        )
+    twice = sorted(set(values) & set(named))
+    check_that(not twice, "values", "without those given by keyword", twice)
+    return dict(values) | named
+
+
+def _columns_in_words(values, available):
+    """Say what is no dict of parameters; of a table, the call that takes its columns."""
+    columns = getattr(values, "colnames", getattr(values, "columns", None))
+    if columns is None:
+        return repr(values)
+    names = [name for name in columns if name in available]
+    columns = ", ".join(f"{name}=table[{name!r}]" for name in names)
+    return f"a {type(values).__name__}: evaluate({columns}) takes its columns"
 
 
 def parameter_table(parameters):

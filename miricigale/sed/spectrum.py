@@ -6,15 +6,14 @@ from dataclasses import field
 
 import astropy.units as u
 import numpy as np
-from astropy.constants import c
 
 from miricigale.filters import FilterSet, as_filter
 from miricigale.filters.spectra import spectrum_arrays
 from miricigale.sed.cosmology import COSMOLOGY, distance
 from miricigale.sed.flux_units import flux_density_unit
-from miricigale.sed.frequency_integral import frequency_integral
+from miricigale.sed.frequency_integral import integral_at_rest
 from miricigale.sed.spectrum_conversions import specutils_spectrum, synphot_spectrum
-from miricigale.sed.spectrum_parts import Parts
+from miricigale.sed.spectrum_parts import Parts, points_of
 from miricigale.sed.spectrum_tables import spectrum_columns, spectrum_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import reading
@@ -213,19 +212,7 @@ class SED(Frozen, WithTable):
         """
         if isinstance(key, numbers.Integral) and not isinstance(key, (bool, np.bool_)):
             return self.fnu[key]
-        if isinstance(key, slice):
-            check_that(key.step is None, "key", "two wavelengths without a step", key)
-            wave = self.wave.value
-            inside = np.ones(wave.size, bool)
-            if key.start is not None:
-                inside &= wave >= to_array(key.start, WAVE, "key", ndim=0)
-            if key.stop is not None:
-                inside &= wave <= to_array(key.stop, WAVE, "key", ndim=0)
-        else:
-            inside = np.asarray(key)
-            is_mask = inside.dtype == bool and inside.shape == self.wave.shape
-            wanted = "two wavelengths (sed[5 * u.um:10 * u.um]) or a mask of the points; sed.fnu has all values"
-            check_that(is_mask, "key", wanted, repr(key))
+        inside = points_of(key, self.wave.value)
         parts = {name: part[inside] for name, part in self.components.items()}
         return self.replace(wave=self.wave[inside], fnu=self.fnu[inside], components=parts)
 
@@ -411,20 +398,8 @@ class SED(Frozen, WithTable):
             frequency = wave.to(u.Hz, u.spectral())
             return (4 * np.pi * far**2 * frequency * self.fnu_at(wave)).to(u.Lsun)
         if high is not None:
-            return (4 * np.pi * far**2 * self._integral(low, high)).to(u.Lsun)
+            return (4 * np.pi * far**2 * integral_at_rest(self, low, high)).to(u.Lsun)
         return (4 * np.pi * far**2 * self.frequency * self.fnu).to(u.Lsun)
-
-    def _integral(self, low, high):
-        """Integrate F_nu over the frequencies between two rest wavelengths."""
-        check_that(low is not None, "low", "given with 'high'", low)
-        first = to_array(low, WAVE, "low") * (1.0 + self.redshift)
-        last = to_array(high, WAVE, "high") * (1.0 + self.redshift)
-        wave = self.wave.value
-        is_inside = wave[0] <= first < last <= wave[-1]
-        span = f"{self.rest_wavelength[0]:.4g} and {self.rest_wavelength[-1]:.4g}"
-        check_that(is_inside, "low, high", f"in order, and within {span}", f"{low}, {high}")
-        integral = frequency_integral(wave, self.fnu.value, first, last)
-        return integral * FNU * c / WAVE
 
     @classmethod
     def from_table(cls, table):

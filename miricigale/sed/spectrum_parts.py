@@ -1,9 +1,13 @@
-"""Parts of a spectrum: stars, dust and AGN, and their sums."""
+"""Parts of a spectrum: stars, dust and AGN, and their sums; and parts in wavelength."""
 
 import functools
 import operator
 
+import numpy as np
+
 from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.options import check_that
+from miricigale.utils.units import WAVE, to_array
 
 
 class Parts(dict):
@@ -23,3 +27,38 @@ class Parts(dict):
         if name not in groups:
             raise unknown_name("component", name, [*self, *groups])
         return functools.reduce(operator.add, groups[name])
+
+
+def points_of(key, wave):
+    """
+    Find the points of a spectrum that a key in brackets stands for.
+
+    Parameters
+    ----------
+    key : slice of `~astropy.units.Quantity`, or `~numpy.ndarray` of bool, shape (n,)
+        Wavelengths between which they are, or a mask.
+    wave : `~numpy.ndarray`, shape (n,)
+        Wavelengths of the points, um.
+
+    Returns
+    -------
+    inside : `~numpy.ndarray` of bool, shape (n,)
+
+    Raises
+    ------
+    ValueError
+        If it is nothing of these, or a slice has a step.
+    """
+    if not isinstance(key, slice):
+        inside = np.asarray(key)
+        is_mask = inside.dtype == bool and inside.shape == wave.shape
+        wanted = "two wavelengths (sed[5 * u.um:10 * u.um]) or a mask of the points; sed.fnu has all values"
+        check_that(is_mask, "key", wanted, repr(key))
+        return inside
+    check_that(key.step is None, "key", "two wavelengths without a step", key)
+    inside = np.ones(wave.size, bool)
+    if key.start is not None:
+        inside &= wave >= to_array(key.start, WAVE, "key", ndim=0)
+    if key.stop is not None:
+        inside &= wave <= to_array(key.stop, WAVE, "key", ndim=0)
+    return inside

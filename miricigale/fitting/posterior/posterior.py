@@ -101,6 +101,34 @@ def cell_shares(values, pdf, low, high, bounds):
         return np.diff(np.reshape(ends, (-1, 2)), axis=1)[:, 0] / upto[:, -1]
 
 
+def shares_between(values, levels, low, high):
+    """
+    Return the shares of distributions between two limits, either of which may be None.
+
+    Parameters
+    ----------
+    values, levels : `~numpy.ndarray`, shape (m, k)
+        Points of the cumulative distributions, which are linear between them.
+    low, high : float or None
+        The limits; what is at a first value of 0 is above a limit of 0.
+
+    Returns
+    -------
+    shares : `~numpy.ndarray`, shape (m,)
+    """
+    shares = np.empty(len(levels))
+    for row, (x, y) in enumerate(zip(values, levels, strict=True)):
+        # a cell of no width at 0 belongs to what is above 0
+        below = 0.0
+        if low is not None and low > x[0]:
+            below = np.interp(low, x, y, left=0.0, right=1.0)
+        above = 1.0
+        if high is not None:
+            above = np.interp(high, x, y, left=0.0, right=1.0)
+        shares[row] = above - below
+    return shares
+
+
 def randomized_ranks(pdf, node, draw):
     """
     Draw the ranks of true values that lie on nodes, shape (m,), uniform if the posteriors are right.

@@ -15,15 +15,17 @@ from miricigale.fitting.posterior.posterior import (
     cell_shares,
     check_levels,
     moments,
+    shares_between,
 )
 from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.fitting.results import drawing, histories, inference_data
+from miricigale.fitting.results.posterior_weights import PosteriorWeights
 from miricigale.fitting.results.result_tables import flux_table, reduced_chi2, result_table
 from miricigale.fitting.results.sample_flags import worst_bands
 from miricigale.fitting.results.table_columns import OUTLIER, TEXTS
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.flag_arrays import FlagField
-from miricigale.utils.object_rows import ArraysByName, PerObject, PerObjectDict, of_id
+from miricigale.utils.object_rows import PerObject, PerObjectDict, of_id
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.values import value_class
 
@@ -33,29 +35,6 @@ CIGALE_LEAST_STD = 0.05
 _STATISTICS = {"err": "std", "median": "median"}
 #: Objects that a notebook shows.
 _SHOWN = 20
-
-
-class _Posteriors(ArraysByName):
-    """Posterior weights by name of parameter; a call has the values of the parameter too."""
-
-    def __init__(self, weights, other_name, axes, quantities):
-        super().__init__(weights, other_name)
-        self.axes = axes
-        self.quantities = quantities
-
-    def __missing__(self, name):
-        if self.other_name(name, self.quantities) in self.quantities:
-            msg = (
-                f"{name!r} is a derived quantity, which has no nodes: results.distribution({name!r}) gives the "
-                "edges of its cells and their weights"
-            )
-            raise KeyError(msg)
-        return super().__missing__(name)
-
-    def __call__(self, name, *others):
-        weights = super().__call__(name, *others)
-        axis = self.axes[self.other_name(name, self)]
-        return axis.values * u.Unit(axis.unit), weights
 
 
 @value_class
@@ -277,7 +256,7 @@ class FitResults(FitRows):
 
     def _by_name(self, field, arrays):
         if field == "pdf":
-            return _Posteriors(arrays, self._other_name, self.axes, self.quantities)
+            return PosteriorWeights(arrays, self._other_name, self.axes, self.quantities)
         return super()._by_name(field, arrays)
 
     def unit(self, name):
@@ -494,20 +473,16 @@ class FitResults(FitRows):
             raise TypeError(msg)
         unit = self.unit(name)
         check_that(low is not None or high is not None, "low", "given, or 'high'", "None")
-        ends = [u.Quantity(end, unit).value for end in (low, high) if end is not None]
-        check_that(ends == sorted(ends), "high", f"at least 'low', {low}", high)
+        wanted = f"at least 'low', {low}"
+        got = f"{high}"
+        if low is not None:
+            low = u.Quantity(low, unit).value
+        if high is not None:
+            high = u.Quantity(high, unit).value
+        check_that(low is None or high is None or low <= high, "high", wanted, got)
         values, levels = self.cdf(name)
         values, levels = np.broadcast_arrays(np.atleast_2d(values.value), levels)
-        out = np.empty(len(levels))
-        for row, (x, y) in enumerate(zip(values, levels, strict=True)):
-            # a cell of no width at 0 belongs to what is above 0
-            below = 0.0
-            if low is not None and ends[0] > x[0]:
-                below = np.interp(ends[0], x, y, left=0.0, right=1.0)
-            above = 1.0
-            if high is not None:
-                above = np.interp(ends[-1], x, y, left=0.0, right=1.0)
-            out[row] = above - below
+        out = shares_between(values, levels, low, high)
         if self.isscalar:
             return float(out[0])
         return out

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
@@ -16,15 +15,11 @@ from miricigale.photometry.detection.prior_catalog import (
     read_catalog,
     read_prior,
 )
+from miricigale.photometry.fit.chosen_kernel import SampledPSFs, check_one_band, chosen_kernel
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels, are_exposures
 from miricigale.photometry.fit.fit_loop import fit_image
 from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package, warn_of_none
-from miricigale.photometry.fit.sampled_psfs import (
-    SampledPSFs,
-    compared_psf,
-    is_sampled,
-    marked_kernel,
-)
+from miricigale.photometry.fit.settings import ErrorSettings, MemorySettings
 from miricigale.photometry.fit.stars import with_stars
 from miricigale.photometry.images.arrays import fit_arrays, image_arrays, pixel_scale
 from miricigale.photometry.images.flags import ForcedFlags
@@ -33,7 +28,7 @@ from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.photometry.images.sky_noise import warn_of_background
 from miricigale.photometry.templates.placement import Placement
 from miricigale.photometry.templates.sources import SourceTemplates
-from miricigale.psf import MODEL_FILTERS, KernelField, MatchingKernel, as_kernel
+from miricigale.psf import MODEL_FILTERS, KernelField, MatchingKernel
 from miricigale.utils.exceptions import PhotometryWarning, PSFWarning, argument_error, warn
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.memory import return_freed_memory
@@ -43,69 +38,6 @@ from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, is_number, positive, to_array
 from miricigale.utils.values import value_class
-
-
-@dataclasses.dataclass(frozen=True)
-class ErrorSettings:
-    """
-    What the errors of fluxes are made of.
-
-    Parameters
-    ----------
-    correlated_noise : bool, optional
-        Whether the noise's autocorrelation is measured on source-free pixels and goes into
-        the errors; otherwise the image's uncertainty is taken as white noise. With fewer than 400 pixels
-        it is what the mosaic states (``meta["noise_correction"]``), if it does.
-    size_scatter : float or None, optional
-        Templates fitted to the high-resolution image (``"auto"`` and ``"cutout"`` with ``wings``) may
-        change as far as their fit leaves them open, and in size by this standard deviation of ln size,
-        since galaxies are not of one size in all bands. None takes them without error. Shapes that a
-        catalog states always are.
-    psf_error : float, optional
-        Error of a point source's flux, as a fraction, by that of the image's PSF: about 0.8 of the
-        fractional error of its width. By default that of the kernel's encircled energy, for templates
-        that are images, and none for the others, which need the kernel's target only.
-
-    Raises
-    ------
-    ValueError
-        If a fraction is not at least 0 and below 1.
-
-    Examples
-    --------
-    >>> from miricigale.photometry import ErrorSettings
-    >>> ErrorSettings(psf_error=0.02)
-    ErrorSettings(correlated_noise=True, size_scatter=0.1, psf_error=0.02)
-    """
-
-    correlated_noise: bool = True
-    size_scatter: float | None = 0.1
-    psf_error: float | None = None
-
-    def __post_init__(self):
-        for name in ("size_scatter", "psf_error"):
-            value = getattr(self, name)
-            check_that(value is None or 0 <= value < 1, name, "at least 0 and below 1", value)
-
-
-@dataclasses.dataclass(frozen=True)
-class MemorySettings:
-    """
-    What is kept in memory during a fit; it changes nothing in the result.
-
-    Parameters
-    ----------
-    max_bytes : float, optional
-        Memory for templates; beyond it they are made anew for each pass.
-
-    Examples
-    --------
-    >>> from miricigale.photometry import MemorySettings
-    >>> MemorySettings(max_bytes=4e9)
-    MemorySettings(max_bytes=4000000000.0)
-    """
-
-    max_bytes: float = 1.5e9
 
 
 @takes_other_keywords
@@ -246,26 +178,9 @@ class ForcedPhotometer(Interactive):
     n_threads: int | None = None
 
     def __post_init__(self, psf, highres_psf, filter):
-        _check_one_band(self.kernel, "kernel")
-        _check_one_band(psf, "psf")
-        # one kernel, given or made of PSFs
-        got = "neither" if psf is None else "both"
-        check_that((self.kernel is None) != (psf is None), "kernel, psf", "one of them given", got)
-        if self.kernel is not None:
-            object.__setattr__(self, "kernel", _as_kernels(self.kernel))
-        if self.kernel is not None and highres_psf is not None:
-            wanted = "given with 'psf', not with 'kernel'"
-            raise argument_error("highres_psf", wanted, "a kernel too")
-        check_that(psf is not None or filter is None, "filter", "given with 'psf'", filter)
+        kernel = chosen_kernel(self.kernel, psf, highres_psf, filter)
         template = self.template
-        kernel = self.kernel
         check_choice(template, "template", ("auto", "cutout", "psf", "sersic"))
-        if kernel is None and (is_sampled(psf) or is_sampled(highres_psf)):
-            kernel = SampledPSFs(psf, highres_psf, filter)
-        elif kernel is None and highres_psf is None:
-            kernel = marked_kernel(MatchingKernel.identity(compared_psf(psf, filter)))
-        elif kernel is None:
-            kernel = marked_kernel(MatchingKernel.from_psfs(highres_psf, compared_psf(psf, filter)))
         if psf is not None and highres_psf is None and template == "auto":
             template = "psf"
         # the kernel that all have in common: the mean, with PSFs in any case
@@ -355,7 +270,7 @@ class ForcedPhotometer(Interactive):
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
-        _check_one_band(image, "image")
+        check_one_band(image, "image")
         if templates is not None and not isinstance(templates, SourceTemplates):
             msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
             raise TypeError(msg)
@@ -618,25 +533,3 @@ class ForcedPhotometer(Interactive):
                     f"kernel is from one whose peak holds {peaks[1]:.3g}: is it of the same image?"
                 )
                 warn(msg, PhotometryWarning)
-
-
-def _as_kernels(kernel):
-    """Make the kernel of an image, or those of exposures, of anything that stands for them."""
-    if isinstance(kernel, ExposureKernels):
-        return kernel
-    if isinstance(kernel, (list, tuple)):
-        kinds = (MatchingKernel, KernelField)
-        if all(isinstance(member, kinds) for member in kernel):
-            return ExposureKernels(kernel)
-    return as_kernel(kernel)
-
-
-def _check_one_band(value, argument):
-    """Refuse images, PSFs or kernels of several bands."""
-    if isinstance(value, Mapping):
-        wanted = (
-            "that of one band (several at once: measure_bands(images, photometers, templates) of "
-            "miricigale.photometry, with a dict of images, one of ForcedPhotometer(psf=...) and "
-            "SourceTemplates.from_catalog(catalog))"
-        )
-        raise argument_error(argument, wanted, f"a dict of {', '.join(map(str, value))}")

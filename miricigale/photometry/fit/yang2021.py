@@ -7,7 +7,8 @@ import numpy as np
 from astropy.wcs.utils import pixel_to_pixel
 
 from miricigale.photometry.fit.corrections import aperture_correction
-from miricigale.photometry.fit.forced import ErrorSettings, ForcedPhotometer
+from miricigale.photometry.fit.forced import ForcedPhotometer
+from miricigale.photometry.fit.settings import ErrorSettings
 from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.psf import MatchingKernel
 from miricigale.utils.exceptions import argument_error

@@ -12,12 +12,9 @@ from astropy.nddata import CCDData, Cutout2D, NDData, StdDevUncertainty
 
 from miricigale.filters.band_names import find_filter
 from miricigale.instrument.data_models import is_data_model, read_data_model
-from miricigale.instrument.dq_schemes import bad_pixels
 from miricigale.instrument.header_wcs import check_kind_of_exposure, image_wcs, is_exposure
 from miricigale.instrument.image import Image
 from miricigale.instrument.image_planes import (
-    MARKS,
-    MASKS,
     NOISE_MAPS,
     PLANES,
     VARIANCE_PARTS,
@@ -44,6 +41,7 @@ from miricigale.photometry.images.mosaic_headers import (
     own_facts,
     unit_of,
 )
+from miricigale.photometry.images.pixel_marks import marked_good
 from miricigale.photometry.images.sky_noise import mask_filled, sky_noise
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
 from miricigale.utils.options import check_data, check_that
@@ -389,7 +387,10 @@ class MosaicFile:
             factor, how = self._factor()
             factor = np.asarray(factor, data.dtype)
             usable = np.isfinite(data)
-            usable &= self._marked_good(hdus, header.index, meta, usable & (data != 0))
+            good, scheme = marked_good(hdus, header.index, self, usable & (data != 0))
+            usable &= good
+            if scheme is not None:
+                meta["dq_scheme"] = scheme
             kind, values, source = self._noise_map(hdus, header, usable)
         meta.update(source_unit=header.unit, calibration=how)
         sigma = None
@@ -540,47 +541,6 @@ class MosaicFile:
         plane = plane_data(hdu)
         return bool(np.any(np.isfinite(plane) & (plane != 0)))
 
-    def _marked_good(self, hdus, index, meta, has_data):
-        """Find pixels that no extension of marks or weights excludes; note the scheme of the bits in ``meta``."""
-        header = hdus[index].header
-
-        def get(key):
-            return header.get(key, hdus[0].header.get(key))
-
-        good = True
-        for name in _MARKS:
-            # weights and plain masks by their value, others by their bits
-            hdu = companion(hdus, index, name)
-            if hdu is None or not hdu.is_image or (not hdu.shape and plane_shape(hdu) is None):
-                continue
-            check_plane(hdu, plane_shape(hdus[index]), self.path, "marks of pixels")
-            values = np.asarray(plane_data(hdu, self.section))
-            if name == "WHT":
-                good = good & (values > 0)
-                continue
-            has_planes = any(str(key).startswith("MP_") for key in hdu.header)
-            if name in MASKS and not has_planes:
-                # a mask of astropy's has no bits
-                good = good & (values == 0)
-                self._check_sense(name, values != 0, has_data)
-                continue
-            bad, scheme = bad_pixels(values, hdu.header, get, f"{self.path}[{name}]")
-            good = good & ~bad
-            meta["dq_scheme"] = scheme
-        return good
-
-    def _check_sense(self, name, masked, has_data):
-        """Warn of a mask that excludes most pixels with data, as one does in which 1 is good."""
-        if not has_data.any():
-            return
-        part = np.mean(masked[has_data])
-        if part > _MOST:
-            msg = (
-                f"{self.path}[{name}] excludes {part:.0%} of the pixels with data: what is not 0 is bad there. "
-                "If 1 is good in it, write 1 less it"
-            )
-            warn(msg, PhotometryWarning)
-
     def _in_unit(self, hdu, kind, unit, path):
         """Read a map of the noise in the unit that the image states, as far as both do."""
         values = _native(plane_data(hdu, self.section))
@@ -611,10 +571,6 @@ def _native(data):
 
 #: Power of the image's unit that a map of the noise has; the scale of weights is measured.
 _POWERS = {"error": 1, "variance": 2, "inverse_variance": -2}
-#: Extensions that mark pixels, and weights, which are above 0.
-_MARKS = (*MARKS, "WHT")
-#: Part of the pixels with data that a mask may exclude without a warning.
-_MOST = 0.5
 
 
 def _sigma(kind, values):
