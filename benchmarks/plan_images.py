@@ -309,6 +309,17 @@ def paired_numbers(planner, plans, imaged_plans, imaged):
     return QTable(rows)
 
 
+def plans_of_images(planner, plans, imaged):
+    """Return the plans, each set of bands evaluated with the photometry of the images."""
+    of_images = [plans[0]]
+    for plan, name in zip(plans[1:], planner.config.exposures.sets, strict=True):
+        bands = planner.config.set_bands(name)
+        share = planner.share(bands)
+        measured = planner.evaluate(bands, name=plan.name, share=share, measured=imaged.measured)
+        of_images.append(measured)
+    return of_images
+
+
 def main():
     """Run."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -322,7 +333,7 @@ def main():
     plans = planner.compare()
     with process_pool(thread_count(planner.config.plan.threads or None)) as pool:
         imaged = image_sample(planner, args.folder, executor=pool, progress_bar=True)
-    numbers = paired_numbers(planner, plans, planner.compare(measured=imaged.measured), imaged)
+    numbers = paired_numbers(planner, plans, plans_of_images(planner, plans, imaged), imaged)
     for table in (paired_bands(planner, imaged), numbers):
         for name in table.colnames:
             if table[name].dtype.kind == "f":

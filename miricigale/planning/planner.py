@@ -401,14 +401,12 @@ class Planner:
                 rows.append(row)
         return QTable(rows)
 
-    def compare(self, *, measured=None, progress_bar=False):
+    def compare(self, *, progress_bar=False):
         """
         Evaluate the existing bands alone and each set of bands of the configuration.
 
         Parameters
         ----------
-        measured : `~astropy.table.QTable`, optional
-            As for `photometry`.
         progress_bar : bool, optional
             Whether a progress bar is shown.
 
@@ -425,10 +423,7 @@ class Planner:
             bar.update()
             for name, share in zip(sets, shares, strict=True):
                 plan = self.evaluate(
-                    self.config.set_bands(name),
-                    name=_short_name(name),
-                    share=share,
-                    measured=measured,
+                    self.config.set_bands(name), name=_short_name(name), share=share
                 )
                 plans.append(plan)
                 bar.update()

@@ -127,8 +127,7 @@ class Reducer(Interactive):
                 check_least(getattr(self, name), name, 0, whole=True)
         for name, kind in KINDS.items():
             value = getattr(self, name)
-            if value is None and name in NEEDED:
-                raise argument_error(name, f"a {kind.__name__}", "None")
+            check_that(value is not None or name not in NEEDED, name, f"a {kind.__name__}", "None")
             check_kind(value, name, kind)
         thread_count(self.n_threads)
         is_reference_set = isinstance(self.references, (ReferenceFiles, ReferenceCache))
@@ -275,7 +274,7 @@ class Reducer(Interactive):
                 raise argument_error("rate", "slopes, or an image with its PHOTMJSR", "neither")
             rate = with_data(rate, rate.data / before, factor=1 / before, unit=RATE)
         brightness, references = brightness_of(self, rate)
-        cal = calibrate(rate, filter=facts.filter, subarray=facts.subarray, **brightness)
+        cal = calibrate(rate, subarray=facts.subarray, **brightness)
         cal.meta.update(references)
         return cal
 

@@ -155,12 +155,9 @@ class Parts:
         data.flags.writeable = False
         return data
 
-    def table(self, name, cls=None, *, rows=None):
-        """Table by name (a `~astropy.table.Table`, or another class), or these rows; its meta empty."""
-        hdu = self._hdus[name]
-        if rows is not None:
-            hdu = fits.BinTableHDU(hdu.data[rows], header=hdu.header)
-        table = (cls or Table).read(hdu, character_as_bytes=False)
+    def table(self, name, cls=Table):
+        """Table by name (a `~astropy.table.Table`, or another class); its meta empty."""
+        table = cls.read(self._hdus[name], character_as_bytes=False)
         table.meta.clear()
         return table
 

@@ -10,7 +10,7 @@ from miricigale.reduction.images.images import flagged_image
 
 SHAPE = (1024, 1032)
 FILTER = "miri.f1000w"
-OPTIONS = {"filter": FILTER, "subarray": "FULL", "flat": flat_field(FILTER)}
+OPTIONS = {"subarray": "FULL", "flat": flat_field(FILTER)}
 OPTIONS["conversion"] = photmjsr(FILTER, gain=4.0)
 
 

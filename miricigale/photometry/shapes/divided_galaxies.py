@@ -98,7 +98,7 @@ def _groups(models, sources, is_source, links):
     return [sorted(group) for k, group in groups.items() if len(group) > 1 and min(group) == k]
 
 
-def reaching_over(models, sources, segments, variance, is_source, smooth):
+def reaching_over(models, sources, segments, variance, is_source):
     """
     Find the sources whose profiles have more light on others' segments than on their own and on the sky.
 

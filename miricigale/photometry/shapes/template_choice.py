@@ -261,7 +261,9 @@ class _Lights:
                 lights = self._of_galaxies([[labels[k] for k in group] for group in groups])
                 changed = [group for group in groups if not new.isdisjoint(group)]
                 models, sources = lights._put_together(models, sources, population, changed)
-        reaching = reaching_over(models, sources, lights.segments, *lights.as_seen)
+        reaching = reaching_over(
+            models, sources, lights.segments, lights.variance, lights.is_source
+        )
         members = {group[0]: group for group in groups}
         for k in reaching:
             members.setdefault(k, [k])

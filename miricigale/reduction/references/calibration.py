@@ -10,7 +10,7 @@ from miricigale.utils.options import check_that
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS, with_adu
 
 
-def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
+def calibrate(rate, *, subarray, flat, conversion, flags=None):
     """
     Turn an image of slopes into surface brightness.
 
@@ -18,7 +18,7 @@ def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
     ----------
     rate : `~astropy.nddata.CCDData`
         DN/s, without the dark current, with uncertainty.
-    filter, subarray : str
+    subarray : str
         Of the exposure.
     flat : `~numpy.ndarray`, shape (ny, nx), or float
         Relative response.
@@ -51,7 +51,6 @@ def calibrate(rate, *, filter, subarray, flat, conversion, flags=None):
     >>> from miricigale.reduction import calibrate
     >>> cal = calibrate(
     ...     Reducer().fit_ramp(ramp),
-    ...     filter="miri.f770w",
     ...     subarray="SUB64",
     ...     flat=1.0,
     ...     conversion=photmjsr("miri.f770w"),
