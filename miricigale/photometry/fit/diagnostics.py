@@ -242,24 +242,56 @@ def source_flags(fit, diagnostics, place, flux, blending):
     ``place`` is the source of each row of the bank, ``flux`` those of all sources (NaN where not
     measured), ``blending`` each row's formal error over that of the source alone (NaN where not fitted).
     """
-    flags = np.zeros(len(flux), int)
-    inside = np.zeros(len(flux))
-    coverage = np.zeros(len(flux))
-    inside[place[fit.main]] = fit.light[fit.main, 0]
-    coverage[place[fit.main]] = np.clip(fit.light[fit.main, 1], 0.0, 1.0)
-    for rows, flag in (
-        (inside < 0.9, ForcedFlags.EDGE),
-        (coverage < 0.9 * np.minimum(inside, 1.0), ForcedFlags.MASKED),
-        (place[fit.degenerate], ForcedFlags.DEGENERATE),
-        (place[fit.inseparable], ForcedFlags.ONE_COMPONENT),
-        (place[fit.noisy], ForcedFlags.NOISY_SEGMENT),
-        (place[blending > 2], ForcedFlags.BLENDED),
-        (place[diagnostics.poor], ForcedFlags.POOR_FIT),
-    ):
-        flags[rows] |= int(flag)
+    flags, coverage = flags_of_light(fit.light[fit.main], place[fit.main], len(flux))
+    add_fit_flags(flags, fit, place, blending, diagnostics.poor)
+    flags[place[fit.inseparable]] |= int(ForcedFlags.ONE_COMPONENT)
     cut = np.flatnonzero(fit.main & (flags[place] & ForcedFlags.MASKED > 0))
     cut = cut[_cut_by_rim(fit.arrays.usable, fit.bank.box[cut])]
     flags[place[cut]] |= ForcedFlags.EDGE
     flags[place[fit.main & (diagnostics.rim > _RIM_LIGHT)]] |= ForcedFlags.EDGE
-    flags[np.isnan(flux) & (flags & ForcedFlags.DEGENERATE == 0)] |= ForcedFlags.NO_DATA
+    add_no_data(flags, flux)
     return flags, coverage
+
+
+def flags_of_light(light, place, n):
+    """
+    Flag sources by the light of their templates that is seen.
+
+    Parameters
+    ----------
+    light : `~numpy.ndarray`, shape (m, 2)
+        Fractions of each template on the image and on usable pixels.
+    place : `~numpy.ndarray` of int, shape (m,)
+        Their sources, of ``n``.
+
+    Returns
+    -------
+    flags : `~numpy.ndarray` of int, shape (n,)
+        ``EDGE`` and ``MASKED``.
+    coverage : `~numpy.ndarray`, shape (n,)
+        Fraction on usable pixels.
+    """
+    flags = np.zeros(n, int)
+    inside = np.zeros(n)
+    coverage = np.zeros(n)
+    inside[place] = light[:, 0]
+    coverage[place] = np.clip(light[:, 1], 0.0, 1.0)
+    flags[inside < 0.9] |= int(ForcedFlags.EDGE)
+    flags[coverage < 0.9 * np.minimum(inside, 1.0)] |= int(ForcedFlags.MASKED)
+    return flags, coverage
+
+
+def add_fit_flags(flags, fit, place, blending, poor):
+    """Add flags of the rows of a fit to those of their sources, ``place``, in place; see `source_flags`."""
+    for rows, flag in (
+        (fit.degenerate, ForcedFlags.DEGENERATE),
+        (fit.noisy, ForcedFlags.NOISY_SEGMENT),
+        (blending > 2, ForcedFlags.BLENDED),
+        (poor, ForcedFlags.POOR_FIT),
+    ):
+        flags[place[rows]] |= int(flag)
+
+
+def add_no_data(flags, flux):
+    """Add the flag of sources that are not measured, though not for being degenerate, in place."""
+    flags[np.isnan(flux) & (flags & ForcedFlags.DEGENERATE == 0)] |= int(ForcedFlags.NO_DATA)

@@ -7,7 +7,9 @@ import scipy.linalg
 import scipy.sparse
 
 from miricigale.photometry.fit.template_fit import (
+    MAX_EXCESS,
     MIN_COVERAGE,
+    BankEquations,
     duplicates,
     gaussian_width,
     inner_products,
@@ -23,14 +25,10 @@ from miricigale.photometry.templates.free_templates import (
 from miricigale.photometry.templates.normal_equations import (
     LinearFit,
     change_matrices,
-    normal_matrix,
     sandwich_matrix,
     stated_correlation,
 )
 from miricigale.utils.values import value_class
-
-#: Largest share of a template's power that is its own noise and is taken off (as for one image).
-_MAX_EXCESS = 0.5
 
 
 @dataclasses.dataclass(eq=False)
@@ -188,31 +186,25 @@ class ExposureFit:
                 places["shift"] = slice(places["sky"].stop, n_common + len(columns))
             n_common += len(columns)
             self.places.append(places)
-            white = list(map(part.arrays.whitened, columns))
-            data = part.arrays.whitened(part.arrays.flux)
             # normal equations of this exposure, then summed over exposures by source
-            square, projection, power, light = normal_matrix(
-                part.bank, part.inverse_sigma, [data] + list(white)
-            )
+            equations = BankEquations.of(part.arrays, part.bank, part.inverse_sigma, columns)
+            light = equations.light
             # from rows of the bank to sources of the joint fit
             gather = part.gather(n)
             source = part.row_source
-            light = light / part.bank.full_light()[:, None]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                excess = part.bank.noise_terms() / np.where(power > 0, power, np.inf)
-            matrix = matrix + gather @ square @ gather.T
-            correction += gather @ (np.minimum(excess, _MAX_EXCESS) * square.diagonal())
-            rhs += gather @ projection[:, 0]
-            borders.append(gather @ projection[:, 1:])
-            corners.append(inner_products(white, white))
-            corner_rhs.append(inner_products(white, [data])[:, 0])
+            matrix = matrix + gather @ equations.matrix @ gather.T
+            correction += gather @ equations.correction
+            rhs += gather @ equations.rhs
+            borders.append(gather @ equations.border)
+            corners.append(equations.corner)
+            corner_rhs.append(equations.corner_rhs)
             is_seen = light[:, 1] >= MIN_COVERAGE
             self.n_exposures[source[is_seen]] += 1
-            self.noisy[source[is_seen & (excess <= _MAX_EXCESS)]] = False
+            self.noisy[source[is_seen & (equations.excess <= MAX_EXCESS)]] = False
             # of each source the exposure that shows most of it
             best = light[:, 1] > self.light[source, 1]
             self.light[source[best]] = light[best]
-            self.power[source[best]] = power[best]
+            self.power[source[best]] = equations.power[best]
         self.noisy &= self.n_exposures > 0
         # sources with enough light somewhere
         rows = (self.n_exposures > 0) & (matrix.diagonal() > 0)

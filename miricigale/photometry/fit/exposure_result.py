@@ -12,14 +12,23 @@ from miricigale.instrument import pixel_area_map
 from miricigale.instrument.image import Image
 from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.detection.residual_sources import residual_peaks, unexplained_neighbors
-from miricigale.photometry.fit.diagnostics import canceling
-from miricigale.photometry.fit.result_table import result_of_columns
+from miricigale.photometry.fit.diagnostics import add_fit_flags, add_no_data, flags_of_light
+from miricigale.photometry.fit.result_table import (
+    BRIGHT_SNR,
+    FEWEST_BRIGHT,
+    WARNED_OFFSET,
+    add_flags,
+    flux_columns,
+    joint_errors,
+    result_of_columns,
+    spread_over,
+)
 from miricigale.photometry.fit.template_fit import gaussian_width, psf_covariance, row_covariances
 from miricigale.photometry.images.arrays import lengths
-from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
+from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
-from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
+from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS
 from miricigale.utils.values import value_class
 
 #: Largest light of the model, over the noise, of pixels that count as free of sources.
@@ -28,11 +37,6 @@ _FREE = 0.3
 #: Fewest such pixels of which the noise is measured, and by how much it may be another than is stated.
 _FEWEST_PIXELS = 400
 _OTHER_NOISE = 0.1
-
-#: Least offset (pixels) that is warned of, with so many sources above so many sigma (as for one image).
-_OFFSET = 0.1
-_FEWEST_BRIGHT = 5
-_BRIGHT = 10.0
 
 #: uJy per MJy.
 _MICRO = 1e12
@@ -172,7 +176,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     chi2, residual_fraction, core_flux, poor, checks = _compared(fit, models, residuals)
     terms, common, blending = _covariances(fit)
     joint = scipy.sparse.csr_array((n_all, n_all))
-    errors = {name: np.full(n_all, np.nan) for name in ("", "_noise", "_template", "_psf")}
+    flux_err = np.full((4, n_all), np.nan)
     flux = np.full(n_all, np.nan)
     measured = place[fit.rows]
     flux[measured] = fit.flux[fit.rows]
@@ -180,28 +184,20 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
         k = np.arange(len(measured))
         gather = scipy.sparse.coo_array((np.ones(len(k)), (measured, k)), shape=(n_all, len(k)))
         spread = [(gather @ term @ gather.T).tocsr() for term in terms]
-        # noise, templates and PSF are independent
-        joint = (spread[0] + spread[1] + spread[2]).tocsr()
+        joint, flux_err = joint_errors(spread, measured, n_all)
+        joint = joint.tocsr()
         joint.sort_indices()
-        # the total first, as its name is
-        for name, term in zip(errors, [joint] + list(spread), strict=True):
-            errors[name][measured] = np.sqrt(np.maximum(term.diagonal()[measured], 0.0))
     # peaks of the last residual, for flags of their neighbors
     xy = np.concatenate([catalog.xy, new_xy])
     peaks, _ = _peaks(fit, plane, xy, models, residuals, inverse)
     flags, coverage = _flags(fit, place, n_all, flux, blending, poor)
-    is_canceling = canceling(flux, errors[""], _spread_over(core_flux, place, n_all))
-    flags[is_canceling] |= ForcedFlags.CANCELING
-    flags[:n] |= catalog.flags
-    flags[n:] |= ForcedFlags.NOT_IN_CATALOG
     has_neighbor = unexplained_neighbors(peaks, xy, flux)
-    flags[has_neighbor & np.isfinite(flux)] |= ForcedFlags.UNEXPLAINED_NEIGHBOR
-    # columns of all sources, from which the catalog's and the new ones are taken
-    columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage}
-    columns["chi2"] = _spread_over(chi2, place, n_all)
-    columns["residual_fraction"] = _spread_over(residual_fraction, place, n_all)
-    for name, term in errors.items():
-        columns[f"flux_err{name}"] = term * FNU
+    core_flux = spread_over(core_flux, place, n_all)
+    add_flags(flags, catalog, has_neighbor, flux, flux_err, core_flux)
+    columns = {"flags": flags, "coverage": coverage}
+    columns["chi2"] = spread_over(chi2, place, n_all)
+    columns["residual_fraction"] = spread_over(residual_fraction, place, n_all)
+    columns |= flux_columns(flux, flux_err)
     exposures = _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
     model, residual, pixel_weight = _plane_means(plane, models, residuals, inverse)
     model, residual = _images_of(
@@ -245,13 +241,6 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
             **counted,
         ),
     )
-
-
-def _spread_over(values, place, n):
-    """Spread values of the fit's sources over their places among n; NaN elsewhere."""
-    spread = np.full(n, np.nan)
-    spread[place] = values
-    return spread
 
 
 def _compared(fit, models, residuals):
@@ -344,22 +333,9 @@ def _covariances(fit):
 
 def _flags(fit, place, n_all, flux, blending, poor):
     """Return flags of all sources, and the fraction of each template on the exposure that shows most of it."""
-    flags = np.zeros(n_all, int)
-    inside = np.zeros(n_all)
-    coverage = np.zeros(n_all)
-    inside[place] = fit.light[:, 0]
-    coverage[place] = np.clip(fit.light[:, 1], 0.0, 1.0)
-    flags[inside < 0.9] |= ForcedFlags.EDGE
-    flags[coverage < 0.9 * np.minimum(inside, 1.0)] |= ForcedFlags.MASKED
-    for rows, flag in (
-        (fit.degenerate, ForcedFlags.DEGENERATE),
-        (fit.noisy, ForcedFlags.NOISY_SEGMENT),
-        (blending > 2, ForcedFlags.BLENDED),
-        (poor, ForcedFlags.POOR_FIT),
-    ):
-        flags[place[rows]] |= flag
-    lost = np.isnan(flux) & (flags & ForcedFlags.DEGENERATE == 0)
-    flags[lost] |= ForcedFlags.NO_DATA
+    flags, coverage = flags_of_light(fit.light, place, n_all)
+    add_fit_flags(flags, fit, place, blending, poor)
+    add_no_data(flags, flux)
     return flags, coverage
 
 
@@ -420,8 +396,8 @@ def _warn_of_offsets(fit, offsets):
         return
     snr = fit.fit.flux * np.sqrt(fit.fit.matrix.diagonal())
     offset = lengths(offsets[0])
-    far = (offset > _OFFSET * fit.scale) & (offset > 3 * offsets[1])
-    if far.any() and np.count_nonzero(snr > _BRIGHT) >= _FEWEST_BRIGHT:
+    far = (offset > WARNED_OFFSET * fit.scale) & (offset > 3 * offsets[1])
+    if far.any() and np.count_nonzero(snr > BRIGHT_SNR) >= FEWEST_BRIGHT:
         msg = (
             f"{np.count_nonzero(far)} exposures lie up to {offset[far].max():.3f} arcsec from their templates: "
             "'max_shift' fits that"

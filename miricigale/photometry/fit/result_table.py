@@ -28,11 +28,11 @@ from miricigale.utils.values import value_class
 _TERMS = ("", "_noise", "_template", "_psf")
 
 #: Least offset (pixels) that is warned of.
-_WARNED_OFFSET = 0.1
+WARNED_OFFSET = 0.1
 
 #: Fewest bright sources, and their signal-to-noise, with which offsets are warned of.
-_FEWEST_BRIGHT = 5
-_BRIGHT_SNR = 10.0
+FEWEST_BRIGHT = 5
+BRIGHT_SNR = 10.0
 
 #: Relative error of templates.
 _TEMPLATE_ERROR = 0.1
@@ -141,8 +141,6 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     blending = np.full(len(place), np.nan)
     flux = np.full(n_all, np.nan)
     flux_err = np.full((4, n_all), np.nan)
-    chi2 = np.full(n_all, np.nan)
-    residual_fraction = np.full(n_all, np.nan)
     joint = scipy.sparse.csr_array((2 * n_all, 2 * n_all))
     if len(fit.rows):
         *covariances, common, blending[fit.rows] = fit_covariances(fit, diagnostics.correlation)
@@ -150,29 +148,19 @@ def package(fit, diagnostics, new_xy, catalog, meta):
             _by_source(covariance, place[fit.rows], main[fit.rows], n_all)
             for covariance in covariances
         ]
-        # noise, templates and PSF are independent
-        joint = terms[0] + terms[1] + terms[2]
         # total fluxes stand in the rows of the first components
         measured = fit.rows[main[fit.rows]]
         flux[place[measured]] = fit.total[measured]
-        for error, term in zip(flux_err, (joint, *terms), strict=True):
-            error[place[measured]] = np.sqrt(np.maximum(term.diagonal()[place[measured]], 0.0))
+        joint, flux_err = joint_errors(terms, place[measured], n_all)
     flags, coverage = source_flags(fit, diagnostics, place, flux, blending)
-    flags[:n] |= catalog.flags
-    flags[n:] |= ForcedFlags.NOT_IN_CATALOG
     xy = np.concatenate([catalog.xy, new_xy])
     has_neighbor = unexplained_neighbors(diagnostics.peaks, xy + fit.displacement(xy), flux)
-    flags[has_neighbor & np.isfinite(flux)] |= ForcedFlags.UNEXPLAINED_NEIGHBOR
-    core_flux = np.full(n_all, np.nan)
-    core_flux[place[main]] = diagnostics.core_flux[main]
-    flags[canceling(flux, flux_err[0], core_flux)] |= ForcedFlags.CANCELING
-    chi2[place[main]] = diagnostics.chi2[main]
-    residual_fraction[place[main]] = diagnostics.residual_fraction[main]
-    # columns of all sources, from which the catalog's and the new ones are taken
-    columns = {"flux": flux * FNU, "flags": flags, "coverage": coverage, "chi2": chi2}
-    columns["residual_fraction"] = residual_fraction
-    for name, error in zip(_TERMS, flux_err, strict=True):
-        columns[f"flux_err{name}"] = error * FNU
+    core_flux = spread_over(diagnostics.core_flux[main], place[main], n_all)
+    add_flags(flags, catalog, has_neighbor, flux, flux_err, core_flux)
+    columns = {"flags": flags, "coverage": coverage}
+    for name in ("chi2", "residual_fraction"):
+        columns[name] = spread_over(getattr(diagnostics, name)[main], place[main], n_all)
+    columns |= flux_columns(flux, flux_err)
     image_meta = {}
     if "filter" in meta:
         image_meta["filter"] = meta["filter"]
@@ -194,13 +182,78 @@ def package(fit, diagnostics, new_xy, catalog, meta):
             correlated_noise=diagnostics.correlation is not None,
             measured_noise=fit.arrays.measured_noise,
             pixel_scatter=round(diagnostics.pixel_scatter, 4),
-            **_registration(fit, diagnostics, common, np.sum(flux > _BRIGHT_SNR * flux_err[0])),
+            **_registration(fit, diagnostics, common, np.sum(flux > BRIGHT_SNR * flux_err[0])),
             **evidence,
         ),
         **_components(fit, catalog, joint, place, n_all),
         **_common(fit, common),
         **_images(fit, diagnostics, image_meta),
     )
+
+
+def spread_over(values, place, n):
+    """Spread values over their places among ``n`` sources; NaN elsewhere."""
+    spread = np.full(n, np.nan)
+    spread[place] = values
+    return spread
+
+
+def joint_errors(terms, rows, n):
+    """
+    Add covariances of noise, templates and PSF, which are independent.
+
+    Parameters
+    ----------
+    terms : list of `~scipy.sparse.csr_array`
+        The three.
+    rows : `~numpy.ndarray` of int
+        Sources that were measured, of ``n``.
+
+    Returns
+    -------
+    joint : `~scipy.sparse.csr_array`
+        Their sum.
+    flux_err : `~numpy.ndarray`, shape (4, n)
+        Errors of the sum, then of each; NaN where nothing was measured.
+    """
+    joint = terms[0] + terms[1] + terms[2]
+    flux_err = [
+        spread_over(np.sqrt(np.maximum(term.diagonal()[rows], 0.0)), rows, n)
+        for term in (joint, *terms)
+    ]
+    return joint, np.array(flux_err)
+
+
+def add_flags(flags, catalog, has_neighbor, flux, flux_err, core_flux):
+    """
+    Add the flags of a catalog and those that depend on fluxes, in place.
+
+    Parameters
+    ----------
+    flags : `~numpy.ndarray` of int, shape (n,)
+        Of the catalog's sources, then of new ones.
+    catalog : `CatalogRows`
+        The catalog.
+    has_neighbor : `~numpy.ndarray` of bool, shape (n,)
+        Which have an unexplained neighbor.
+    flux, core_flux : `~numpy.ndarray`, shape (n,)
+        Fluxes, and those in the cores.
+    flux_err : `~numpy.ndarray`, shape (4, n)
+        Errors, as of `joint_errors`.
+    """
+    n = len(catalog.id)
+    flags[:n] |= catalog.flags
+    flags[n:] |= ForcedFlags.NOT_IN_CATALOG
+    flags[has_neighbor & np.isfinite(flux)] |= ForcedFlags.UNEXPLAINED_NEIGHBOR
+    flags[canceling(flux, flux_err[0], core_flux)] |= ForcedFlags.CANCELING
+
+
+def flux_columns(flux, flux_err):
+    """Return columns of fluxes (uJy) and of their errors, (4, n) as of `joint_errors`: dict of `Quantity`."""
+    columns = {"flux": flux * FNU}
+    for name, error in zip(_TERMS, flux_err, strict=True):
+        columns[f"flux_err{name}"] = error * FNU
+    return columns
 
 
 def result_of_columns(catalog, new_xy, wcs, columns, *, second_pass, **others):
@@ -287,8 +340,8 @@ def _registration(fit, diagnostics, common, n_bright):
     # the jackknife's error
     error = np.sqrt((len(sums) - 1) * np.var(without, axis=0))
     far = (
-        np.any((np.abs(offset) > _WARNED_OFFSET) & (np.abs(offset) > 3 * error))
-        and n_bright >= _FEWEST_BRIGHT
+        np.any((np.abs(offset) > WARNED_OFFSET) & (np.abs(offset) > 3 * error))
+        and n_bright >= FEWEST_BRIGHT
     )
     # a shift that was asked for and is too large has a warning of its own
     if far and fit.settings.max_shift is None:

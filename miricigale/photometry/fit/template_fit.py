@@ -1,5 +1,7 @@
 """The fit of one image: all templates at once, with what they have in common."""
 
+import typing
+
 import numpy as np
 import scipy.sparse
 from scipy.signal import oaconvolve
@@ -175,6 +177,8 @@ _SEPARABLE = 0.99
 
 #: Least part of a template's light on usable pixels: sources with less are not measured.
 MIN_COVERAGE = 0.05
+#: Largest share of a template's power that is its own noise and is taken off.
+MAX_EXCESS = 0.5
 
 
 class TemplateFit:
@@ -263,37 +267,28 @@ class TemplateFit:
         if gradients:
             self.places["shift"] = slice(len(self.columns), len(self.columns) + len(gradients))
             self.columns += gradients
-        white = list(map(self.arrays.whitened, self.columns))
-        data = self.arrays.whitened(self.arrays.flux)
-        # normal equations of the sources, and their products with the common parameters
-        matrix, projection, power, light = normal_matrix(
-            bank, self.inverse_sigma, [data] + list(white)
-        )
+        equations = BankEquations.of(self.arrays, bank, self.inverse_sigma, self.columns)
         # stamps over the noise, of which many were made and freed
         return_freed_memory()
-        self.light = light / bank.full_light()[:, None]
-        self.power = power
-        diagonal = matrix.diagonal()
-        rows = (self.light[:, 1] >= MIN_COVERAGE) & (diagonal > 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            excess = bank.noise_terms() / np.where(power > 0, power, np.inf)
-        self.noisy = excess > 0.5
-        # errors in variables: the noise of the templates adds to their power
-        correction = scipy.sparse.diags_array(np.minimum(excess, 0.5) * diagonal)
+        matrix = equations.matrix
+        self.light = equations.light
+        self.power = equations.power
+        rows = (self.light[:, 1] >= MIN_COVERAGE) & (matrix.diagonal() > 0)
+        self.noisy = equations.excess > MAX_EXCESS
+        correction = scipy.sparse.diags_array(equations.correction)
         self.degenerate = duplicates(matrix, rows, bank.order)
         matrix = (matrix - correction).tocsr()
         self._find_pairs(matrix, rows & ~self.degenerate)
         # rows that can be fitted
         self.rows = np.flatnonzero(rows & ~self.degenerate & ~self.inseparable)
         matrix = matrix[self.rows][:, self.rows]
-        corner = inner_products(white, white)
-        corner_rhs = inner_products(white, [data])[:, 0]
         self.fit = None
         self.flux = np.zeros(len(bank.order))
         if len(self.rows):
-            rhs = projection[self.rows, 0]
-            border = projection[self.rows, 1:]
-            self.fit = LinearFit(matrix, rhs, border, corner, corner_rhs)
+            rhs = equations.rhs[self.rows]
+            border = equations.border[self.rows]
+            corner = equations.corner
+            self.fit = LinearFit(matrix, rhs, border, corner, equations.corner_rhs)
             self.flux[self.rows] = self.fit.flux
 
     def free_templates(self, fitted):
@@ -431,6 +426,43 @@ class TemplateFit:
         self.add_background(residual, -1.0)
         residual[~self.arrays.usable] = 0.0
         return residual
+
+
+class BankEquations(typing.NamedTuple):
+    """Normal equations of the templates of a bank on an image, and of the common parameters."""
+
+    matrix: object  # (n, n): Products of the templates, over the noise.
+    rhs: np.ndarray  # (n,): With the image.
+    border: np.ndarray  # (n, m): With the columns of the common parameters.
+    corner: np.ndarray  # (m, m): Of these columns.
+    corner_rhs: np.ndarray  # (m,): Of these with the image.
+    light: np.ndarray  # (n, 2): Fractions of each template on the image, and on usable pixels.
+    power: np.ndarray  # (n,): As of `normal_matrix`.
+    excess: np.ndarray  # (n,): Noise of the templates over their power.
+
+    @classmethod
+    def of(cls, arrays, bank, inverse_sigma, columns):
+        """Make those of the arrays of an image and the columns of its common parameters."""
+        white = list(map(arrays.whitened, columns))
+        data = arrays.whitened(arrays.flux)
+        matrix, projection, power, light = normal_matrix(bank, inverse_sigma, [data] + white)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            excess = bank.noise_terms() / np.where(power > 0, power, np.inf)
+        return cls(
+            matrix,
+            projection[:, 0],
+            projection[:, 1:],
+            inner_products(white, white),
+            inner_products(white, [data])[:, 0],
+            light / bank.full_light()[:, None],
+            power,
+            excess,
+        )
+
+    @property
+    def correction(self):
+        """What the noise of the templates adds to the diagonal: errors in variables."""
+        return np.minimum(self.excess, MAX_EXCESS) * self.matrix.diagonal()
 
 
 def gaussian_width(kernel):
