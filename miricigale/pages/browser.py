@@ -96,6 +96,14 @@ def list_column(key, label, title, *, group="", **options):
     return {"key": key, "label": label, "title": title, "group": group, **options}
 
 
+def band_entries(names, labels, waves, *, miri):
+    """Return what ``sources.js`` shows of bands with their wavelengths (um), those of ``miri`` marked."""
+    entries = []
+    for name, label, wave in zip(names, labels, rounded(waves), strict=True):
+        entries.append({"name": name, "label": label, "wave": wave, "miri": name in miri})
+    return entries
+
+
 def shown_unit(unit):
     """Return the unit in which a parameter is shown: luminosities in that of the Sun."""
     unit = u.Unit(unit)

@@ -143,6 +143,11 @@ def open_fits(path, *, wanted, **options):
             yield hdus
 
 
+def is_path(value):
+    """Whether a value is a path, or a text that may be one."""
+    return isinstance(value, (str, os.PathLike))
+
+
 def split_extension(path):
     """
     Take ``file.fits[EXTENSION]`` apart.

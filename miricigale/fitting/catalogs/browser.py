@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.filters.band_names import band_label
 from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.pages.browser import (
+    band_entries,
     cell_weights,
     list_column,
     moments_of,
@@ -20,6 +21,7 @@ from miricigale.pages.browser import (
 )
 from miricigale.plotting.axes import MEASURED
 from miricigale.sed.cells import cell_means
+from miricigale.utils.arrays import thinning_step
 from miricigale.utils.named_values import places
 from miricigale.utils.units import FNU, WAVE
 
@@ -71,7 +73,7 @@ def write_browser(path, title, results, numbers, curves, *, step=1):
 
 def browser_step(n):
     """Return the step between objects of the page, of ``n``."""
-    return max(1, -(-n // MAX_OBJECTS))
+    return thinning_step(n, MAX_OBJECTS)
 
 
 class _Objects:
@@ -129,11 +131,8 @@ class _Objects:
         columns.append(list_column("n_bands", "bands", "bands that were fitted"))
         columns.append(list_column("flags", "flags", "flags of the fit", text=True))
         edges = {name: rounded(fits.distribution(name)[0].value) for name in self.drawn}
-        bands = []
-        for name, wave in zip(self.names, rounded(self.waves), strict=True):
-            label = band_label(name)
-            is_miri = name.startswith("miri.")
-            bands.append({"name": name, "label": label, "wave": wave, "miri": is_miri})
+        miri = [name for name in self.names if name.startswith("miri.")]
+        labels = map(band_label, self.names)
         spectrum = (
             "Arrows: upper limits, and three times the error where the flux is below its error."
         )
@@ -150,7 +149,7 @@ class _Objects:
             "heading": [["chi2", "reduced χ²", 2], ["n_bands", "bands", 0]],
             "flags": {"fit": FitFlags.meanings()},
             "flag_columns": [["fit", "fit", ""]],
-            "bands": bands,
+            "bands": band_entries(self.names, labels, self.waves, miri=miri),
             "sets": [{"name": "fit", "label": "fit", "color": MEASURED}],
             "wave": rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
             "pdf_edges": {"fit": edges},

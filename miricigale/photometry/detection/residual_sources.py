@@ -68,50 +68,11 @@ def residual_peaks(fit, residual, model, xy):
         return ResidualPeaks(np.empty((0, 2), int), np.empty((0, 2)), np.empty(0), full_width)
     matched = _Matched(inverse_sigma, width, residual)
     executor = fit.bank.executor
-    # of very many pixels only those of some rows
-    sampled = [part for part in chunks(len(residual), _ROWS // 8) if inverse_sigma[part].any()]
-    sampled = sampled[:: max(1, residual.size // _SOME)]
-    strips = parallel_map(matched.rows, sampled, executor=executor)
-    # images as large as the residual are dropped as soon as they are used
-    power = np.concatenate(
-        [
-            strip_power[inverse_sigma[part] > 0]
-            for part, (_, strip_power) in zip(sampled, strips, strict=True)
-        ]
-    )
-    matched.min_power = 0.25 * np.median(power, overwrite_input=True)
-    del power
-    snr = np.concatenate(
-        [strip_snr[strip_power > matched.min_power] for strip_snr, strip_power in strips]
-    )
-    del strips
+    limit = matched.limit(executor)
     return_freed_memory()
-    # what is a thousandth of the stated noise is that of the arithmetic
-    limit = LEFT_SNR * max(mad_std(snr), 1e-3)
-    del snr
-    return_freed_memory()
-    reach = int(np.ceil(width))
 
     def find(part):
-        """Find places, light and tops of the parabolas of peaks on some rows."""
-        first = max(part.start - reach, 0)
-        snr, power = matched.rows(slice(first, part.stop + reach))
-        inner = slice(part.start - first, part.stop - first)
-        peaks = []
-        y, x = np.nonzero(snr[inner] > limit)
-        # few pixels are left for what follows, unless the image has a background
-        for group in chunks(len(y), _CANDIDATES):
-            i = y[group] + inner.start
-            j = x[group]
-            top = snr[i, j] >= _windows(snr, i, j, np.arange(-reach, reach + 1)).max(axis=(1, 2))
-            i = i[top]
-            j = j[top]
-            root = np.sqrt(power[i, j])
-            top = snr[i, j] * root > _LEFT_SHARE * matched.at(i + first, j, width, model)
-            place = np.stack([j, i], axis=1)[top]
-            light = (snr[i, j] / root)[top]
-            peaks.append([place + [0, first], light, place + [0, first] + _parabola(snr, place)])
-        return peaks
+        return matched.peaks(part, limit, model)
 
     peaks = parallel_map(find, chunks(len(residual), _ROWS), executor=executor)
     none = np.empty((0, 2), int), np.empty(0), np.empty((0, 2))
@@ -121,18 +82,7 @@ def residual_peaks(fit, residual, model, xy):
     pixel = pixel[order]
     light = light[order]
     refined = refined[order]
-    distance = np.full(len(pixel), np.inf)
-    if len(placed) and len(pixel):
-        distance, nearest = scipy.spatial.KDTree(placed).query(pixel)
-        # a template that is too narrow leaves as much on the other side of the source
-        close = np.flatnonzero(distance < _LEFT_REACH * full_width)
-        for part in chunks(len(close), _CANDIDATES // 10):
-            rows = close[part]
-            mirror = np.rint(2 * placed[nearest[rows]] - pixel[rows]).astype(int)
-            x, y = mirror.T
-            is_symmetric = matched.light_at(y, x) > 0.5 * light[rows]
-            is_symmetric &= np.all((mirror >= 0) & (mirror < residual.shape[::-1]), axis=1)
-            distance[rows[is_symmetric]] = 0.0
+    distance = _distances(pixel, light, placed, matched, full_width)
     is_apart = distance >= _LEFT_DISTANCE * full_width
     pixel = pixel[is_apart]
     light = light[is_apart]
@@ -145,6 +95,24 @@ def residual_peaks(fit, residual, model, xy):
         ):
             lone[neighbor] &= ~lone[row]
     return ResidualPeaks(pixel[lone], refined[lone], light[lone], full_width)
+
+
+def _distances(pixel, light, placed, matched, full_width):
+    """Return distances of peaks to the nearest source; 0 of those that are a source's own light."""
+    distance = np.full(len(pixel), np.inf)
+    if not len(placed) or not len(pixel):
+        return distance
+    distance, nearest = scipy.spatial.KDTree(placed).query(pixel)
+    # a template that is too narrow leaves as much on the other side of the source
+    close = np.flatnonzero(distance < _LEFT_REACH * full_width)
+    for part in chunks(len(close), _CANDIDATES // 10):
+        rows = close[part]
+        mirror = np.rint(2 * placed[nearest[rows]] - pixel[rows]).astype(int)
+        x, y = mirror.T
+        is_symmetric = matched.light_at(y, x) > 0.5 * light[rows]
+        is_symmetric &= np.all((mirror >= 0) & (mirror < matched.residual.shape[::-1]), axis=1)
+        distance[rows[is_symmetric]] = 0.0
+    return distance
 
 
 #: Rows that are filtered at a time, pixels of which medians are taken, where there are more, and pixels
@@ -167,6 +135,55 @@ class _Matched:
     width: float
     residual: np.ndarray
     min_power: float = 0.0  # Power below which too little of a source is seen.
+
+    def limit(self, executor):
+        """Return the signal-to-noise of peaks, measured on the filtered image; set the least power before."""
+        # of very many pixels only those of some rows
+        sampled = [
+            part
+            for part in chunks(len(self.residual), _ROWS // 8)
+            if self.inverse_sigma[part].any()
+        ]
+        sampled = sampled[:: max(1, self.residual.size // _SOME)]
+        strips = parallel_map(self.rows, sampled, executor=executor)
+        # images as large as the residual are dropped as soon as they are used
+        power = np.concatenate(
+            [
+                strip_power[self.inverse_sigma[part] > 0]
+                for part, (_, strip_power) in zip(sampled, strips, strict=True)
+            ]
+        )
+        self.min_power = 0.25 * np.median(power, overwrite_input=True)
+        del power
+        snr = np.concatenate(
+            [strip_snr[strip_power > self.min_power] for strip_snr, strip_power in strips]
+        )
+        del strips
+        return_freed_memory()
+        # what is a thousandth of the stated noise is that of the arithmetic
+        return LEFT_SNR * max(mad_std(snr), 1e-3)
+
+    def peaks(self, part, limit, model):
+        """Find places, light and tops of the parabolas of peaks on some rows, by groups."""
+        reach = int(np.ceil(self.width))
+        first = max(part.start - reach, 0)
+        snr, power = self.rows(slice(first, part.stop + reach))
+        inner = slice(part.start - first, part.stop - first)
+        peaks = []
+        y, x = np.nonzero(snr[inner] > limit)
+        # few pixels are left for what follows, unless the image has a background
+        for group in chunks(len(y), _CANDIDATES):
+            i = y[group] + inner.start
+            j = x[group]
+            top = snr[i, j] >= _windows(snr, i, j, np.arange(-reach, reach + 1)).max(axis=(1, 2))
+            i = i[top]
+            j = j[top]
+            root = np.sqrt(power[i, j])
+            top = snr[i, j] * root > _LEFT_SHARE * self.at(i + first, j, self.width, model)
+            place = np.stack([j, i], axis=1)[top]
+            light = (snr[i, j] / root)[top]
+            peaks.append([place + [0, first], light, place + [0, first] + _parabola(snr, place)])
+        return peaks
 
     def rows(self, part):
         """Return signal-to-noise and power on some rows, both zero where too little of a source is seen."""

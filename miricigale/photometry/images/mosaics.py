@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import logging
-import os
 
 import astropy.units as u
 import numpy as np
@@ -44,6 +43,7 @@ from miricigale.photometry.images.mosaic_headers import (
 from miricigale.photometry.images.pixel_marks import marked_good
 from miricigale.photometry.images.sky_noise import mask_filled, sky_noise
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
+from miricigale.utils.files import is_path
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.units import SURFACE_BRIGHTNESS, scalar
 
@@ -113,7 +113,7 @@ def as_mosaic(image, argument="image"):
     """
     if isinstance(image, CCDData):
         return image
-    if isinstance(image, (str, os.PathLike)):
+    if is_path(image):
         return read_mosaic(image)
     if is_data_model(image):
         return read_data_model(image, read_mosaic)
@@ -395,11 +395,7 @@ class MosaicFile:
         meta.update(source_unit=header.unit, calibration=how)
         sigma = None
         if kind is None:
-            msg = f"{self.path} has no map of the noise, which will be measured on the image"
-            n_zero = np.count_nonzero(data[usable] == 0)
-            if n_zero > 1e-3 * np.count_nonzero(usable):
-                msg += f", and {n_zero / np.count_nonzero(usable):.0%} of its pixels are exactly 0"
-            warn(msg, PhotometryWarning)
+            self._warn_of_no_noise(data[usable])
             meta["noise"] = "none"
         else:
             negative = np.count_nonzero(values[usable] < 0)
@@ -433,15 +429,7 @@ class MosaicFile:
             relative = relative / np.where(usable, sigma, 1)
         level, scale, _ = sky_noise(relative, usable)
         if sigma is not None:
-            done = "which are scaled by it" if kind == "weight" else "which are kept"
-            text = "%s: noise is %.4g times the errors of the %s map, %s"
-            _log.info(text, self.path, scale, kind, done)
-            if not 1 / _ODD_SCALE < scale < _ODD_SCALE:
-                msg = (
-                    f"{self.path}: noise on the sky is {scale:.4g} times what the {kind} map says, {done}; "
-                    "is it the map of this image, in its unit?"
-                )
-                warn(msg, PhotometryWarning)
+            self._tell_scale(kind, scale)
             meta["noise_scale"] = float(f"{scale:.6g}")
         if kind == "weight":
             problem = "has weights of unknown scale, for its sky is constant"
@@ -452,9 +440,9 @@ class MosaicFile:
         meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
         meta["n_masked"] = int(np.count_nonzero(~usable))
         uncertainty = None
-        if sigma is not None and added_variance is not None:
-            sigma = np.sqrt(np.square(sigma) + added_variance).astype(data.dtype)
         if sigma is not None:
+            if added_variance is not None:
+                sigma = np.sqrt(np.square(sigma) + added_variance).astype(data.dtype)
             uncertainty = StdDevUncertainty(sigma)
         return Image(
             data,
@@ -464,6 +452,26 @@ class MosaicFile:
             uncertainty=uncertainty,
             meta=meta,
         )
+
+    def _warn_of_no_noise(self, values):
+        """Warn that there is no map of the noise, and of how many of the usable pixels are exactly 0."""
+        msg = f"{self.path} has no map of the noise, which will be measured on the image"
+        n_zero = np.count_nonzero(values == 0)
+        if n_zero > 1e-3 * values.size:
+            msg += f", and {n_zero / values.size:.0%} of its pixels are exactly 0"
+        warn(msg, PhotometryWarning)
+
+    def _tell_scale(self, kind, scale):
+        """Log the noise of the sky in units of the map's errors; warn if it is far from 1."""
+        done = "which are scaled by it" if kind == "weight" else "which are kept"
+        text = "%s: noise is %.4g times the errors of the %s map, %s"
+        _log.info(text, self.path, scale, kind, done)
+        if not 1 / _ODD_SCALE < scale < _ODD_SCALE:
+            msg = (
+                f"{self.path}: noise on the sky is {scale:.4g} times what the {kind} map says, {done}; "
+                "is it the map of this image, in its unit?"
+            )
+            warn(msg, PhotometryWarning)
 
     def _noise_map(self, hdus, header, usable):
         """Read the map of the noise: its kind, values and place; the kind is None if there is none."""

@@ -9,6 +9,7 @@ from miricigale.evaluation import OUTLIER, AssociationFlags
 from miricigale.filters import Filter
 from miricigale.pages.browser import (
     N_WAVE,
+    band_entries,
     cell_weights,
     image_note,
     list_column,
@@ -231,11 +232,7 @@ class _Sources(StudyTables):
             edges[unit] = {}
             for key in DRAWN:
                 edges[unit][key] = rounded(results.first.distribution(key)[0].value)
-        bands = []
-        for name, wave in zip(self.bands, rounded(self.pivots), strict=True):
-            band = {"name": name, "label": band_label(name), "wave": wave}
-            band["miri"] = name in self.miri
-            bands.append(band)
+        labels = map(band_label, self.bands)
         shows = {
             "field": ["in the field", "in_field"],
             "all": ["all of the catalog", None],
@@ -256,7 +253,7 @@ class _Sources(StudyTables):
             "shows": shows,
             "flag_columns": flag_columns,
             "heading": heading,
-            "bands": bands,
+            "bands": band_entries(self.bands, labels, self.pivots, miri=self.miri),
             "wave": rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
             "pdf_edges": edges,
             "parameters": parameter_entries(self.units),

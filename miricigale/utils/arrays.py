@@ -1,0 +1,23 @@
+"""Small operations on arrays: middles of cells, places about a middle, peaks, and steps that thin out."""
+
+import numpy as np
+
+
+def middles(edges):
+    """Return the middles of cells between edges along the first axis: shape (n, ...) to (n - 1, ...)."""
+    return 0.5 * (edges[1:] + edges[:-1])
+
+
+def centered(n):
+    """Return the places of ``n`` pixels about the middle of them: 0 in the middle, shape (n,)."""
+    return np.arange(n) - (n - 1) / 2
+
+
+def peak_index(values):
+    """Return the index of the largest value of an array, along each axis: tuple of int."""
+    return np.unravel_index(np.argmax(values), values.shape)
+
+
+def thinning_step(n, most):
+    """Return the smallest step with which at most ``most`` of ``n`` elements are left."""
+    return max(1, -(-n // most))
