@@ -5,7 +5,7 @@ import numpy as np
 
 from miricigale.evaluation import classify
 from miricigale.evaluation.classes import CLASS_LIMITS
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.units import LUMINOSITY
 from miricigale.utils.values import value_class
 
@@ -63,8 +63,7 @@ class FittedSample:
             log_evidence[name] = of_class["log_evidence"]
         first = next(iter(fits["galaxy"].parts()))
         axis = first.axes.get("frac_agn")
-        if axis is None:
-            raise argument_error("axes", "a grid with several AGN fractions", "one without")
+        check_that(axis is not None, "axes", "a grid with several AGN fractions", "one without")
         return cls(
             galaxy["ids"], usable, selected, main, **values, tables=tables,
             log_evidence=log_evidence, axis=axis,

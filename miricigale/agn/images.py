@@ -2,7 +2,6 @@
 
 import dataclasses
 import logging
-import os
 import warnings
 from functools import cached_property
 
@@ -21,7 +20,7 @@ from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.content_hash import content_sha256, file_sha256
 from miricigale.utils.exceptions import CatalogWarning, PhotometryWarning
-from miricigale.utils.files import file_place
+from miricigale.utils.files import file_place, is_path
 from miricigale.utils.named_values import field_names
 from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
@@ -241,7 +240,7 @@ class AGNImages:
 
 def _content(source):
     """Checksum of a file, or of the table that takes its place, and the extension that is meant; None of none."""
-    if not isinstance(source, (str, os.PathLike)):
+    if not is_path(source):
         return content_sha256(source)
     name, *part = file_place(source)
     return file_sha256(name), *part

@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 
 from miricigale.utils.named_values import without
+from miricigale.utils.options import check_that
 from miricigale.utils.table_formats import WRITTEN_FORMATS
 
 
@@ -219,12 +220,9 @@ def filled(args, *functions):
 
 def refuse(args, names, wanted):
     """Refuse options that mean nothing with others: none of ``names`` may be given."""
-    from miricigale.utils.exceptions import argument_error
-
     for name in names:
         value = getattr(args, name)
-        if value is not None and value is not False:
-            raise argument_error(name, wanted, value)
+        check_that(value is None or value is False, name, wanted, value)
 
 
 def declarations(file="commands.toml"):

@@ -12,6 +12,7 @@ from astropy.nddata import NDData
 from miricigale.detector import level1b, ramp_reader
 from miricigale.detector.effects.order import checked_effects
 from miricigale.instrument import DQ, STEPS, DetectorProperties, ExposureHistory
+from miricigale.utils.arrays import peak_index
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.missing_values import mask_of
@@ -272,7 +273,7 @@ class Ramp(Interactive, NDData):
             groups = np.linspace(0, self.shape[1] - 1, min(5, self.shape[1])).astype(int)
             gathered = np.diff(self.data[0, groups].astype(float), axis=0).min(axis=0)
             gathered[(self.pixel_dq & int(DQ.DO_NOT_USE)) != 0] = -np.inf
-            pixel = np.unravel_index(np.argmax(gathered), gathered.shape)[::-1]
+            pixel = peak_index(gathered)[::-1]
         check_that(np.shape(pixel) == (2,), "pixel", "column and row, (x, y)", pixel)
         x, y = map(operator.index, pixel)
         check_that(0 <= x < nx and 0 <= y < ny, "pixel", f"(x, y) below ({nx}, {ny})", pixel)

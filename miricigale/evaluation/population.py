@@ -7,6 +7,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from miricigale.sed import stern2015_6um
+from miricigale.utils.arrays import middles
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
@@ -388,9 +389,9 @@ def _psi(log_l, z):
 
 def _smf(log_mass, z):
     """Return the mass function in Mpc^-3 dex^-1."""
-    middles = 0.5 * (_SMF_EDGES[1:] + _SMF_EDGES[:-1])
-    place = np.interp(z, middles, np.arange(middles.size))
-    low = np.minimum(place.astype(int), middles.size - 2)
+    redshifts = middles(_SMF_EDGES)
+    place = np.interp(z, redshifts, np.arange(redshifts.size))
+    low = np.minimum(place.astype(int), redshifts.size - 2)
     part = place - low
     low_density = _log_schechter(log_mass, low)
     high_density = _log_schechter(log_mass, low + 1)

@@ -11,7 +11,7 @@ from astropy.table import Column
 
 from miricigale.filters.catalog_map import TRANSLATE_SUFFIXES, CatalogMap
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
-from miricigale.utils.files import reading
+from miricigale.utils.files import is_path, reading
 from miricigale.utils.ids import counted_ids, warn_of_duplicates
 from miricigale.utils.missing_values import plain_floats, without_codes
 from miricigale.utils.table_files import read_table
@@ -101,7 +101,7 @@ def as_catalog_map(catalog_map, options=None):
         catalog_map = CatalogMap.from_translate(catalog_map)
     elif isinstance(catalog_map, str) and not _is_file_name(catalog_map):
         catalog_map = CatalogMap(survey=catalog_map)
-    elif isinstance(catalog_map, (str, os.PathLike)):
+    elif is_path(catalog_map):
         catalog_map = CatalogMap.read(catalog_map)
     elif catalog_map is None:
         catalog_map = CatalogMap()

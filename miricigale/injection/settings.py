@@ -3,8 +3,7 @@
 import dataclasses
 
 from miricigale.photometry import DETECTION_PRESETS, DetectionPreset
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_least, check_names, check_positive
+from miricigale.utils.options import check_least, check_names, check_positive, check_that
 from miricigale.utils.random import check_seed
 from miricigale.utils.values import value_class
 
@@ -26,8 +25,7 @@ class InjectionSettings:
         check_least(self.n_trials, "n_trials", 1, whole=True)
         if self.n_sources is not None:
             check_least(self.n_sources, "n_sources", 0, whole=True)
-        if not 0 <= self.stars <= 1:
-            raise argument_error("stars", "a share from 0 to 1", self.stars)
+        check_that(0 <= self.stars <= 1, "stars", "a share from 0 to 1", self.stars)
         check_positive(self.threshold, "threshold")
         if not isinstance(self.preset, DetectionPreset):
             check_names([self.preset], "detection preset", DETECTION_PRESETS)

@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import json
-import os
 import tempfile
 from pathlib import Path
 from typing import ClassVar
@@ -27,6 +26,7 @@ from miricigale.photometry import DetectionPreset, MosaicFile
 from miricigale.photometry.commands.file_inputs import Inputs
 from miricigale.psf import read_psf
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import is_path
 from miricigale.utils.meta import provenance
 from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_that
@@ -399,7 +399,7 @@ def _catalog_text(catalog):
     """Return an own catalog as a path, or as text."""
     if catalog is None:
         return None
-    if isinstance(catalog, (str, os.PathLike)):
+    if is_path(catalog):
         return absolute(catalog)
     text = io.StringIO()
     as_table(catalog, "catalog").write(text, format="ascii.ecsv")

@@ -22,7 +22,7 @@ from miricigale.instrument.sky_axes import pixel_to_radec
 from miricigale.instrument.wcs import imager_wcs, pixel_area_map
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import replacing, write_fits
+from miricigale.utils.files import is_path, replacing, write_fits
 from miricigale.utils.meta import json_meta
 from miricigale.utils.named_values import without_none
 from miricigale.utils.options import check_that
@@ -58,7 +58,7 @@ def jwst_product(path):
     product : str or None
         Such as ``"rate"`` for ``x_rate.fits``; None for other names.
     """
-    if not isinstance(path, (str, os.PathLike)):
+    if not is_path(path):
         return None
     name = _PRODUCT_NAME.search(os.fspath(path).lower())
     if name is None:

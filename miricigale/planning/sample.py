@@ -6,6 +6,7 @@ from astropy.table import vstack
 
 from miricigale.refdata import resources
 from miricigale.sed import SEDModel
+from miricigale.utils.arrays import middles
 from miricigale.utils.exceptions import argument_error, config_error
 from miricigale.utils.missing_values import floats, plain_floats
 from miricigale.utils.options import check_that
@@ -211,8 +212,8 @@ def _by_luminosity(sources, options, rng):
     low = np.maximum(options.redshift[0], steps[0]), np.maximum(options.luminosity[0], levels[0])
     high = np.minimum(options.redshift[1], steps[-1]), np.minimum(options.luminosity[1], levels[-1])
     z, logs = (np.linspace(a, b, 201) for a, b in zip(low, high, strict=True))
-    z = 0.5 * (z[1:] + z[:-1])
-    logs = 0.5 * (logs[1:] + logs[:-1])
+    z = middles(z)
+    logs = middles(logs)
     at_levels = np.array([np.interp(logs, levels, row) for row in values])
     fine = np.array([np.interp(z, steps, column) for column in at_levels.T]).T
     volume = cosmology.differential_comoving_volume(z).to_value(u.Mpc**3 / u.arcmin**2)

@@ -7,6 +7,7 @@ from miricigale.psf.field import miri_psf_grid, psf_at
 from miricigale.psf.kernel_field import KernelField
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.miri import MIRI_PIXEL_SCALE, local_pixel
+from miricigale.utils.arrays import centered
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE
 
@@ -48,8 +49,8 @@ def undistorted_psf(psf):
     n_cells = psf.n_cells
     cell = MIRI_PIXEL_SCALE.to_value(ANGLE) / n_cells
     ny, nx = psf.data.shape
-    x = (np.arange(nx) - (nx - 1) / 2) * cell
-    y = ((np.arange(ny) - (ny - 1) / 2) * cell)[:, None]
+    x = centered(nx) * cell
+    y = (centered(ny) * cell)[:, None]
     inverse = np.linalg.inv(pixel) * n_cells
     column = inverse[0, 0] * x + inverse[0, 1] * y + psf.origin[0]
     row = inverse[1, 0] * x + inverse[1, 1] * y + psf.origin[1]

@@ -11,6 +11,7 @@ from miricigale.instrument.header_wcs import header_wcs
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.psf import _core
 from miricigale.psf.model import InstrumentPSF, make_psf
+from miricigale.utils.arrays import peak_index
 from miricigale.utils.exceptions import PSFWarning, argument_error, data_error, warn
 from miricigale.utils.file_formats import register
 from miricigale.utils.files import file_place, open_fits, split_extension
@@ -304,7 +305,7 @@ def core_position(data):
     y, x = np.indices(data.shape)
     core = np.where(data > 0.3 * data.max(), data, 0.0)
     # only the brightest peak
-    peak = np.unravel_index(np.argmax(data), data.shape)
+    peak = peak_index(data)
     core[np.hypot(y - peak[0], x - peak[1]) > 0.25 * min(data.shape)] = 0
     return float((core * x).sum() / core.sum()), float((core * y).sum() / core.sum())
 

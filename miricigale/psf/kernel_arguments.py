@@ -1,7 +1,5 @@
 """Kernels of whatever a user has for one."""
 
-import os
-
 import astropy.units as u
 import numpy as np
 from astropy.nddata import NDData
@@ -10,6 +8,7 @@ from astropy.wcs.utils import proj_plane_pixel_scales
 from miricigale.psf.kernel_field import KernelField
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import is_path
 
 
 def as_kernel(kernel, argument="kernel"):
@@ -45,7 +44,7 @@ def as_kernel(kernel, argument="kernel"):
     """
     if isinstance(kernel, (MatchingKernel, KernelField)):
         return kernel
-    if isinstance(kernel, (str, os.PathLike)):
+    if is_path(kernel):
         from miricigale.psf.kernel_io import read_kernel
 
         return read_kernel(kernel)

@@ -14,7 +14,7 @@ from miricigale.psf.model import from_photutils, instrument_psf, make_psf
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
 from miricigale.psf.wiener import checked_square, gaussian_gain
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
-from miricigale.utils.files import split_extension
+from miricigale.utils.files import is_path, split_extension
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE, scalar
 
@@ -23,14 +23,13 @@ _log = logging.getLogger(__name__)
 
 def named_psf(psf):
     """Return the PSF of a file, of the name of a filter or of a pair with its pixel; anything else itself."""
-    if isinstance(psf, tuple) and len(psf) == 2 and isinstance(psf[0], (str, os.PathLike)):
+    if isinstance(psf, tuple) and len(psf) == 2 and is_path(psf[0]):
         from miricigale.psf.files import read_psf
 
         return read_psf(psf[0], pixel_scale=psf[1])
     if isinstance(psf, tuple):
         return instrument_psf(psf)
-    is_path = isinstance(psf, os.PathLike)
-    if is_path or (isinstance(psf, str) and os.path.isfile(split_extension(psf)[0])):
+    if isinstance(psf, os.PathLike) or (is_path(psf) and os.path.isfile(split_extension(psf)[0])):
         from miricigale.psf.files import read_psf
 
         return read_psf(psf)

@@ -9,6 +9,7 @@ from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
+from miricigale.utils.arrays import centered
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.files import write_fits
@@ -545,7 +546,7 @@ def from_photutils(model, pixel_scale, *, x=None, y=None, **options):
         options["origin"] = tuple(model.origin)
     else:
         check_that(x is not None and y is not None, "x, y", "given for a GriddedPSFModel", (x, y))
-        yy, xx = ((np.arange(n) - (n - 1) / 2) * (1.0 / cells) for n in model.data.shape[1:])
+        yy, xx = (centered(n) * (1.0 / cells) for n in model.data.shape[1:])
         data = model.evaluate(*np.meshgrid(xx + x, yy + y), 1.0, x, y)
     return make_psf(data, pixel_scale, oversampling=cells, **options)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from miricigale.psf import _core
 from miricigale.refdata import locate
+from miricigale.utils.arrays import centered
 from miricigale.utils.caching import cached
 from miricigale.utils.options import check_least, check_that
 from miricigale.utils.parallel import single_threaded
@@ -103,7 +104,7 @@ class Pupil:
         check_least(rms, "rms", 0)
         if rms == 0:
             return np.zeros_like(self.amplitude)
-        axis = (np.arange(self.n) - 0.5 * (self.n - 1)) * 2 / self.n
+        axis = centered(self.n) * 2 / self.n
         v, u = np.meshgrid(axis, axis, indexing="ij")
         # back to the telescope's frame, so that the error turns with the telescope
         a = math.radians(self.angle)
@@ -302,7 +303,7 @@ def polychromatic_psf(pupil, opd, wavelengths, *, step, n):
     axis = (np.arange(n) - (n - 1) // 2) * step * ARCSEC
     image = np.zeros((n, n))
     power = float(pupil.amplitude.sum())
-    across = (np.arange(pupil.n) - 0.5 * (pupil.n - 1)) * pupil.step
+    across = centered(pupil.n) * pupil.step
     # the same bits on any number of cores
     with single_threaded():
         # the core goes to the middle by a tilt: one matrix then serves both axes

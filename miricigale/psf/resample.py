@@ -9,6 +9,7 @@ import numpy as np
 from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
+from miricigale.utils.arrays import centered
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_that
 from miricigale.utils.positions import middle_pixel
@@ -199,8 +200,8 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     else:
         ny, nx = shape
     check_that(min(ny, nx) >= 1, "shape", "at least one row and column", shape)
-    x = (np.arange(nx) - (nx - 1) / 2 - offset[0]) * scale
-    y = ((np.arange(ny) - (ny - 1) / 2 - offset[1]) * scale)[:, None]
+    x = (centered(nx) - offset[0]) * scale
+    y = ((centered(ny) - offset[1]) * scale)[:, None]
     return sampled(psf, x, y) * (scale / psf.pixel_scale.value) ** 2
 
 

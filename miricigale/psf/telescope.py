@@ -8,6 +8,7 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.psf.optics import jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
+from miricigale.utils.arrays import middles
 from miricigale.utils.caching import cached
 from miricigale.utils.units import ANGLE, WAVE, check_count, positive, scalar, to_array
 
@@ -23,7 +24,7 @@ def band_quantiles(name, n=9):
     band = Filter.from_name(name)
     wave = to_array(band.wave, WAVE, "wave")
     rate = np.asarray(band.throughput, dtype=float) * wave**-1.0
-    total = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(wave))])
+    total = np.concatenate([[0.0], np.cumsum(middles(rate) * np.diff(wave))])
     inside = np.concatenate([[True], np.diff(total) > 0])
     result = np.interp((np.arange(n) + 0.5) / n, total[inside] / total[-1], wave[inside])
     result.flags.writeable = False

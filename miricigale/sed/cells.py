@@ -3,6 +3,8 @@
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
+from miricigale.utils.arrays import middles
+
 
 def edges_around(points):
     """
@@ -18,7 +20,7 @@ def edges_around(points):
     edges : `~numpy.ndarray`, shape (n + 1,)
         In the unit of the points.
     """
-    middle = 0.5 * (points[1:] + points[:-1])
+    middle = middles(points)
     return np.concatenate([points[:1], middle, points[-1:]])
 
 

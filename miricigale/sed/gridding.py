@@ -13,7 +13,7 @@ from miricigale.sed.derived import DERIVED, galaxy_quantities
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.tables import BLOCK, dilution, seen_agn
 from miricigale.utils.caching import cached
-from miricigale.utils.exceptions import ModelWarning, argument_error, unknown_name, warn
+from miricigale.utils.exceptions import ModelWarning, unknown_name, warn
 from miricigale.utils.missing_values import own_mask
 from miricigale.utils.named_values import subset, without
 from miricigale.utils.options import check_that, check_type
@@ -35,8 +35,7 @@ def check_axes(model, axes):
         if name not in model.parameters or name in skipped:
             raise unknown_name("axis", name, [n for n in model.parameters if n not in skipped])
         parameter = model.parameters[name]
-        if np.any(own_mask(values)):
-            raise argument_error(name, "values without a mask", values)
+        check_that(not np.any(own_mask(values)), name, "values without a mask", values)
         array = parameter.array(values)
         check_that(is_ascending(array), name, "ascending values", array)
         for value in array:

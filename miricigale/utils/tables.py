@@ -1,7 +1,6 @@
 """Checks and joins of tables, and integer flags that explain themselves."""
 
 import enum
-import os
 from collections.abc import Mapping
 
 import astropy.units as u
@@ -9,6 +8,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.files import is_path
 from miricigale.utils.frames import as_column, frame_columns, is_frame
 from miricigale.utils.ids import id_column, ids_and_missing
 from miricigale.utils.options import check_least, check_that, check_type
@@ -99,7 +99,7 @@ def as_table(data, argument):
         return data
     if isinstance(data, Row):
         return data.table[data.index : data.index + 1]
-    if isinstance(data, (str, os.PathLike)):
+    if is_path(data):
         from miricigale.utils.table_files import read_table
 
         return read_table(data, wanted="a table")

@@ -1,13 +1,13 @@
 """Fits of a catalog of photometry in a file, by default with models of real galaxies and their calibration."""
 
 import logging
-import os
 from pathlib import Path
 
 from miricigale.fitting.catalogs.catalog_rows import open_catalog
 from miricigale.fitting.data.fitted_bands import bands_with_errors, warn_of_unfitted
 from miricigale.fitting.data.likelihood import unused_bands
 from miricigale.fitting.data.nuclei import nucleus_columns
+from miricigale.utils.files import is_path
 from miricigale.utils.options import check_that
 
 log = logging.getLogger(__name__)
@@ -185,7 +185,7 @@ def first_calibration(calibration, axes, model_error):
     from miricigale.fitting.survey.defaults import DEFAULT, chosen_calibration
     from miricigale.fitting.survey.survey import SurveyCalibration
 
-    of_file = isinstance(calibration, (str, os.PathLike)) and calibration != DEFAULT
+    of_file = is_path(calibration) and calibration != DEFAULT
     if of_file:
         return SurveyCalibration.read(calibration)
     return chosen_calibration(calibration, axes, model_error)

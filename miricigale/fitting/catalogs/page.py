@@ -20,6 +20,7 @@ from miricigale.fitting.results.object_plots import draw_objects
 from miricigale.pages import Link, Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure, plain_text
 from miricigale.plotting.comparison import plot_redshifts
+from miricigale.utils.arrays import thinning_step
 from miricigale.utils.named_values import convert_values, without
 from miricigale.utils.package_tables import declared
 
@@ -88,7 +89,7 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None, browser=
         catalog_map=catalog_map,
         flux_unit=job["catalogue"]["flux_unit"],
     )
-    step = max(1, -(-len(results) // _MAX_OBJECTS))
+    step = thinning_step(len(results), _MAX_OBJECTS)
     all_numbers = fit_numbers(results, step)
     numbers = all_numbers
     numbers.meta["known"], numbers["z_known"] = known_redshifts(rows, z_spec, step)

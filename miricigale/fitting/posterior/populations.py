@@ -9,6 +9,7 @@ import numpy as np
 from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.fitting.posterior.quantities import column_values
 from miricigale.sed.cosmology import COSMOLOGY
+from miricigale.utils.arrays import middles
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
@@ -63,7 +64,7 @@ def agn_fraction_prior(frac_agn):
     log = np.linspace(-2.0, 2.0, 4001)
     # number for each dex of lambda, and the part of it above each lambda
     number = 10.0 ** (-0.5 * log) * np.exp(-(10.0**log))
-    steps = 0.5 * (number[1:] + number[:-1])
+    steps = middles(number)
     above = 1.0 - np.concatenate([[0.0], np.cumsum(steps)]) / np.sum(steps)
     # lambda at which half of the AGN's light over that plus the dust of stars is the fraction of each edge
     rate = edges / (1.0 - edges) * _DUST_PER_MASS / (0.5 * _EDDINGTON_PER_MASS / _STARS_PER_HOLE)

@@ -6,6 +6,7 @@ import numpy as np
 
 from miricigale.fitting._core import percentile_places
 from miricigale.fitting.data.likelihood import FitFlags
+from miricigale.utils.arrays import middles
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.missing_values import floats
@@ -31,7 +32,7 @@ def cell_edges(values, bounds=(-np.inf, np.inf)):
     values = np.asarray(values, dtype=float)
     if values.size == 1:
         return np.array([values[0], values[0]])
-    middle = 0.5 * (values[1:] + values[:-1])
+    middle = middles(values)
     first = max(2.0 * values[0] - middle[0], bounds[0])
     last = min(2.0 * values[-1] - middle[-1], bounds[1])
     return np.concatenate([[first], middle, [last]])

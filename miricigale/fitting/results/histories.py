@@ -6,7 +6,7 @@ import numpy as np
 from miricigale.fitting.posterior.posterior import check_levels
 from miricigale.fitting.results.percentile_columns import LEVELS, suffix
 from miricigale.sed.parameter import default_values
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
 
 #: Unit of star-formation rates, and steps of the history drawn.
@@ -121,8 +121,7 @@ def plot_sfh(results, ax=None, *, model=None, **kwargs):
     component = None
     if model is not None:
         component = model.component("sfh")
-    if component is None:
-        raise argument_error("model", "given where results were read from a file", "None")
+    check_that(component is not None, "model", "given where results were read from a file", "None")
     best = best_parameters(results, model)
     values = default_values(component.parameters)
     values |= {name: float(best[name].value) for name in values if name in best}

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from miricigale.fitting.data.likelihood import HIGH_CHI2, FitFlags
+from miricigale.utils.arrays import thinning_step
 from miricigale.utils.exceptions import FitWarning, warn
 
 #: What a warning of fits that are not converged begins with, after their number.
@@ -26,7 +27,7 @@ _MIN_CHI2_PART = 0.4
 
 def chi2_step(n):
     """Return the step between those of n objects that `chi2_limit` looks at."""
-    return max(1, -(-n // _MAX_SAMPLE))
+    return thinning_step(n, _MAX_SAMPLE)
 
 
 def chi2_limit(reduced_chi2):

@@ -14,6 +14,7 @@ from miricigale.photometry.commands.file_inputs import (
 from miricigale.photometry.commands.kernel_files import image_psf, matching_kernel
 from miricigale.utils.exceptions import PhotometryWarning, argument_error
 from miricigale.utils.named_values import field_values, subset
+from miricigale.utils.options import check_that
 
 
 def with_exposures(inputs):
@@ -72,13 +73,11 @@ class ExposureInputs(Inputs):
         super().check()
         for name, offered in (("components", 1), ("offset_order", None)):
             value = self.options.get(name, offered)
-            if value != offered:
-                raise argument_error(name, f"{offered} for exposures of one filter", value)
+            check_that(value == offered, name, f"{offered} for exposures of one filter", value)
         if self.options.get("background_order", 0) is None:
             wanted = "0 to 4 for exposures of one filter, each of which has a sky of its own"
             raise argument_error("background_order", wanted, None)
-        if self.psf_stars:
-            raise argument_error("psf_stars", "left out for exposures of one filter", True)
+        check_that(not self.psf_stars, "psf_stars", "left out for exposures of one filter", True)
 
     def _check_bands(self):
         """Accept several images of a filter, which are exposures: see `with_exposures`."""

@@ -21,6 +21,7 @@ from miricigale.photometry.images.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import file_place
 from miricigale.utils.named_values import field_names
+from miricigale.utils.options import check_that
 from miricigale.utils.positions import middle_pixel
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 from miricigale.utils.values import value_class
@@ -421,8 +422,7 @@ def _check_psfs(image, highres, kernel):
     from miricigale.psf import MODEL_FILTERS
 
     if kernel is not None:
-        if image.psf is not None:
-            raise argument_error("psf", "left out where a kernel is given", image.psf)
+        check_that(image.psf is None, "psf", "left out where a kernel is given", image.psf)
         return
     for file, prefix in ((image, ""), (highres, "highres_")):
         name = file.header.filter

@@ -20,6 +20,7 @@ from miricigale.plotting.axes import new_figure, plain_text
 from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
 from miricigale.plotting.posteriors import plot_pulls
 from miricigale.psf.star_fit import TERMS
+from miricigale.utils.arrays import thinning_step
 from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import plain_rows, row_dicts
@@ -210,7 +211,7 @@ def _summary(band):
 
 def _whole_image(result):
     model = result.model_image.data
-    step = max(1, -(-max(model.shape) // _ACROSS))
+    step = thinning_step(max(model.shape), _ACROSS)
     data = result.residual_image.data + model
     scale = pixel_scale(result.model_image.wcs) * step
     ny, nx = model.shape
@@ -486,7 +487,7 @@ def write_errors_page(path, errors, *, overwrite):
     # the map of the first aperture
     aperture, limit = next(iter(errors.limits.items()))
     limit = limit.value
-    step = max(1, -(-max(limit.shape) // 1500))
+    step = thinning_step(max(limit.shape), _ACROSS)
     scale = step * pixel_scale(errors.noise.wcs)
     figure, [[limit_ax, correlation_ax]] = new_figure(1, 2, size=(5.2, 4.2))
     form = {"limits": np.nanpercentile(limit, [1, 99]), "colorbar": "limit (uJy)"}

@@ -12,7 +12,7 @@ from miricigale.photometry.images.arrays import nearest_values, sky_to_pixels
 from miricigale.photometry.images.fits_images import open_map
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, data_error, warn
-from miricigale.utils.files import open_fits, split_extension
+from miricigale.utils.files import is_path, open_fits, split_extension
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.options import check_data, check_that
 from miricigale.utils.positions import as_positions
@@ -90,7 +90,7 @@ def read_prior(highres, *, segmentation=None, catalog=None):
     if catalog is None:
         return segments, _from_segments(highres, segments, ids)
     sources = read_catalog(catalog, epoch=epoch_of(highres))
-    if isinstance(catalog, (str, os.PathLike)):
+    if is_path(catalog):
         # other columns of a file may be called as ours without being meant
         kept = [name for name in ("id", "sky", "components") if name in sources.colnames]
         sources = sources[kept]
@@ -194,7 +194,7 @@ def read_catalog(catalog, wcs=None, epoch=None):
     `~miricigale.utils.exceptions.DataError`, ValueError
         If a file is missing or damaged, or there are no positions; if ids are not unique.
     """
-    is_file = isinstance(catalog, (str, os.PathLike))
+    is_file = is_path(catalog)
     name = "catalog"
     if is_file:
         name = f"catalog {catalog}"
@@ -222,7 +222,7 @@ def is_catalog(value):
     """
     if isinstance(value, (SkyCoord, Table)) or hasattr(value, "iloc"):
         return True
-    if not isinstance(value, (str, os.PathLike)):
+    if not is_path(value):
         return False
     path = split_extension(value)[0]
     if not os.path.isfile(path):

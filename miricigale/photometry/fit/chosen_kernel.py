@@ -23,7 +23,7 @@ from miricigale.psf import (
 from miricigale.psf.files import states_pixel
 from miricigale.psf.kernel_inputs import named_psf
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import split_extension
+from miricigale.utils.files import is_path, split_extension
 from miricigale.utils.options import check_that
 from miricigale.utils.units import ANGLE
 
@@ -163,7 +163,7 @@ def is_sampled(psf):
     """Whether a PSF is an array, a model or a file without the size of its pixels."""
     if isinstance(psf, (InstrumentPSF, GriddedPSFModel)):
         return False
-    if isinstance(psf, (str, os.PathLike)):
+    if is_path(psf):
         return os.path.isfile(split_extension(psf)[0]) and not states_pixel(psf)
     return isinstance(psf, np.ndarray) or hasattr(psf, "param_names") or hasattr(psf, "array")
 
@@ -174,6 +174,6 @@ def _on_pixels(psf, image):
         return psf
     scale = pixel_scale(image.wcs) * ANGLE
     angle = grid_angle(image.wcs, image.shape)
-    if isinstance(psf, (str, os.PathLike)):
+    if is_path(psf):
         return read_psf(psf, pixel_scale=scale, frame="sky", angle=angle)
     return from_photutils(psf, pixel_scale=scale, frame="sky", angle=angle)

@@ -68,8 +68,7 @@ class ExposureKernels:
         kernels = tuple(self.kernels)
         object.__setattr__(self, "kernels", kernels)
         wanted = "a MatchingKernel or a KernelField for each exposure"
-        if not kernels:
-            raise argument_error("kernel", wanted, "none")
+        check_that(kernels, "kernel", wanted, "none")
         for kernel in kernels:
             if not isinstance(kernel, (MatchingKernel, KernelField)):
                 raise argument_error("kernel", wanted, type(kernel).__name__)

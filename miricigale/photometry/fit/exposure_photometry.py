@@ -112,8 +112,7 @@ def measure_exposures(photometer, images, highres, segmentation, catalog, *, tem
 
 def _opened(images):
     """Open the exposures as images, and check that they are of one filter."""
-    if not len(images):
-        raise argument_error("image", "at least one exposure", "none")
+    check_that(len(images), "image", "at least one exposure", "none")
     opened = [as_mosaic(image, f"image[{k}]") for k, image in enumerate(images)]
     names = {str(image.meta["filter"]) for image in opened if image.meta.get("filter") is not None}
     check_that(len(names) <= 1, "image", "exposures of one filter", sorted(names))
@@ -124,8 +123,7 @@ def _settings_of_each(photometer, n):
     """Return the photometer with the kernel of each of n exposures."""
     kernel = photometer.kernel
     if not isinstance(kernel, ExposureKernels):
-        if photometer.bare:
-            raise argument_error("kernel", "one with its PSFs for exposures", "one without")
+        check_that(not photometer.bare, "kernel", "one with its PSFs for exposures", "one without")
         return [photometer] * n
     wanted = f"one for each of {n} exposures"
     check_that(len(kernel) == n, "kernel", wanted, f"{len(kernel)} kernels")
@@ -143,8 +141,7 @@ def _check_offered(photometer):
         ("components", photometer.components, 1),
         ("offset_order", photometer.offset_order, None),
     ):
-        if value != offered:
-            raise argument_error(name, f"{offered} for exposures", value)
+        check_that(value == offered, name, f"{offered} for exposures", value)
     if photometer.psf_stars is True:
         wanted = "False or None for exposures (correct the PSFs beforehand)"
         raise argument_error("psf_stars", wanted, True)

@@ -1,7 +1,6 @@
 """Forced photometry: all sources of a catalog fitted at once, with templates."""
 
 import dataclasses
-import os
 
 import astropy.units as u
 import numpy as np
@@ -30,6 +29,7 @@ from miricigale.photometry.templates.placement import Placement
 from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.psf import MODEL_FILTERS, KernelField, MatchingKernel
 from miricigale.utils.exceptions import PhotometryWarning, PSFWarning, argument_error, warn
+from miricigale.utils.files import is_path
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.named_values import field_values
@@ -483,7 +483,7 @@ class ForcedPhotometer(Interactive):
         if segmentation is None:
             segments, sources = detected_prior(highres, catalog)
             return highres, segments, sources
-        if catalog is not None and not isinstance(segmentation, (str, os.PathLike)):
+        if catalog is not None and not is_path(segmentation):
             # labels are those of the catalog, or by position
             return highres, segmentation, catalog
         if isinstance(segmentation, SegmentationImage):

@@ -32,7 +32,7 @@ from miricigale.instrument.keywords import keyword_text
 from miricigale.instrument.product_files import PLANES
 from miricigale.reduction.images.images import flagged_image, sigma
 from miricigale.utils.exceptions import DataError, argument_error, data_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import is_path, open_fits
 from miricigale.utils.named_values import without, without_none
 from miricigale.utils.options import check_data
 from miricigale.utils.parallel import check_memory
@@ -410,7 +410,7 @@ def as_exposure(exposure):
     """Return an exposure of its file or data model; anything else itself."""
     if is_data_model(exposure):
         return read_data_model(exposure, open_exposure)
-    if isinstance(exposure, (str, os.PathLike)):
+    if is_path(exposure):
         return open_exposure(exposure)
     return exposure
 
@@ -423,7 +423,7 @@ def exposure_list(exposures):
             msg = f"no file is called {exposures}"
             raise DataError(msg)
         return paths
-    if isinstance(exposures, (str, os.PathLike)) and os.path.isdir(exposures):
+    if is_path(exposures) and os.path.isdir(exposures):
         raise argument_error(
             "ramps", f"files, such as {os.path.join(exposures, '*_uncal.fits')!r}", "a folder"
         )

@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.depth._core import shared_photons
 from miricigale.instrument import DQ
 from miricigale.reduction.references.reference_maps import read_variance
+from miricigale.utils.arrays import centered
 from miricigale.utils.options import check_that
 
 # pixels that are looked at, at most
@@ -249,7 +250,7 @@ def _mean(values, errors):
 
 def _slope(data):
     """Return the least-squares slope of each pixel, DN in a group."""
-    group = np.arange(len(data)) - (len(data) - 1) / 2
+    group = centered(len(data))
     return np.tensordot(group, data, 1) / np.sum(group**2)
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import numbers
-import os
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from miricigale.instrument import (
 from miricigale.reduction.references.measured_noise import measure_noise
 from miricigale.reduction.references.reference_maps import READERS
 from miricigale.utils.exceptions import ReferenceWarning, argument_error, data_error, warn
+from miricigale.utils.files import is_path
 from miricigale.utils.named_values import without
 from miricigale.utils.options import check_that
 
@@ -270,7 +270,7 @@ class ReferenceFiles:
             value = getattr(self, name)
             if value is None or (value == "measured" and name in _MEASURED):
                 continue
-            if isinstance(value, (str, os.PathLike)):
+            if is_path(value):
                 check_that(
                     Path(value).is_file(), name, "the path of a file", f"{value}: there is none"
                 )

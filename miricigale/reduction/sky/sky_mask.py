@@ -5,6 +5,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filt
 from scipy.stats import norm
 
 from miricigale.reduction.images.cells import cells_of, pixels_of, smoothed_cells
+from miricigale.utils.arrays import centered
 
 # detection of what is masked: standard deviations of the smoothing in pixels (cores, and
 # the wings of bright sources), and the least number of connected pixels: those of the smoothing
@@ -138,7 +139,7 @@ def light_left(mesh, sources, noise, step=1):
     # sources that cover the image are in the mesh
     wide = mesh.level
     for axis in (0, 1):
-        place = np.arange(wide.shape[axis]) - (wide.shape[axis] - 1) / 2
+        place = centered(wide.shape[axis])
         slope = place @ wide.mean(axis=1 - axis) / max(place @ place, 1.0)
         wide = wide - np.expand_dims(np.float32(slope) * place.astype(np.float32), 1 - axis)
     wide = np.maximum(wide - np.quantile(wide[::8, ::8], 0.02), 0)

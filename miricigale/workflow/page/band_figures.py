@@ -18,6 +18,7 @@ from miricigale.plotting.axes import (
     panels,
 )
 from miricigale.plotting.comparison import plot_error_function, plot_offsets, plot_relation
+from miricigale.utils.arrays import middles
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.labels import band_label, band_title, by_wavelength
 from miricigale.workflow.stages.conditions import has_flag
@@ -291,7 +292,7 @@ def counts_figure(galaxies, bands, area):
         counts = counts.to_value(u.deg**-2)
         error = error.to_value(u.deg**-2)
         good = counts > 0
-        middle = 0.5 * (edges[1:] + edges[:-1])[good]
+        middle = middles(edges)[good]
         ax.errorbar(middle, counts[good], error[good], fmt="o", ms=4, color=MEASURED, lw=1)
         ax.set(yscale="log", title=band_title(name))
     label_outer(axes, "magnitude (AB)", r"N (deg$^{-2}$ mag$^{-1}$)")

@@ -12,6 +12,7 @@ from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_
 from miricigale.plotting.images import filled, mark_sky, plot_color, plot_image, plot_model_residual
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.psf.wiener import energy_error
+from miricigale.utils.arrays import middles, peak_index
 from miricigale.utils.positions import middle_pixel
 from miricigale.workflow.labels import band_title
 
@@ -65,7 +66,7 @@ def _zooms(planes, scale):
     total = uniform_filter(light, size, mode="constant", cval=-_BRIGHT * len(planes))
     middles = []
     while total.max() > 0 and len(middles) < 4:
-        y, x = np.unravel_index(np.argmax(total), total.shape)
+        y, x = peak_index(total)
         middles.append((scale * (x - 0.5 * total.shape[1]), scale * (y - 0.5 * total.shape[0])))
         # the next one does not overlap
         total[max(y - size, 0) : y + size, max(x - size, 0) : x + size] = 0
@@ -184,7 +185,7 @@ def residual_figure(images, names, *, size=220):
     model = np.where(np.isfinite(first), filled(images[0][1]), 0.0)
     # the brightest part of the model, where deblending matters most
     light = uniform_filter(np.sqrt(np.clip(model, 0, None)), size or 1)
-    middle = np.array(np.unravel_index(np.argmax(light), light.shape))
+    middle = np.array(peak_index(light))
     if size is None:
         part = _exposed([first])
     else:
@@ -263,7 +264,7 @@ def _profile(image, axis):
     medians = []
     for strip in np.split(image, edges[1:-1], axis=1 - axis):
         medians.append(np.nanmedian(strip) if np.isfinite(strip).any() else np.nan)
-    return 0.5 * (edges[1:] + edges[:-1]), np.array(medians)
+    return middles(edges), np.array(medians)
 
 
 def convolution_figure(kernels):

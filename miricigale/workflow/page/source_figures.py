@@ -8,6 +8,7 @@ from miricigale.filters import Filter
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure, plain_text
 from miricigale.plotting.curves import plot_filters, plot_spectrum
 from miricigale.plotting.posteriors import plot_pdf_2d
+from miricigale.utils.arrays import middles
 from miricigale.utils.units import FNU
 from miricigale.workflow.labels import SET_LABELS, band_label, by_wavelength
 
@@ -170,7 +171,7 @@ def _draw_posteriors(ax, distributions):
         density = np.divide(weights, width, out=np.zeros(width.size), where=width > 0)
         # straight lines between the middles of the cells, level to the ends
         density = np.pad(density / max(density.max(), 1e-300), 1, mode="edge")
-        place = np.r_[edges[0], 0.5 * (edges[1:] + edges[:-1]), edges[-1]]
+        place = np.r_[edges[0], middles(edges), edges[-1]]
         if not ends:
             ax.fill_between(place, density, alpha=0.2, color=color, lw=0)
         ax.plot(place, density, color=color, lw=1.6, ls=line, label=SET_LABELS[name])
