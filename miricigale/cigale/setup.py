@@ -23,7 +23,7 @@ from miricigale.utils.exceptions import config_error
 from miricigale.utils.files import replacing
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
-from miricigale.utils.tables import require_columns
+from miricigale.utils.tables import columns_among, require_columns
 from miricigale.utils.values import value_class
 
 #: Most models that are written.
@@ -257,10 +257,8 @@ class CigaleSetup:
         fitter : `~miricigale.fitting.BayesFitter`
         """
         require_columns(photometry, ["id"], "photometry")
-        have = [name for name in self.bands if name in photometry.colnames]
-        wanted = f"a table with at least one of the columns {list(self.bands)}"
-        check_that(have, "photometry", wanted, f"columns {photometry.colnames}")
-        grid = self.grid(list(have) + list(self.predicted), _column(photometry, "redshift"))
+        have = columns_among(photometry, self.bands, "photometry")
+        grid = self.grid(have + list(self.predicted), _column(photometry, "redshift"))
         options = {"model_error": self.additional_error} | options
         return BayesFitter(grid, have, compat=compat, **options)
 

@@ -8,7 +8,7 @@ import numpy as np
 from miricigale.detector.ramp import Ramp
 from miricigale.instrument import DQ, aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_that, check_type
+from miricigale.utils.options import check_shape, check_that, check_type
 from miricigale.utils.units import TIME, Frozen, frozen_array, scalar, to_array
 from miricigale.utils.values import value_class
 
@@ -81,8 +81,7 @@ class Latent(Frozen):
             full = np.zeros(rate.shape, bool)
         else:
             full = self.saturated
-        if np.shape(full) != rate.shape:
-            raise argument_error("saturated", f"of shape {rate.shape}", np.shape(full))
+        check_shape(full, rate.shape, "saturated")
         self.__dict__.update(rate=rate, gap=gap * TIME, saturated=frozen_array(full, bool))
 
     @classmethod

@@ -9,7 +9,7 @@ from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_shape, check_that
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, ab_magnitude
 from miricigale.utils.values import value_class
@@ -78,8 +78,7 @@ class TruthResults:
         ids = np.asarray(self.truth["id"])
         good = np.array_equal(ids, np.asarray(self.matched["id"]))
         check_that(good, "matched", "of the sources of 'truth', row by row", "others")
-        if np.shape(self.field) != ids.shape:
-            raise argument_error("field", f"of shape {ids.shape}", np.shape(self.field))
+        check_shape(self.field, ids.shape, "field")
         for name, table in self.fits.items():
             if not np.array_equal(ids[self.sample], np.asarray(table["id"])):
                 wanted = "tables of the sample ('selection' 0), row by row"

@@ -20,7 +20,7 @@ from miricigale.utils.interactive import WithTable
 from miricigale.utils.options import check_that
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.table_files import write_table
-from miricigale.utils.table_formats import table_suffix
+from miricigale.utils.table_formats import check_keeps_units
 from miricigale.utils.units import (
     FNU,
     WAVE,
@@ -390,8 +390,7 @@ class Filter(Frozen, WithTable):
 
         CSV is refused, which keeps neither units nor the wavelength at which catalogs quote fluxes.
         """
-        wanted = "a file of a format with units, such as .ecsv or .fits"
-        check_that(table_suffix(path) != ".csv", "path", wanted, str(path))
+        check_keeps_units(path)
         write_table(self.to_table(), path, overwrite=overwrite)
 
     @cached_property

@@ -7,8 +7,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing
+from miricigale.utils.folder import check_folder
 from miricigale.utils.outputs import check_outputs
 from miricigale.utils.table_files import write_table
 
@@ -129,8 +129,7 @@ def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=F
     from miricigale.planning.page import answer
 
     folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise argument_error("folder", "a folder, or nothing yet", f"the file {folder}")
+    check_folder(folder)
     # those of a plan with fewer sets, too
     paths = [folder / "plan.html", folder / "plan.toml"]
     paths += [folder / "comparison.ecsv", folder / "areas.ecsv"]

@@ -9,7 +9,7 @@ from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
-from miricigale.utils.arrays import centered
+from miricigale.utils.arrays import centered, check_light
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.files import write_fits
@@ -409,8 +409,7 @@ def make_psf(data, pixel_scale, *, frame="sky", oversampling=1, enclosed=None, *
     0.424 arcsec, 0.95
     """
     data = np.array(floats(data))
-    if data.ndim != 2 or not np.all(np.isfinite(data)) or not data.sum() > 0:
-        raise argument_error("data", "a finite 2D array with a positive sum", f"{data.shape}")
+    check_light(data, "data")
     total = float(data.sum())
     factor = 1.0
     if enclosed is not None:

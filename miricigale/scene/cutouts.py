@@ -9,6 +9,7 @@ import numpy as np
 from astropy.nddata import NDData
 
 from miricigale.scene.sky import local_jacobian
+from miricigale.utils.arrays import check_light
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
@@ -71,8 +72,7 @@ class Cutout(Frozen):
 
     def __post_init__(self):
         data = frozen_array(floats(self.data))
-        if data.ndim != 2 or not np.all(np.isfinite(data)) or not data.sum() > 0:
-            raise argument_error("data", "a finite 2D array with a positive sum", data.shape)
+        check_light(data, "data")
         scale = positive(self.pixel_scale, ANGLE, "pixel_scale") * ANGLE
         angle = frozen_quantity(self.angle, u.deg, "angle", ndim=0, finite=True)
         center = self.center

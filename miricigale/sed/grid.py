@@ -11,7 +11,7 @@ from astropy.table import QTable
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write, register
 from miricigale.utils.named_values import attributes, subset
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_shape, check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import Frozen, frozen_array, is_ascending
 from miricigale.utils.values import value_class
@@ -196,8 +196,7 @@ class ModelGrid(Frozen):
         sizes = {"z": n_z, "g": n_g, "a": n_a, "f": self.frac_agn.size, "b": n_b}
         for name, (_, _, letters) in _ARRAYS.items():
             shape = tuple(sizes[letter] for letter in letters)
-            got = getattr(self, name).shape
-            check_that(got == shape, name, f"of shape {shape}", got)
+            check_shape(getattr(self, name), shape, name)
         for name in _TABLES:
             if name.startswith("galaxy"):
                 rows = n_g

@@ -21,7 +21,7 @@ from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import full_meta
 from miricigale.utils.options import check_that
 from miricigale.utils.table_files import read_table, write_table
-from miricigale.utils.table_formats import table_suffix
+from miricigale.utils.table_formats import check_keeps_units
 from miricigale.utils.units import (
     FLAM,
     FNU,
@@ -436,8 +436,7 @@ class SED(Frozen, WithTable):
         The parts are in nJy: readers such as that of specutils take a further column in the unit of the flux for
         its uncertainty. CSV is refused, which keeps neither units nor the redshift.
         """
-        wanted = "a file of a format with units, such as .ecsv or .fits"
-        check_that(table_suffix(path) != ".csv", "path", wanted, str(path))
+        check_keeps_units(path)
         table = self.to_table()
         for name in self.components:
             table[name] = table[name].to(u.nJy)

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from miricigale.utils.options import check_that
+
 
 def middles(edges):
     """Return the middles of cells between edges along the first axis: shape (n, ...) to (n - 1, ...)."""
@@ -16,6 +18,12 @@ def centered(n):
 def peak_index(values):
     """Return the index of the largest value of an array, along each axis: tuple of int."""
     return np.unravel_index(np.argmax(values), values.shape)
+
+
+def check_light(data, argument):
+    """Refuse what is no image with light (a `ValueError`)."""
+    good = data.ndim == 2 and np.all(np.isfinite(data)) and data.sum() > 0
+    check_that(good, argument, "a finite 2D array with a positive sum", data.shape)
 
 
 def thinning_step(n, most):

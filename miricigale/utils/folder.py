@@ -11,10 +11,17 @@ from miricigale.utils.exceptions import DataError, data_error
 from miricigale.utils.files import PARTIAL, replacing, writing
 from miricigale.utils.lock import FolderLock
 from miricigale.utils.named_values import without
+from miricigale.utils.options import check_that
 
 log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
+
+
+def check_folder(folder):
+    """Refuse a file in the place of a folder (a `ValueError`)."""
+    is_file = folder.exists() and not folder.is_dir()
+    check_that(not is_file, "folder", "a folder, or nothing yet", f"the file {folder}")
 
 
 class FileFolder:

@@ -66,6 +66,12 @@ def check_data(good, path, problem):
         raise data_error(path, problem)
 
 
+def check_shape(value, shape, name):
+    """Refuse an array of another shape (a `ValueError`)."""
+    got = np.shape(value)
+    check_that(got == shape, name, f"of shape {shape}", got)
+
+
 def check_choice(value, name, choices):
     """Refuse a value that is none of those known (a `ValueError`)."""
     check_that(value in choices, name, " or ".join(map(repr, choices)), repr(value))

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from miricigale.utils.options import check_that
+
 #: Formats that are read, as `astropy.table.Table` calls them.
 TABLE_FORMATS = {
     ".fits": "fits",
@@ -17,6 +19,12 @@ TABLE_FORMATS = {
 }
 #: Formats that are written: plain text keeps the units too.
 WRITTEN_FORMATS = TABLE_FORMATS | {".txt": "ascii.ecsv", ".dat": "ascii.ecsv"}
+
+
+def check_keeps_units(path):
+    """Refuse the path of a table in a format without units (a `ValueError`)."""
+    wanted = "a file of a format with units, such as .ecsv or .fits"
+    check_that(table_suffix(path) != ".csv", "path", wanted, str(path))
 
 
 def table_suffix(path):

@@ -265,6 +265,14 @@ def require_columns(table, names, argument, *, units=None):
             raise units_error(argument, f"convertible to {unit}", have, column=name)
 
 
+def columns_among(table, names, argument):
+    """Return those of some names that are columns of a table, in their order; refuse none (a `ValueError`)."""
+    columns = [name for name in names if name in table.colnames]
+    wanted = f"a table with at least one of the columns {list(names)}"
+    check_that(columns, argument, wanted, f"columns {table.colnames}")
+    return columns
+
+
 def unique_ids(ids, argument):
     """Return ids as `read_ids` has them, after checking that none is there twice."""
     ids = _whole_ids(ids, argument)

@@ -12,7 +12,7 @@ from miricigale.utils.missing_values import first_word, own_mask
 from miricigale.utils.named_values import attributes
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
-from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
+from miricigale.utils.tables import Flags, columns_among, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, flux_unit, to_array
 from miricigale.utils.values import value_class
 
@@ -276,10 +276,7 @@ class PhotometryReader:
         require_columns(table, [], "photometry")
         if self.filters is not None:
             return self.filters
-        filters = tuple(name for name in self.bands if name in table.colnames)
-        wanted = f"a table with at least one of the columns {list(self.bands)}"
-        check_that(filters, "photometry", wanted, f"columns {table.colnames}")
-        return filters
+        return tuple(columns_among(table, self.bands, "photometry"))
 
     def read(self, table, repeated=None):
         """

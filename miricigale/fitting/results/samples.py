@@ -20,7 +20,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.flag_arrays import FlagField
 from miricigale.utils.object_rows import PerObject, PerObjectDict
-from miricigale.utils.options import check_names, check_that
+from miricigale.utils.options import check_names, check_shape, check_that
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.units import FNU, WAVE
 from miricigale.utils.values import value_class
@@ -128,8 +128,7 @@ model : `~miricigale.sed.SEDModel`, optional
         if len(shape) != 2 or shape[0] != n or shape[1] < 1:
             raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
         for name, wanted in (("index", shape + (4,)), ("flags", (n,))):
-            got = np.shape(getattr(self, name))
-            check_that(got == wanted, name, f"of shape {wanted}", got)
+            check_shape(getattr(self, name), wanted, name)
         sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
         drawn = index[(index[:, :, 0] >= 0).all(axis=1)].reshape(-1, 4)
         if np.any(drawn < [0, 0, -1, 0]) or np.any(drawn >= sizes):

@@ -11,7 +11,13 @@ from miricigale.utils.column_units import quantity_table
 from miricigale.utils.ids import id_column
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
-from miricigale.utils.tables import described_columns, error_column, read_ids, require_columns
+from miricigale.utils.tables import (
+    columns_among,
+    described_columns,
+    error_column,
+    read_ids,
+    require_columns,
+)
 from miricigale.utils.units import FNU, to_array
 from miricigale.utils.values import value_class
 
@@ -186,9 +192,8 @@ def flux_table(photometry, filters, model_bands):
         photometry = as_photometry(photometry, names)
     require_columns(photometry, [], "photometry")
     if filters is None:
-        filters = [name for name in model_bands if name in photometry.colnames]
-    wanted = f"a table with at least one of the columns {list(model_bands)}"
-    check_that(filters, "photometry", wanted, f"columns {photometry.colnames}")
+        filters = columns_among(photometry, model_bands, "photometry")
+    check_that(filters, "filters", "at least one band", "none")
     require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
     table = quantity_table(photometry, copy=True)
     for name in filters:

@@ -36,7 +36,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats
-from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.options import check_choice, check_shape, check_that
 from miricigale.utils.parallel import single_threaded, threads
 from miricigale.utils.tables import unique_ids
 from miricigale.utils.units import ANGLE
@@ -133,8 +133,8 @@ class SourceTemplates:
             value = nothing.get(name) if value is None else np.array(value)
             if value is None:
                 continue
-            if name in shapes and value.shape != shapes[name]:
-                raise argument_error(name, f"of shape {shapes[name]}", value.shape)
+            if name in shapes:
+                check_shape(value, shapes[name], name)
             value.flags.writeable = False
             object.__setattr__(self, name, value)
         if len(self.light) != n or len(self.sky) != n:

@@ -1,7 +1,7 @@
 """The folder of reduced exposures: what stands in it, and what may be replaced."""
 
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.folder import PARTIAL, RecordFolder
+from miricigale.utils.folder import PARTIAL, RecordFolder, check_folder
 
 
 class ProductFolder(RecordFolder):
@@ -30,8 +30,7 @@ class ProductFolder(RecordFolder):
 
     def _refuse_foreign(self, *, damaged):
         """Refuse a file in place of the folder; files of others stay, and none is taken for ours."""
-        if self.folder.exists() and not self.folder.is_dir():
-            raise argument_error("folder", "a folder, or nothing yet", f"the file {self.folder}")
+        check_folder(self.folder)
 
     def _unfinished(self):
         """Unfinished products of a reduction that was killed; other programs may write in the folder too."""

@@ -22,7 +22,7 @@ from miricigale.reduction.ramps.showers import find_showers
 from miricigale.reduction.references.reference_maps import read_variance
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats, without_mask
-from miricigale.utils.options import check_positive, check_that
+from miricigale.utils.options import check_positive, check_shape, check_that
 from miricigale.utils.parallel import chunks, parallel_map, threads
 from miricigale.utils.units import check_count
 from miricigale.utils.values import value_class
@@ -226,7 +226,7 @@ def fit_groups(
         usable = np.ones((ny, nx), bool)
     else:
         usable = np.ascontiguousarray(usable, bool)
-    check_that(usable.shape == (ny, nx), "usable", f"of shape {(ny, nx)}", usable.shape)
+    check_shape(usable, (ny, nx), "usable")
     noise = _noise(maps, usable, n_frames, poisson_factor, rounded=is_rounded)
     ramp = (data, *_response(maps, usable, drift, data.shape, last_group, n_frames))
     group_dq = _group_dq(group_dq, data.shape)

@@ -8,11 +8,12 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
+from miricigale.utils.arrays import middles
 from miricigale.utils.caching import cached_property
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.named_values import convert_values, subset
-from miricigale.utils.options import check_data, check_that
+from miricigale.utils.options import check_data, check_shape, check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, is_ascending, to_array
 from miricigale.utils.values import value_class
@@ -82,7 +83,7 @@ class LibraryTable:
             for name, column in getattr(self, kind).items():
                 if kind != "spectra" and hasattr(column, "unit"):
                     raise argument_error(name, "plain numbers (units stand apart)", "a quantity")
-                check_that(np.shape(column) == shape, name, f"of shape {shape}", np.shape(column))
+                check_shape(column, shape, name)
                 if kind == "axes" and not np.all(np.isfinite(column)):
                     raise argument_error(name, "finite in every row", "NaN or infinity")
         for kind in ("axes", "values"):
@@ -126,7 +127,7 @@ class LibraryTable:
     def _codes(self, axis, values):
         """Return for each value the number of the level that is the same, or -1."""
         levels = self.levels[axis]
-        nearest = np.searchsorted(0.5 * (levels[1:] + levels[:-1]), values)
+        nearest = np.searchsorted(middles(levels), values)
         # zero has no relative neighborhood: there the extent of the axis is the measure
         tolerance = _SAME * np.maximum(np.abs(levels), 1e-3 * np.ptp(levels))
         return np.where(np.abs(values - levels[nearest]) <= tolerance[nearest], nearest, -1)
