@@ -50,7 +50,7 @@ class CatalogFits(Interactive):
             return self.engine
         return repr(self.engine)
 
-    def _settings(self, filters):
+    def _settings(self, filters=None):
         """Return what `~miricigale.fitting.BayesFitter.settings` does."""
         optional = {}
         if self.calibration is not None:

@@ -614,6 +614,6 @@ class BayesFitter(CatalogFits):
         meta = provenance(citations=cited, fit=settings, seed=seed)
         return samples._changed(model=fitter.model, meta=meta)
 
-    def settings(self, filters=None):
+    def settings(self):
         """Return the settings of the fit, for the meta of results: a dict of plain values."""
-        return self._settings(filters)
+        return self._settings()

@@ -273,25 +273,18 @@ class InjectionResult(Interactive):
         """
         return _errors(self.sources)
 
-    def false_rate(self, threshold=None):
+    def false_rate(self):
         """
         Share of empty positions whose flux is above the threshold: false sources of forced photometry.
-
-        Parameters
-        ----------
-        threshold : float, optional
-            Signal-to-noise; that of the injection by default.
 
         Returns
         -------
         rate : float
             NaN without empty positions.
         """
-        if threshold is None:
-            threshold = self.meta["threshold"]
         pulls = self.empty_pulls[np.isfinite(self.empty_pulls)]
         if len(pulls):
-            return float(np.mean(pulls > threshold))
+            return float(np.mean(pulls > self.meta["threshold"]))
         return np.nan
 
     @functools.cached_property

@@ -90,7 +90,7 @@ def header_wcs(header, hdus=None, *, where):
     return wcs
 
 
-def as_wcs(given, argument="wcs"):
+def as_wcs(given):
     """
     Return the world coordinates of whatever holds some.
 
@@ -98,8 +98,6 @@ def as_wcs(given, argument="wcs"):
     ----------
     given : `~astropy.wcs.WCS`, `~astropy.io.fits.Header` or image with ``wcs``
         A header has those of its image, with the shape of the pixels if it states it.
-    argument : str, optional
-        The argument's name, for messages.
 
     Returns
     -------
@@ -123,7 +121,7 @@ def as_wcs(given, argument="wcs"):
 
     wcs = given
     if isinstance(given, fits.Header):
-        wcs = header_wcs(given, where=f"'{argument}'")
+        wcs = header_wcs(given, where="'wcs'")
         if wcs is not None and "NAXIS2" in given:
             wcs.pixel_shape = given["NAXIS1"], given["NAXIS2"]
     elif not isinstance(given, WCS):
@@ -134,7 +132,7 @@ def as_wcs(given, argument="wcs"):
             wcs.pixel_shape = shape[::-1]
     celestial = isinstance(wcs, WCS) and wcs.has_celestial
     wanted = "an astropy WCS with celestial axes, or a header or an image with one"
-    check_that(celestial, argument, wanted, type(given).__name__)
+    check_that(celestial, "wcs", wanted, type(given).__name__)
     return wcs
 
 

@@ -11,7 +11,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import is_path
 
 
-def as_kernel(kernel, argument="kernel"):
+def as_kernel(kernel):
     """
     Return the kernel of anything that is one.
 
@@ -20,8 +20,6 @@ def as_kernel(kernel, argument="kernel"):
     kernel : `MatchingKernel`, `KernelField`, path-like, pair or `~astropy.nddata.NDData`
         A kernel, its file, an array with its pixel scale (``(array, 0.03 * u.arcsec)``), or an image with world
         coordinates.
-    argument : str, optional
-        The argument's name, for messages.
 
     Returns
     -------
@@ -57,7 +55,7 @@ def as_kernel(kernel, argument="kernel"):
         array = np.asarray(getattr(array, "array", array))
         return MatchingKernel.from_array(array, pixel_scale=scale)
     raise argument_error(
-        argument,
+        "kernel",
         "a MatchingKernel, a KernelField, a file, or an array with its pixel scale, such as "
         "(array, 0.03 * u.arcsec) (or give 'psf')",
         type(kernel).__name__,

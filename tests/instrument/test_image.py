@@ -68,7 +68,7 @@ def test_world_coordinates_of_a_header_or_an_image():
         np.testing.assert_allclose(
             found.pixel_to_world(3, 4).ra.deg, wcs.pixel_to_world(3, 4).ra.deg
         )
-    refuses("'grid' must be an astropy WCS with celestial axes", as_wcs, fits.Header(), "grid")
+    refuses("'wcs' must be an astropy WCS with celestial axes", as_wcs, fits.Header())
 
 
 def test_errors_of_an_image_are_standard_deviations():

@@ -277,7 +277,7 @@ def measure_priors(results):
     return {name: results.pdf[name][results.fitted].mean(axis=0) for name in names}
 
 
-def calibrate_zero_points(results, *, reference=None, longest=None):
+def calibrate_zero_points(results, *, reference=None):
     """
     Measure what the fluxes of each band want to be multiplied by to agree with the best models.
 
@@ -291,9 +291,6 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
         Of a fit at known redshifts.
     reference : str, optional
         Band whose factor is 1; by default that of the most sources.
-    longest : `~astropy.units.Quantity`, optional
-        Longest rest wavelength of the fluxes that are taken, such as 2.5 um, beyond which models of dust are
-        less sure than zero points.
 
     Returns
     -------
@@ -336,8 +333,6 @@ def calibrate_zero_points(results, *, reference=None, longest=None):
     miri.f770w  40   1.07
     """
     flux, _, model, good = _residuals(results)
-    if longest is not None:
-        good &= _rest_wavelengths(results) < to_array(longest, WAVE, "longest", ndim=0)
     bands = list(results.fitted_filters)
     columns = places(bands, results.filters)
     n = good[:, columns].sum(axis=0)

@@ -83,7 +83,7 @@ def encircled_flux(image, sky, flux, radii):
     )
 
 
-def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
+def flux_scaling(image, sky, flux, psf):
     """
     Calculate the factor by which an image is multiplied to have the true flux scale.
 
@@ -93,8 +93,6 @@ def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
         As in `encircled_flux`.
     psf : `~photutils.psf.ImagePSF`
         PSF of the image, which must include all that its pixels do.
-    fraction : float, optional
-        Encircled energy at whose radius the two are compared.
 
     Returns
     -------
@@ -105,8 +103,8 @@ def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
     Notes
     -----
     The PSF holds the response of a pixel, and a sum over an image's pixels spreads each over its
-    square once more. At the radius of ``fraction`` that sum is therefore a little below it (0.3 % at
-    F770W), which goes into the factor.
+    square once more. At the radius of 80 % of the light, where the two are compared, that sum is therefore
+    a little below it (0.3 % at F770W), which goes into the factor.
 
     References
     ----------
@@ -131,7 +129,7 @@ def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
     >>> print(f"{factor:.2f}")
     0.99
     """
-    radius = radius_of_encircled_energy(psf, fraction)
+    radius = radius_of_encircled_energy(psf, 0.8)
     table = encircled_flux(image, sky, flux, u.Quantity([radius]))
     n = int(np.isfinite(table["values"][0]).sum())
     # what the PSF's pixels would add up to

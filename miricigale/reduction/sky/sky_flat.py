@@ -13,8 +13,11 @@ from miricigale.reduction.sky.sky_mesh import sky_boxes
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 
+#: Pixels over which the flat is smoothed.
+_BOX = 16
 
-def sky_flats(images, *, window=None, box=16):
+
+def sky_flats(images, *, window=None):
     """
     Return the flat field of each of several exposures, from the sky of the others.
 
@@ -26,14 +29,12 @@ def sky_flats(images, *, window=None, box=16):
     window : float, optional
         Days that two exposures may lie apart, if one is to count for the other; any time if not given.
         Exposures that do not state their day count for all.
-    box : int, optional
-        Pixels over which the flat is smoothed.
 
     Returns
     -------
     flats : list of `~astropy.nddata.CCDData`
         Relative response with its standard deviation, median 1: the median of the other images, each over its own
-        sky level and without its sources, smoothed over boxes.
+        sky level and without its sources, smoothed over boxes of 16 pixels.
 
     Raises
     ------
@@ -89,7 +90,7 @@ def sky_flats(images, *, window=None, box=16):
         out = []
         for template in other_medians(relative, masks, sources, [1.0] * len(images), uses):
             finite = np.isfinite(template)
-            boxes = sky_boxes(np.where(finite, template, 0), ~finite, box)
+            boxes = sky_boxes(np.where(finite, template, 0), ~finite, _BOX)
             flat = 1 + boxes.smooth(boxes.level, finite.shape, filter_size=1)
             error = boxes.smooth(boxes.error, finite.shape, filter_size=1)
             flat = flat / np.median(flat[finite])
