@@ -25,6 +25,7 @@ from miricigale.fitting import GridSettings
 from miricigale.fitting.catalogs.catalog_calibration import measured_calibration
 from miricigale.fitting.catalogs.catalog_rows import read_catalog_nuclei
 from miricigale.fitting.catalogs.classes import fit_classes
+from miricigale.fitting.data.likelihood import table_of_fluxes
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import FitWarning, OtherResultsError, warn
 from miricigale.utils.files import replacing
@@ -33,7 +34,7 @@ from miricigale.utils.named_values import places, without
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import stream
-from miricigale.utils.tables import described_columns, error_column
+from miricigale.utils.tables import described_columns
 from miricigale.utils.units import FNU, LUMINOSITY
 
 log = logging.getLogger(__name__)
@@ -217,11 +218,8 @@ class Injections:
         columns = places(bands, hosts.filters)
         flux = hosts.flux[:, columns] / points
         error = hosts.flux_err[:, columns] / points
-        table = QTable({"id": [f"agn{first + i + 1:06d}" for i in range(len(hosts))]})
-        for j, band in enumerate(bands):
-            table[band] = flux[:, j] * FNU
-            table[error_column(band)] = error[:, j] * FNU
-            table[f"{band}_limit"] = hosts.limit[:, columns[j]]
+        ids = [f"agn{first + i + 1:06d}" for i in range(len(hosts))]
+        table = table_of_fluxes(ids, bands, flux, error, hosts.limit[:, columns])
         if self._nuclei is not None:
             table = hstack([table, self._nuclei[rows]])
         redshift = self.options.get("redshift")

@@ -4,11 +4,11 @@ import dataclasses
 import itertools
 
 import numpy as np
-from astropy.table import QTable, vstack
+from astropy.table import vstack
 
 from miricigale.filters.catalog_files import MappedRows
 from miricigale.fitting.catalogs.streaming import row_pieces
-from miricigale.fitting.data.likelihood import PhotometryReader, flux_columns
+from miricigale.fitting.data.likelihood import PhotometryReader, flux_columns, table_of_fluxes
 from miricigale.fitting.data.template_error import TemplateError, pivots
 from miricigale.fitting.grid.node_fluxes import flux_moments
 from miricigale.fitting.posterior.priors import known_redshifts
@@ -32,8 +32,7 @@ from miricigale.utils.files import replacing
 from miricigale.utils.named_values import places, rows_of
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU, WAVE
+from miricigale.utils.units import WAVE
 
 #: Largest number of sources that are fitted to measure the bands.
 MAX_SOURCES = 500
@@ -165,15 +164,13 @@ class SourceSample:
     @property
     def table(self):
         """Photometry of the sources: `~astropy.table.QTable`, with the row numbers as ids."""
-        flux = self._chosen("flux")
-        flux_err = self._chosen("flux_err")
-        limit = self._chosen("limit")
-        table = QTable({"id": self.rows})
-        for i, band in enumerate(self.bands):
-            table[band] = flux[:, i] * FNU
-            table[error_column(band)] = flux_err[:, i] * FNU
-            table[f"{band}_limit"] = limit[:, i]
-        return table
+        return table_of_fluxes(
+            self.rows,
+            self.bands,
+            self._chosen("flux"),
+            self._chosen("flux_err"),
+            self._chosen("limit"),
+        )
 
     @property
     def redshift(self):

@@ -4,6 +4,7 @@ from dataclasses import field
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.filters import Filter
 from miricigale.filters.library import SEDPY
@@ -369,6 +370,16 @@ def flux_columns(bands):
     for band in bands:
         columns += [band, error_column(band)]
     return columns
+
+
+def table_of_fluxes(ids, bands, flux, flux_err, limit):
+    """Make the photometry to fit of arrays (n, n_bands), fluxes and errors in uJy: a `~astropy.table.QTable`."""
+    table = QTable({"id": ids})
+    for i, band in enumerate(bands):
+        table[band] = flux[:, i] * FNU
+        table[error_column(band)] = flux_err[:, i] * FNU
+        table[f"{band}_limit"] = limit[:, i]
+    return table
 
 
 def unused_bands(table, filters):

@@ -325,10 +325,7 @@ class Quantities:
             name = column.info.name
             text = _text(column, ", for one solar mass formed")
             values, unit = _in_watt(column)
-            if name in shared:
-                quantities.append((f"{name}_galaxy", unit, text))
-            else:
-                quantities.append((name, unit, text))
+            quantities.append((_part_name(name, "galaxy", shared), unit, text))
             galaxy_scale.append(values)
             if name in shared[:1]:
                 mixed = (name, LUMINOSITY, f"{text}; and of the AGN")
@@ -344,10 +341,7 @@ class Quantities:
             else:
                 unit = unit * LUMINOSITY
             text = _text(column, ", W for each W of AGN power")
-            if name in shared:
-                quantities.append((f"{name}_agn", unit, text))
-            else:
-                quantities.append((name, unit, text))
+            quantities.append((_part_name(name, "agn", shared), unit, text))
             agn_scale.append(column_values(column))
             if name in shared[:1]:
                 mixed_agn = agn_scale[-1]
@@ -414,6 +408,13 @@ class Quantities:
         if self.mixed_agn.size:
             return mixed + power * self.mixed_agn[k]
         return mixed
+
+
+def _part_name(name, part, shared):
+    """Return what a quantity of galaxies or AGN is called, if those that both have are shared."""
+    if name in shared:
+        return f"{name}_{part}"
+    return name
 
 
 def _text(column, ending):

@@ -83,9 +83,7 @@ class ExposurePart:
 
     def gather(self, n):
         """Make the matrix, (n, k), that sums the bank's rows by source."""
-        k = len(self.source)
-        place = self.row_source, np.arange(k)
-        return scipy.sparse.coo_array((np.ones(k), place), shape=(n, k)).tocsr()
+        return selection(self.row_source, n)
 
     def moved(self, shift, like=None):
         """
@@ -310,7 +308,7 @@ class ExposureFit:
             products, square, projection = change_matrices(
                 part.bank, bank, part.inverse_sigma, [data] + list(white)
             )
-            place = _selection(numbers, n_changes)
+            place = selection(numbers, n_changes)
             gather = part.gather(len(self.xy))[self.rows]
             squares = squares + place @ square @ place.T
             cross = cross + gather @ products @ place.T
@@ -381,7 +379,7 @@ class ExposureFit:
             if self.free is None:
                 continue
             bank, numbers = self.free.bank[k]
-            place = _selection(numbers, n_changes)
+            place = selection(numbers, n_changes)
             # and that of the changes
             products, square, side = change_matrices(
                 part.bank, bank, part.inverse_sigma, spread, correlation
@@ -396,7 +394,7 @@ class ExposureFit:
         return middle, basis.T @ np.concatenate([border, change_border]), corner
 
 
-def _selection(numbers, n):
+def selection(numbers, n):
     """Make the matrix, (n, k), that puts rows of a bank to their numbers."""
     k = len(numbers)
     return scipy.sparse.coo_array((np.ones(k), (numbers, np.arange(k))), shape=(n, k)).tocsr()

@@ -13,6 +13,7 @@ from miricigale.instrument.image import Image
 from miricigale.photometry._core.stamps import residual_statistics
 from miricigale.photometry.detection.residual_sources import residual_peaks, unexplained_neighbors
 from miricigale.photometry.fit.diagnostics import add_fit_flags, add_no_data, flags_of_light
+from miricigale.photometry.fit.exposure_fit import selection
 from miricigale.photometry.fit.result_table import (
     BRIGHT_SNR,
     FEWEST_BRIGHT,
@@ -109,10 +110,10 @@ def plane_peaks(fit, plane, xy):
 
     ``xy``, (n, 2), are all known sources.
     """
-    images = _images(fit)
-    peaks, usable = _peaks(fit, plane, xy, *images)
-    negative, _ = _peaks(fit, plane, xy, *images, sign=-1.0)
-    return peaks, negative, usable
+    means = _plane_means(plane, *_images(fit))
+    peaks = _peaks(fit, plane, xy, means)
+    negative = _peaks(fit, plane, xy, means, sign=-1.0)
+    return peaks, negative, means[2] > 0
 
 
 def _images(fit):
@@ -137,12 +138,13 @@ def _plane_means(plane, models, residuals, inverse):
     return model, residual, weight
 
 
-def _peaks(fit, plane, xy, models, residuals, inverse, sign=1.0):
-    model, residual, weight = _plane_means(plane, models, residuals, inverse)
+def _peaks(fit, plane, xy, means, sign=1.0):
+    """Find peaks of the mean residual in the plane, or of its negative; ``means`` are `_plane_means`."""
+    model, residual, weight = means
     area = pixel_area_map(plane.wcs, plane.shape) * _MICRO
     width = gaussian_width(fit.settings.mean_kernel) / fit.scale
     view = _PlaneFit(np.sqrt(weight) / area, width, fit.parts[0].bank)
-    return residual_peaks(view, sign * residual * area, model * area, xy), weight > 0
+    return residual_peaks(view, sign * residual * area, model * area, xy)
 
 
 def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
@@ -181,15 +183,15 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     measured = place[fit.rows]
     flux[measured] = fit.flux[fit.rows]
     if len(fit.rows):
-        k = np.arange(len(measured))
-        gather = scipy.sparse.coo_array((np.ones(len(k)), (measured, k)), shape=(n_all, len(k)))
+        gather = selection(measured, n_all)
         spread = [(gather @ term @ gather.T).tocsr() for term in terms]
         joint, flux_err = joint_errors(spread, measured, n_all)
         joint = joint.tocsr()
         joint.sort_indices()
     # peaks of the last residual, for flags of their neighbors
     xy = np.concatenate([catalog.xy, new_xy])
-    peaks, _ = _peaks(fit, plane, xy, models, residuals, inverse)
+    means = _plane_means(plane, models, residuals, inverse)
+    peaks = _peaks(fit, plane, xy, means)
     flags, coverage = _flags(fit, place, n_all, flux, blending, poor)
     has_neighbor = unexplained_neighbors(peaks, xy, flux)
     core_flux = spread_over(core_flux, place, n_all)
@@ -199,7 +201,7 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     columns["residual_fraction"] = spread_over(residual_fraction, place, n_all)
     columns |= flux_columns(flux, flux_err)
     exposures = _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
-    model, residual, pixel_weight = _plane_means(plane, models, residuals, inverse)
+    model, residual, pixel_weight = means
     model, residual = _images_of(
         model, residual, pixel_weight > 0, np.sqrt(pixel_weight), plane.wcs, meta
     )

@@ -391,24 +391,9 @@ class _Lights:
         for k, (model, (label, _)) in enumerate(zip(models, sources, strict=True)):
             if model is not None and self.segments.ratio[label] < _BRIGHT_SNR:
                 rows[label] = k
-            else:
-                rows[label] = -1
 
         def links(k):
-            model = models[k]
-            (label, _) = sources[k]
-            if rows[label] < 0:
-                return []
-            labels = self.segments.labels[model.stamp]
-            variance = self.variance[model.stamp]
-            # chi^2 of the model's light on each segment
-            power = np.bincount(labels.ravel(), (model.image**2 / variance).ravel())
-            row_links = []
-            for other_label in np.flatnonzero(power > _LINKED_CHI2):
-                other_row = rows[other_label]
-                if other_label != label and other_row >= 0:
-                    row_links.append((-power[other_label], k, other_row))
-            return row_links
+            return self._links(k, models[k], sources[k][0], rows)
 
         links_of_rows = parallel_map(links, range(len(models)), executor=self.executor)
         groups = {k: [k] for k in range(len(models))}
@@ -424,33 +409,7 @@ class _Lights:
 
         def fit(group):
             members = [models[k] for k in group]
-            hull_of_group = hull([member.stamp for member in members])
-            data = self.data[hull_of_group].astype(float) - sum_of_all[hull_of_group]
-            for member in members:
-                data[within(member.stamp, hull_of_group)] += member.image
-            corner = rectangle_corner(hull_of_group)
-            labels = []
-            places = []
-            populations = []
-            starts = []
-            for k, member in zip(group, members, strict=True):
-                label, xy = sources[k]
-                labels.append(label)
-                places.append(xy - corner)
-                populations.append(population.at(self.segments.brightness(label)))
-                starts.append(member.shape.moved(rectangle_corner(member.stamp) - corner))
-            _, is_free = self._own_and_free(hull_of_group, labels[0], labels)
-            weight = self._weight(hull_of_group, is_free)
-            shapes, neighbors = self.fitter.fit_together(data, weight, places, populations, starts)
-            fitted = []
-            for member, shape, neighbor in zip(members, shapes, neighbors, strict=True):
-                back = corner - rectangle_corner(member.stamp)
-                neighbor = neighbor and neighbor.moved(back)
-                shape, image = shape.moved(back), self._image(member.stamp, shape.moved(back))
-                fitted.append(
-                    SourceModel(member.stamp, shape, image, labels=labels, neighbors=neighbor)
-                )
-            return fitted
+            return self._fitted(members, [sources[k] for k in group], population, sum_of_all)
 
         models = list(models)
         fits = parallel_map(fit, joint_groups, executor=self.executor)
@@ -458,6 +417,51 @@ class _Lights:
             for k, model in zip(group, group_models, strict=True):
                 models[k] = model
         return models
+
+    def _links(self, k, model, label, rows):
+        """List links of a source, chi-square (negative) and both rows, to those on whose segments its light is."""
+        if rows[label] < 0:
+            return []
+        labels = self.segments.labels[model.stamp]
+        variance = self.variance[model.stamp]
+        # chi^2 of the model's light on each segment
+        power = np.bincount(labels.ravel(), (model.image**2 / variance).ravel())
+        row_links = []
+        for other_label in np.flatnonzero(power > _LINKED_CHI2):
+            other_row = rows[other_label]
+            if other_label != label and other_row >= 0:
+                row_links.append((-power[other_label], k, other_row))
+        return row_links
+
+    def _fitted(self, members, sources, population, sum_of_all):
+        """Fit the profiles of a group together to what all other models leave; return its models."""
+        hull_of_group = hull([member.stamp for member in members])
+        data = self.data[hull_of_group].astype(float) - sum_of_all[hull_of_group]
+        for member in members:
+            data[within(member.stamp, hull_of_group)] += member.image
+        corner = rectangle_corner(hull_of_group)
+        labels = []
+        places = []
+        populations = []
+        starts = []
+        for (label, xy), member in zip(sources, members, strict=True):
+            labels.append(label)
+            places.append(xy - corner)
+            populations.append(population.at(self.segments.brightness(label)))
+            starts.append(member.shape.moved(rectangle_corner(member.stamp) - corner))
+        _, is_free = self._own_and_free(hull_of_group, labels[0], labels)
+        weight = self._weight(hull_of_group, is_free)
+        shapes, neighbors = self.fitter.fit_together(data, weight, places, populations, starts)
+        fitted = []
+        for member, shape, neighbor in zip(members, shapes, neighbors, strict=True):
+            back = corner - rectangle_corner(member.stamp)
+            shape = shape.moved(back)
+            image = self._image(member.stamp, shape)
+            neighbor = neighbor and neighbor.moved(back)
+            fitted.append(
+                SourceModel(member.stamp, shape, image, labels=labels, neighbors=neighbor)
+            )
+        return fitted
 
     def _population(self, models, sources):
         """Measure the distribution of the shapes of all sources."""
