@@ -6,6 +6,7 @@ from astropy.table import QTable
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from miricigale.instrument import Exposure, electron_rate, miri_detector
+from miricigale.utils.arrays import is_inside
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import attributes
@@ -225,10 +226,9 @@ def _sources(sources, rate, group, limit, exposure):
     if sources is None:
         sources = QTable({"id": np.zeros(0, int), "x": np.zeros(0), "y": np.zeros(0)})
     require_columns(sources, ("id", "x", "y"), "sources")
-    ny, nx = rate.shape
     x = floats(sources["x"])
     y = floats(sources["y"])
-    on = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+    on = is_inside(x, y, rate.shape)
     table = QTable({name: sources[name][on] for name in ("id", "x", "y")})
     column = np.rint(x[on]).astype(int)
     row = np.rint(y[on]).astype(int)

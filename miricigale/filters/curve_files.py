@@ -15,6 +15,7 @@ from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_data
 from miricigale.utils.table_files import read_table
 from miricigale.utils.table_formats import TABLE_FORMATS, table_suffix
+from miricigale.utils.text_tables import is_number_text
 from miricigale.utils.units import WAVE
 from miricigale.utils.values import value_class
 
@@ -152,7 +153,7 @@ def _not_negative(throughput, path):
 
 def _of_table(path, unit):
     table = read_table(path, wanted="a filter")
-    if table_suffix(path) == ".csv" and any(map(_is_number, table.colnames)):
+    if table_suffix(path) == ".csv" and any(map(is_number_text, table.colnames)):
         # without names of columns
         return _of_text(path, unit)
     wave_name, throughput_name = curve_columns(table, _THROUGHPUT, path)
@@ -253,7 +254,7 @@ def _text_rows(path):
             rows.append(line.partition("#")[0].replace(",", " ").split())
     if len(rows) > 2:
         first = rows[0]
-        has_numbers = len(first) > 1 and all(map(_is_number, first[:2]))
+        has_numbers = len(first) > 1 and all(map(is_number_text, first[:2]))
         if not has_numbers:
             # names of columns without a mark, or what LePhare has there: a number of rows and a name
             comments.append(" ".join(rows.pop(0)))
@@ -282,14 +283,6 @@ def _unit_beside_kind(comments, path):
         if "does not state" in str(err):
             return u.AA
         raise
-
-
-def _is_number(text):
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _two_columns(rows):

@@ -14,6 +14,7 @@ from miricigale.instrument.photometric import electron_rate
 from miricigale.instrument.published_tables import imager_filter, table
 from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3, v2v3_to_sky
 from miricigale.instrument.wcs import imager_wcs, tangent_offset
+from miricigale.utils.arrays import is_inside
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.named_values import field_values
@@ -341,8 +342,7 @@ class Exposure(Interactive):
         """
         self.check_sky()
         x, y = self.wcs.world_to_pixel(sky)
-        ny, nx = self.shape
-        return (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+        return is_inside(x, y, self.shape)
 
     def plot(self, ax=None, **kwargs):
         """

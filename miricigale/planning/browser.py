@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.filters.band_names import band_label
 from miricigale.pages.browser import (
+    band_entries,
     list_column,
     parameter_entries,
     rounded,
@@ -58,20 +59,15 @@ def write_browser(path, title, planner, plans):
     sets = []
     for plan, color in zip(plans, _COLORS, strict=False):
         sets.append({"name": plan.name, "label": plan.name, "color": color})
-    bands_of_page = []
-    for band in bands:
-        label = band_label(band)
-        is_miri = band in plans[-1].bands
-        entry = {"name": band, "label": label, "wave": rounded(pivots[band]), "miri": is_miri}
-        bands_of_page.append(entry)
+    waves = [pivots[band] for band in bands]
     facts = _list(planner, sources, plans) | {
         "report": path.name,
         "heading": [["redshift", "true z", 3], ["frac_agn", "true fracAGN", 2]],
         "flags": {},
         "flag_columns": [],
-        "bands": bands_of_page,
+        "bands": band_entries(bands, map(band_label, bands), waves, miri=plans[-1].bands),
         "sets": sets,
-        "wave": rounded([0.7 * min(pivots.values()), 1.4 * max(pivots.values())]),
+        "wave": rounded([0.7 * min(waves), 1.4 * max(waves)]),
         "parameters": parameter_entries(dict.fromkeys(_PARAMETERS, "")),
         "notes": {
             "spectrum": f"Mock fluxes are of the set {plans[-1].name}. Arrows: three times the error, where the "

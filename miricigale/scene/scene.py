@@ -21,6 +21,7 @@ from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
+from miricigale.utils.arrays import is_inside
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import provenance
@@ -328,10 +329,9 @@ class Scene(WithTable):
     def _painted(self):
         """The light in each pixel (uJy), and the table of truth."""
         catalog = self._catalog
-        ny, nx = self._shape
         flux = self._galaxy_flux + self._agn_flux
         x, y, is_near = pixel_positions(self._wcs, catalog["sky"], self._shape)
-        inside = is_near & (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+        inside = is_near & is_inside(x, y, self._shape)
         valid = np.isfinite(flux) & (flux >= 0)
         sersic = catalog["profile"] == "sersic"
         spoilt = (catalog["flags"] & int(CatalogFlags.unusable_profile())) != 0

@@ -20,6 +20,12 @@ def peak_index(values):
     return np.unravel_index(np.argmax(values), values.shape)
 
 
+def is_inside(x, y, shape):
+    """Return which places, in pixels, are on an image of a shape (ny, nx): bool of the shape of ``x``."""
+    ny, nx = shape
+    return (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+
+
 def check_light(data, argument):
     """Refuse what is no image with light (a `ValueError`)."""
     good = data.ndim == 2 and np.all(np.isfinite(data)) and data.sum() > 0

@@ -5,6 +5,7 @@ import functools
 import inspect
 
 from miricigale.utils.attribute_hints import near_names
+from miricigale.utils.named_values import field_names
 from miricigale.utils.package_tables import declared
 
 #: Key of the sentence that shows the usual call.
@@ -105,7 +106,7 @@ def _our_keywords(keywords, label, names, settings):
         if isinstance(value, (dict, str)) and keyword in other_names:
             # such as the axes of a grid in place of the grid
             name = _names_of_values(label).get(keyword, name)
-        owners = [part for part, kind in settings.items() if name in _field_names(kind)]
+        owners = [part for part, kind in settings.items() if name in field_names(kind)]
         if name in names:
             if name in ours:
                 msg = f"{label}() got {name!r} twice, once as {keyword!r}"
@@ -131,10 +132,6 @@ def _settings_of(cls):
         return {}
     factories = {field.name: field.default_factory for field in dataclasses.fields(cls)}
     return {name: kind for name, kind in factories.items() if dataclasses.is_dataclass(kind)}
-
-
-def _field_names(kind):
-    return [field.name for field in dataclasses.fields(kind)]
 
 
 def _sentences(label):
@@ -175,7 +172,7 @@ def _unknown_keyword(keyword, label, names, settings):
         return f"{message}; {sentences[keyword]}"
     every_name = list(names)
     for kind in settings.values():
-        every_name += _field_names(kind)
+        every_name += field_names(kind)
     close = near_names(keyword, every_name)
     if close:
         return f"{message}; did you mean {' or '.join(map(repr, close))}?"

@@ -150,6 +150,12 @@ _VOTABLE_TYPES = FITS_TYPES | {
 }
 
 
+def write_ecsv(value, path, *, overwrite=False):
+    """Write the table of an object (``to_table``) as ECSV, whole or not at all."""
+    with replacing(path, overwrite=overwrite) as partial:
+        value.to_table().write(partial, format="ascii.ecsv")
+
+
 def write_table(table, path, *, overwrite=False):
     """
     Write a table in the format that the suffix of the file names.

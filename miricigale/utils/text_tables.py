@@ -206,10 +206,10 @@ def _holds_names(comment, line, separator):
     names = next(csv.reader([comment.lstrip("# ")], delimiter=separator))
     if len(names) == len(cells) and any(map(is_id_name, names)):
         return True
-    return any(is_missing_word(cell) or _is_number(cell) for cell in cells)
+    return any(is_missing_word(cell) or is_number_text(cell) for cell in cells)
 
 
-def _is_number(cell):
+def is_number_text(cell):
     """Whether a cell is a number, which no name of a column is."""
     try:
         float(cell)

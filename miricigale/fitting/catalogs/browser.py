@@ -90,12 +90,11 @@ class _Objects:
         self.units = {name: shown_unit(fits.unit(name)) for name in fits.parameters}
         self.drawn = [name for name in _DRAWN if name in fits.pdf]
 
-    def describe(self):
-        """Return what all objects have in common, and the list of them."""
+    def _list(self):
+        """Return the table of all objects, its columns, and what the line in posteriors of redshifts is."""
         numbers = self.numbers
-        fits = self.fits
         table = {
-            "id": np.asarray(fits.ids),
+            "id": np.asarray(self.fits.ids),
             "chi2": numbers["chi2"],
             "n_bands": numbers["n_bands"],
             "fit": numbers["flags"],
@@ -130,6 +129,12 @@ class _Objects:
         columns.append(list_column("chi2", "χ²", title, digits=2))
         columns.append(list_column("n_bands", "bands", "bands that were fitted"))
         columns.append(list_column("flags", "flags", "flags of the fit", text=True))
+        return {key: rounded(values) for key, values in table.items()}, columns, line
+
+    def describe(self):
+        """Return what all objects have in common, and the list of them."""
+        fits = self.fits
+        table, columns, line = self._list()
         edges = {name: rounded(fits.distribution(name)[0].value) for name in self.drawn}
         miri = [name for name in self.names if name.startswith("miri.")]
         labels = map(band_label, self.names)
@@ -139,7 +144,7 @@ class _Objects:
         if fits.model is not None and len(fits) > MAX_MODELS:
             spectrum += f" The best model is drawn of the first {MAX_MODELS} objects."
         return {
-            "table": {key: rounded(values) for key, values in table.items()},
+            "table": table,
             "columns": columns,
             "shows": {
                 "all": ["all objects", None],

@@ -17,13 +17,14 @@ from miricigale.sed import ModelGrid
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import argument_error, data_error
 from miricigale.utils.file_formats import register
-from miricigale.utils.files import open_fits, replacing
+from miricigale.utils.files import open_fits
 from miricigale.utils.folder import RecordFolder
 from miricigale.utils.named_values import attributes, subset
 from miricigale.utils.object_rows import ByID
 from miricigale.utils.options import check_data, check_type
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.store import native, open_parts, write_parts
+from miricigale.utils.table_files import write_ecsv
 from miricigale.utils.tables import ascii_ids
 
 #: Layout of a folder of `fit_file`.
@@ -190,16 +191,10 @@ def _axes_from_plain(text, shares):
     return axes
 
 
-def _write_table(results, path, *, overwrite=False):
-    """Write the table of `FitResults.to_table` or `Samples.to_table`."""
-    with replacing(path, overwrite=overwrite) as partial:
-        results.to_table().write(partial, format="ascii.ecsv")
-
-
 register(FitResults, read=read_results, write=write_results)
-register(FitResults, write=_write_table, name="ascii.ecsv")
+register(FitResults, write=write_ecsv, name="ascii.ecsv")
 register(Samples, read=read_samples, write=write_samples)
-register(Samples, write=_write_table, name="ascii.ecsv")
+register(Samples, write=write_ecsv, name="ascii.ecsv")
 
 
 # ----------------------------------------------------------------- folders of fit_file

@@ -2,7 +2,6 @@
 
 import collections
 import dataclasses
-import warnings
 from pathlib import Path
 
 from miricigale.photometry.commands.file_inputs import (
@@ -12,7 +11,7 @@ from miricigale.photometry.commands.file_inputs import (
     short_band,
 )
 from miricigale.photometry.commands.kernel_files import image_psf, matching_kernel
-from miricigale.utils.exceptions import PhotometryWarning, argument_error
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import field_values, subset
 from miricigale.utils.options import check_that
 
@@ -157,8 +156,7 @@ class ExposureMeasurement(Measurement):
 
     def _shown(self, band):
         """Return the first exposure with a name for all, and pulls of points fitted to all residuals."""
-        from miricigale.photometry.commands.page import empty_positions
-        from miricigale.photometry.fit.forced import ForcedPhotometer
+        from miricigale.photometry.commands.page import empty_positions, pulls_at
 
         images = self.pixels.images[band]
         result = self.results[band]
@@ -170,9 +168,5 @@ class ExposureMeasurement(Measurement):
         empty = empty_positions(result, self.inputs.seed)
         if not len(empty):
             return image, None
-        blank = ForcedPhotometer(self.photometers[band].kernel, template="psf")
         residuals = list(result.exposures.residual_images)
-        with warnings.catch_warnings():
-            # of the noise there was a warning already
-            warnings.simplefilter("ignore", PhotometryWarning)
-            return image, blank.measure(residuals, catalog=empty).snr
+        return image, pulls_at(empty, self.photometers[band].kernel, residuals)

@@ -17,7 +17,12 @@ from miricigale.photometry.commands.browser import write_browser
 from miricigale.photometry.fit.forced import ForcedPhotometer
 from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.plotting.axes import new_figure, plain_text
-from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
+from miricigale.plotting.images import (
+    filled,
+    plot_image,
+    plot_model_residual,
+    plot_segmentation,
+)
 from miricigale.plotting.posteriors import plot_pulls
 from miricigale.psf.star_fit import TERMS
 from miricigale.utils.arrays import thinning_step
@@ -255,10 +260,7 @@ def _zoom(result, highres, segments, k, title):
     wcs = result.model_image.wcs
     _, axes = new_figure(1, 4, size=(2.9, 3.0))
     # the prior with its segments, then the image
-    sharp = np.array(highres.data, float)
-    if highres.mask is not None:
-        sharp[highres.mask] = np.nan
-    sharp, form = square(sharp, highres.wcs)
+    sharp, form = square(filled(highres), highres.wcs)
     form |= {"ax": axes[0, 0], "title": title}
     if segments is None:
         plot_image(sharp, **form)
@@ -442,11 +444,16 @@ def empty_pulls(result, kernel, seed):
     empty = empty_positions(result, seed)
     if kernel.target is None or not len(empty):
         return None
-    blank = ForcedPhotometer(kernel, template="psf")
+    return pulls_at(empty, kernel, result.residual_image)
+
+
+def pulls_at(positions, kernel, residual):
+    """Measure flux over error of points on what a measurement left of an image or of exposures."""
+    photometer = ForcedPhotometer(kernel, template="psf")
     with warnings.catch_warnings():
-        # the warning about a background was given already
+        # the warnings about background and noise were given already
         warnings.simplefilter("ignore", PhotometryWarning)
-        return blank.measure(result.residual_image, catalog=empty).snr
+        return photometer.measure(residual, catalog=positions).snr
 
 
 def empty_positions(result, seed):

@@ -4,14 +4,7 @@ from miricigale.photometry.errors.error_calibration import ErrorCalibration
 from miricigale.photometry.errors.error_model import ErrorModel
 from miricigale.utils.exceptions import file_errors
 from miricigale.utils.file_formats import register
-from miricigale.utils.files import replacing
-from miricigale.utils.table_files import read_table
-
-
-def write_ecsv(value, path, *, overwrite=False):
-    """Write the table of an object as ECSV, whole or not at all."""
-    with replacing(path, overwrite=overwrite) as partial:
-        value.to_table().write(partial, format="ascii.ecsv")
+from miricigale.utils.table_files import read_table, write_ecsv
 
 
 def _reader(cls, kind):

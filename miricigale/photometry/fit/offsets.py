@@ -6,7 +6,7 @@ from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import QTable
 
 from miricigale.photometry._core.stamps import offset_sums
-from miricigale.photometry.fit.template_fit import TemplateFit
+from miricigale.photometry.fit.template_fit import TemplateFit, row_snr
 from miricigale.photometry.images.arrays import lengths
 from miricigale.photometry.images.fields import SmoothField, legendre_terms, n_terms
 from miricigale.photometry.images.flags import ForcedFlags
@@ -302,13 +302,6 @@ def settled(fit, bank, catalog):
     if fit is not first and first.shift is not None:
         fit.include_shift(first.shift)
     return fit
-
-
-def row_snr(fit):
-    """Signal-to-noise of rows of a fit by their formal errors; 0 of those that are not fitted."""
-    snr = np.zeros(len(fit.flux))
-    snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
-    return snr
 
 
 def excess_variance(distance, error):

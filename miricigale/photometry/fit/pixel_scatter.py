@@ -3,6 +3,7 @@
 import numpy as np
 from astropy.stats import gaussian_sigma_to_fwhm
 
+from miricigale.photometry.fit.template_fit import row_snr
 from miricigale.utils.units import ANGLE
 
 #: Transfer of the PSF below which a spatial frequency has no light.
@@ -146,8 +147,7 @@ def _cutoff(kernel):
 
 def _bright_places(fit, half):
     """Return pixels (x, y) of the brightest sources, none within the square of a brighter one."""
-    signal = np.zeros(len(fit.flux))
-    signal[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
+    signal = row_snr(fit)
     places = []
     for row in np.argsort(-signal)[:_MOST_SOURCES]:
         if signal[row] < _BRIGHT:

@@ -472,6 +472,13 @@ def gaussian_width(kernel):
     return width * kernel.pixel_scale.to_value(ANGLE)
 
 
+def row_snr(fit):
+    """Signal-to-noise of rows of a fit by their formal errors; 0 of those that are not fitted."""
+    snr = np.zeros(len(fit.flux))
+    snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
+    return snr
+
+
 def inner(first, second):
     """Sum the products of two images, in double precision."""
     return float(np.einsum("ij,ij->", first, second, dtype=float, casting="same_kind"))
