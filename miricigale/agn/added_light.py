@@ -5,6 +5,7 @@ from astropy.table import QTable
 
 from miricigale.evaluation import agn_fraction
 from miricigale.fitting.data.nuclei import CORRELATION, IS_LIMIT, NUCLEUS
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
@@ -272,7 +273,7 @@ def agn_light(model, hosts, luminosity, parameters, bands, *, quantity="accretio
     )
     fraction = agn_fraction(wanted * LUMINOSITY, half[quantity])
     # the power of an AGN goes as this, which is 1 of that with a half
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with quiet_division():
         power = np.where(wanted > 0, fraction / (1.0 - fraction), 0.0)
     power[np.isnan(wanted)] = np.nan
     light = {}

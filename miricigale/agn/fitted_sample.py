@@ -5,6 +5,7 @@ import numpy as np
 
 from miricigale.evaluation import classify
 from miricigale.evaluation.classes import CLASS_LIMITS
+from miricigale.utils.arrays import nans, quiet_division
 from miricigale.utils.options import check_that
 from miricigale.utils.units import LUMINOSITY
 from miricigale.utils.values import value_class
@@ -110,15 +111,15 @@ def _columns(results, bins):
         columns = {"ids": np.array(part.ids), "log_evidence": np.array(part.log_evidence)}
         columns["weights"] = part.agn_weights
         if part.agn_weights is None:
-            columns["weights"] = np.full((n,) + tuple(bins.shape), np.nan)
+            columns["weights"] = nans((n,) + tuple(bins.shape))
         for name in ("redshift", "frac_agn", bins.quantity):
-            values = np.full(n, np.nan)
+            values = nans(n)
             if name in part.parameters:
                 values = part.median(name)
             elif name in part.best:
                 values = part.best[name]
             columns[name] = np.array(u.Quantity(values).value, float)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             log_luminosity = np.log10(columns.pop(bins.quantity) * LUMINOSITY.to("erg / s"))
         columns["log_luminosity"] = log_luminosity
         for name, values in columns.items():

@@ -28,7 +28,7 @@ from miricigale.fitting.catalogs.classes import fit_classes
 from miricigale.fitting.data.likelihood import table_of_fluxes
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import FitWarning, OtherResultsError, warn
-from miricigale.utils.files import replacing
+from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.meta import package_version
 from miricigale.utils.named_values import places, without
 from miricigale.utils.options import check_that
@@ -270,7 +270,7 @@ class Injections:
         if not resume or not path.exists() or fits.getheader(path, 1).get(_KEY) != key:
             measured = self.images.add_agn(table, lit, hosts, light, seed=self.survey.seed)
             measured.meta = {_KEY: key}
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             with replacing(path, overwrite=True) as partial:
                 measured.write(partial, format="fits")
         else:
@@ -333,7 +333,7 @@ def write_batch(photometry, path, *, resume):
         reason = f"{folder} holds fits of other injected AGN, of another number or seed"
         reason += f" (without the folder {path.parent} they alone are fitted anew)"
         raise OtherResultsError(reason, "resume=False to replace them")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     with replacing(path, overwrite=True) as partial:
         Path(partial).write_bytes(content)
 

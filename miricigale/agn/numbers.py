@@ -6,6 +6,7 @@ import numpy as np
 from miricigale.evaluation import Estimate
 from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.sed.spectrum import COSMOLOGY
+from miricigale.utils.arrays import nans
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows
@@ -167,7 +168,7 @@ class SampleNumbers:
     def _selected_share(self, rng, n_right, n_injected):
         """Draws of the share of injected AGN that is selected; NaN where none is."""
         if not n_right:
-            return np.full(self.draws.n_draws, np.nan)
+            return nans(self.draws.n_draws)
         n_lost = n_injected - n_right
         return rng.beta(n_right + _JEFFREYS, n_lost + _JEFFREYS, self.draws.n_draws)
 
@@ -175,7 +176,7 @@ class SampleNumbers:
         """Calculate the density of all AGN of a bin, corrected for those with a fraction below the floor."""
         width = np.diff(self._luminosity_edges())[k - 1]
         if not injected["all"] or not injected["above"] or np.isinf(width):
-            return _summary(np.full(1, np.nan), "density") | {"density_shipped": np.nan}
+            return _summary(nans(1), "density") | {"density_shipped": np.nan}
         rng = stream(self.seed, "agn", "rates", i, k)
         # of a field of this size others have more or fewer, and objects without a fit are like the rest
         per_object = self.n_all / self.n_used / (self.volume(i) * width)
@@ -188,7 +189,7 @@ class SampleNumbers:
     def _obscured(self, by_class, i, k):
         """Share of the AGN that is obscured: those in fits as a galaxy, whose torus hides the disk."""
         if "quasar" not in by_class:
-            return _summary(np.full(1, np.nan), "obscured") | {"obscured_shipped": np.nan}
+            return _summary(nans(1), "obscured") | {"obscured_shipped": np.nan}
         rng = stream(self.seed, "agn", "obscured", i, k)
         hidden = rng.standard_gamma(by_class["galaxy"] + _JEFFREYS)
         unobscured = rng.standard_gamma(by_class["quasar"] + _JEFFREYS)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from miricigale.utils.arrays import quotient
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
@@ -252,5 +253,5 @@ def _member_counts(table, members, uniform):
 def _by_luminosity(table, probability):
     """Probabilities of bins of redshift and fraction, (n, n_z * n_frac), in those of luminosity too."""
     total = table.sum(axis=3, keepdims=True)
-    part = np.divide(table, total, out=np.zeros(table.shape), where=total > 0)
+    part = quotient(table, total)
     return probability.reshape(total.shape) * part

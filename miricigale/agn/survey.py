@@ -13,7 +13,8 @@ from miricigale.agn.shares import draw_shares
 from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.fitting import AGNBins
 from miricigale.fitting.catalogs.classes import fit_classes
-from miricigale.utils.files import replacing
+from miricigale.utils.arrays import nans
+from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
@@ -205,7 +206,7 @@ class AGNSurvey:
         check_that(sample.used.any(), "path", "a catalog of which objects can be fitted", "none")
         injections = Injections(self, path, fits, sample, output, images, options)
         result = self._result(sample, injections)
-        output.mkdir(parents=True, exist_ok=True)
+        make_folder(output)
         result.write(output, overwrite=True)
         from miricigale.agn.page import write_page
 
@@ -237,7 +238,7 @@ class AGNSurvey:
         }
         columns = {"id": sample.ids, "used": sample.used, "selected": sample.selected}
         for name, values in probability.items():
-            columns[name] = np.full(len(sample), np.nan)
+            columns[name] = nans(len(sample))
             columns[name][sample.used] = values
         columns |= {"redshift": sample.redshift, "log_luminosity": sample.log_luminosity}
         texts = declared("miricigale.agn", "columns.toml")["sources"]

@@ -14,7 +14,7 @@ from miricigale.filters.band_names import filter_of_band
 from miricigale.fitting.results.drawing import best_parameters
 from miricigale.sed.cosmology import distance
 from miricigale.sed.xray_bands import SPAN, XRays, disk_2500
-from miricigale.utils.files import replacing
+from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.options import check_that
 from miricigale.utils.outputs import FILE_NAME, is_file_name
 
@@ -295,7 +295,7 @@ def write_best_models(results, folder, *, xray=None, overwrite=False):
             is_file_name(name), "results", f"of ids that name files ({FILE_NAME})", repr(name)
         )
     paths = [folder / f"{name}_best_model.fits" for name in names]
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     options = {"modules": results.meta.get("cigale", {}).get("modules")}
     for best, path in zip(fitted, paths, strict=True):
         if best.distance is not None:

@@ -12,6 +12,7 @@ from miricigale.sed import components as c
 from miricigale.sed.xray_bands import ALPHA_OX
 from miricigale.utils.exceptions import ConfigError, config_error
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import first_value
 from miricigale.utils.table_files import read_table
 
 
@@ -94,7 +95,7 @@ class Module:
         if number not in choices:
             first = next(iter(choices))
             self.chain.replaced.append(f"{self.label(key)} = {number:g} by {first}")
-        return choices.get(number, next(iter(choices.values())))
+        return choices.get(number, first_value(choices))
 
     def ignore(self, *keys):
         """Take parameters that change nothing, or that another line of the report names."""

@@ -9,6 +9,7 @@ import numpy as np
 from miricigale.fitting import FitFlags
 from miricigale.fitting.posterior.quantities import draws_summary, node_shares, put_draws
 from miricigale.fitting.samplers.run import chi2_at
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import FitWarning
 from miricigale.utils.parallel import chunks
 
@@ -93,7 +94,7 @@ def _is_near(samples, max_deviation):
 def _distance(slope, light):
     """Tell how far a slope is from the relation; NaN without a disk."""
     light = light.to_value(u.erg / u.s / u.Hz)
-    log_light = np.log10(light, where=light > 0, out=np.full(np.shape(light), np.nan))
+    log_light = np.log10(light, where=light > 0, out=nans(np.shape(light)))
     return np.abs(slope - (_JUST[0] * log_light + _JUST[1]))
 
 

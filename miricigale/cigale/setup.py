@@ -19,6 +19,7 @@ from miricigale.fitting import BayesFitter, FitResults, GridSettings, Samples
 from miricigale.sed import SEDModel
 from miricigale.sed.grid_spectra import row_values
 from miricigale.sed.xray_bands import with_xray_bands, xray_filter
+from miricigale.utils.arrays import finite_values, nans
 from miricigale.utils.exceptions import config_error
 from miricigale.utils.files import replacing
 from miricigale.utils.missing_values import floats
@@ -160,7 +161,7 @@ class CigaleSetup:
             wanted = "given where the configuration lists no redshifts"
             check_that(redshifts is not None, "redshifts", wanted, "None")
             nodes = self.rounded(redshifts)
-            nodes = np.unique(nodes[np.isfinite(nodes)])
+            nodes = np.unique(finite_values(nodes))
             check_that(nodes.size, "redshifts", "with a redshift >= 0", "none")
         return self.parameters | {"redshift": nodes}
 
@@ -297,7 +298,7 @@ class CigaleSetup:
         parallel = {"executor": executor, "progress_bar": progress_bar}
         distances = _column(photometry, "redshift")
         if distances is None:
-            distances = np.full(len(photometry), np.nan)
+            distances = nans(len(photometry))
         z = self.rounded(distances)
 
         def fit(redshift=None):

@@ -11,6 +11,7 @@ import tomllib
 from importlib import resources
 from pathlib import Path
 
+from miricigale.utils.files import make_folder
 from miricigale.utils.named_values import without
 from miricigale.utils.options import check_that
 from miricigale.utils.table_formats import WRITTEN_FORMATS
@@ -430,7 +431,7 @@ def read_input(folder):
         if data.startswith(begin):
             ending = name
     path = folder.with_name(f"{folder.name}-input.{ending}")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     if path.exists():
         # the same input again resumes; another is not put in its place
         is_same = path.is_file() and path.read_bytes() == data

@@ -187,10 +187,13 @@ def _bands_of_sets(sets):
     """List the bands that stand in sets of them; None without sets, or where one is ``all``."""
     if not sets or "all" in sets:
         return None
-    labels = []
-    for words in sets:
-        labels += [label.strip() for label in words.split(",") if label.strip()]
-    return labels
+    return _labels(sets)
+
+
+def _labels(texts):
+    """List the labels that stand in texts, separated by commas."""
+    labels = [label.strip() for label in ",".join(texts).split(",")]
+    return list(filter(None, labels))
 
 
 def _keys_of_bands(args, bands, values):
@@ -198,11 +201,8 @@ def _keys_of_bands(args, bands, values):
     from miricigale.instrument.published_tables import imager_filter
     from miricigale.planning.config import ExposureSection
 
-    labels = []
-    for words in bands:
-        # separated by spaces or commas
-        labels += [label.strip() for label in words.split(",") if label.strip()]
-    names = list(dict.fromkeys(imager_filter(label) for label in labels))
+    # separated by spaces or commas
+    names = list(dict.fromkeys(imager_filter(label) for label in _labels(bands)))
     keys = {"exposures.bands": names}
     if args.config is None and not {"exposures.time", "exposures.depth"} & set(values):
         times = ExposureSection(bands=tuple(names)).by_band("time")

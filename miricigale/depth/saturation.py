@@ -6,7 +6,7 @@ from astropy.table import QTable
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from miricigale.instrument import Exposure, electron_rate, miri_detector
-from miricigale.utils.arrays import is_inside
+from miricigale.utils.arrays import finite_values, is_inside, quiet_division
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import attributes
@@ -94,7 +94,7 @@ class SaturationForecast:
         rate = floats(rate)
         step = exposure.group_time.to_value(u.s)
         group = saturation_group(rate, limit, step)
-        good = rate[np.isfinite(rate)]
+        good = finite_values(rate)
         sky = np.nan
         if good.size:
             sky = float(np.median(good))
@@ -214,7 +214,7 @@ def saturation_group(rate, limit, step):
     charge.
     """
     rate = floats(rate)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         # a rate that fills it exactly does so in that group, whatever the rounding
         group = np.ceil(limit / (rate * step) * (1 - 1e-12))
     usable = np.isfinite(group) & (rate > 0) & (group < NEVER)

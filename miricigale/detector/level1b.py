@@ -22,6 +22,7 @@ from astropy.time import Time, TimeDelta
 from miricigale.instrument import kept_keywords, placed_keywords
 from miricigale.instrument.asdf_extension import asdf_extension, bytes_table
 from miricigale.instrument.product_files import jwst_product
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import replacing
 from miricigale.utils.meta import plain_value
@@ -118,7 +119,7 @@ def _int_times(exposure, start):
     for name, shift in shifts.items():
         columns[f"int_{name}_MJD_UTC"] = begin + shift
     for name in shifts:
-        columns[f"int_{name}_BJD_TDB"] = np.full(n_int, np.nan)
+        columns[f"int_{name}_BJD_TDB"] = nans(n_int)
     return fits.BinTableHDU(Table(columns), name="INT_TIMES")
 
 

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.stats import kstest
 
 from miricigale.evaluation.metrics import fraction_interval
+from miricigale.utils.arrays import finite_values, quiet_division
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
@@ -68,7 +69,7 @@ def posterior_ranks(true, values, levels, *, seed=None):
     rows = np.arange(n)
     low_value = values[rows, cell]
     high_value = values[rows, cell + 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         inside = np.where(
             high_value > low_value, (true - low_value) / (high_value - low_value), 0.5
         )
@@ -93,7 +94,7 @@ def posterior_ranks(true, values, levels, *, seed=None):
 
 def interval_share(ranks, level=0.68):
     """Share of finite ranks, and so of true values, in the central interval of a level."""
-    ranks = ranks[np.isfinite(ranks)]
+    ranks = finite_values(ranks)
     inside = np.count_nonzero(np.abs(ranks - 0.5) <= 0.5 * level)
     return fraction_interval(inside, ranks.size)[0]
 
@@ -139,7 +140,7 @@ def coverage_table(ranks, *, levels=(0.68, 0.95)):
     rows = []
     for name, values in ranks.items():
         values = floats(values)
-        values = values[np.isfinite(values)]
+        values = finite_values(values)
         bad = (values < 0) | (values > 1)
         check_that(not np.any(bad), "ranks", "between 0 and 1", values[bad])
         if values.size:

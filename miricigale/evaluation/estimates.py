@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 from miricigale.evaluation.metrics import OUTLIER, fraction_interval, sigma_mad
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import attributes
@@ -166,7 +167,7 @@ def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):
     rng = stream(check_seed(seed), "bootstrap")
     size = max(1, _PIECE // sum(column.size for column in columns))
     draws = []
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         value = float(statistic(*(column.reshape(-1) for column in columns)))
         for first in range(0, n_draws, size):
             rows = rng.integers(n, size=(min(size, n_draws - first), n))

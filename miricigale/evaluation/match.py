@@ -5,6 +5,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
+from miricigale.utils.arrays import nans
 from miricigale.utils.ids import id_column, ids_and_missing
 from miricigale.utils.options import check_that, check_type
 from miricigale.utils.positions import at_epoch
@@ -126,7 +127,7 @@ def associate(first, second, *, radius):
         text = f"Rows of the {partner} catalog within the radius of the row of the {name}"
         counts[f"n_{partner}"] = (near_by, text)
         reasons[has_row] |= candidates.reasons(k)[rows[k][has_row]]
-    separation = np.append(candidates.separation, np.full(len(unmatched), np.nan))
+    separation = np.append(candidates.separation, nans(len(unmatched)))
     columns |= ids | {"separation": (separation * ANGLE, "Distance between the partners")} | counts
     # of rows with a partner neither of the two reasons is set
     status = np.where(reasons == 0, 0, np.where(reasons & (_NONE | _LOST), 2, 1))
@@ -167,7 +168,7 @@ class _Candidates:
             mutual = forward >= 0
             mutual[mutual] = backward[forward[mutual]] == np.flatnonzero(mutual)
             self.partner.append(np.where(mutual, forward, -1))
-        self.separation = np.full(size[0], np.nan)
+        self.separation = nans(size[0])
         chosen = self.partner[0][i] == j
         self.separation[i[chosen]] = distance[chosen]
 
@@ -277,7 +278,7 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     for band in bands:
         table[f"{band}_true"] = to_array(truth[band], FNU, band) * FNU
         for name in (band, error_column(band)):
-            values = np.full(len(truth), np.nan)
+            values = nans(len(truth))
             if name in measured.colnames:
                 values[matched] = to_array(measured[name], FNU, name)[index[matched]]
             table[name] = values * u.uJy

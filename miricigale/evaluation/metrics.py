@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 from astropy.stats import binom_conf_interval
 
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.missing_values import floats, without_mask
 from miricigale.utils.options import check_that
 
@@ -238,7 +239,7 @@ def recovery_metrics(true, measured, *, relative=False):
     0.10 +- 0.11, scatter 0.15
     """
     true, measured = one_by_one(true=true, measured=measured)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         if relative:
             delta = (measured - true) / true
         else:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from miricigale.sed import stern2015_6um
-from miricigale.utils.arrays import middles
+from miricigale.utils.arrays import middles, nans, quiet_division
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
@@ -167,7 +167,7 @@ def agn_fraction(l_6um, reference):
     """
     wanted = to_array(l_6um, LUMINOSITY, "l_6um")
     half = to_array(reference, LUMINOSITY, "reference")
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with quiet_division():
         fraction = np.where(half > 0, wanted / (wanted + half), np.nan)
     return np.where(wanted == 0, 0.0, fraction)
 
@@ -323,7 +323,7 @@ class AGNPopulation:
         drawn = [stream(seed, "agn", str(key)).uniform(size=2) for key in ids]
         drawn = np.reshape(drawn, (len(ids), 2))
         probability = np.zeros(len(ids))
-        log_l = np.full(len(ids), np.nan)
+        log_l = nans(len(ids))
         grid = self._log_l
         for first in range(0, len(ids), _ROWS):
             part = slice(first, first + _ROWS)
@@ -349,7 +349,7 @@ class AGNPopulation:
 
 
 def _log_luminosity(l_x):
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         return np.log10(to_array(l_x, u.erg / u.s, "l_x"))
 
 

@@ -14,6 +14,7 @@ from miricigale.evaluation.metrics import OUTLIER
 from miricigale.evaluation.study import TruthResults
 from miricigale.evaluation.xray import half_complete, xray_luminosity_at, yang2021_xray_flux
 from miricigale.filters import Filter
+from miricigale.utils.arrays import finite_values, nans
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names
 from miricigale.utils.tables import error_column
@@ -189,7 +190,7 @@ def _outlier_share(study, sky, band_set, option, draws):
     """Share of outliers in redshift, with its Wilson interval."""
     rows, n_all = _in_bin(sky, option)
     delta = sky.redshift_error(band_set)[rows]
-    return _share(np.abs(delta[np.isfinite(delta)]) > OUTLIER, n_all)
+    return _share(np.abs(finite_values(delta)) > OUTLIER, n_all)
 
 
 def _class_share(study, sky, band_set, option, draws):
@@ -228,7 +229,7 @@ def xray_fluxes(sky):
     """Log of the X-ray flux (erg/s/cm2) of all sources of a truth; NaN without an AGN, and of stars."""
     redshift = floats(sky.truth["redshift"])
     power = sky.truth["l_6um"]
-    flux = np.full(redshift.size, np.nan)
+    flux = nans(redshift.size)
     good = np.isfinite(redshift) & (power > 0)
     flux[good] = yang2021_xray_flux(power[good], redshift[good]).value
     return np.log10(flux)

@@ -7,6 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_shape, check_that
@@ -99,7 +100,7 @@ class TruthResults:
     def fitted(self, band_set, name):
         """Return a column of a fit as plain numbers; NaN throughout if the truth has no such fit."""
         if band_set not in self.fits:
-            return np.full(np.count_nonzero(self.sample), np.nan)
+            return nans(np.count_nonzero(self.sample))
         column = self.fits[band_set][name]
         return floats(column)
 
@@ -115,7 +116,7 @@ class TruthResults:
     def power_error(self, band_set):
         """Log of fitted over true accretion power (dex) of the sample; NaN without an AGN."""
         if band_set not in self.fits:
-            return np.full(np.count_nonzero(self.sample), np.nan)
+            return nans(np.count_nonzero(self.sample))
         true = self.truth["accretion_power"][self.sample]
         ratio = self.fits[band_set]["accretion_power_mean"] / np.where(true > 0, true, np.nan)
         return np.log10(ratio.to_value(u.one))
@@ -125,7 +126,7 @@ class TruthResults:
         measured = self.matched[band].to_value(FNU)
         true = self.matched[f"{band}_true"].to_value(FNU)
         good = (measured > 0) & (true > 0)
-        ratio = np.divide(measured, true, out=np.full(true.size, np.nan), where=good)
+        ratio = np.divide(measured, true, out=nans(true.size), where=good)
         return -2.5 * np.log10(ratio)
 
     def is_bright(self, band):
@@ -142,7 +143,7 @@ class TruthResults:
 
     def of_catalog(self, values):
         """Return the values of the sample at the rows of the catalog, NaN elsewhere."""
-        out = np.full(len(self.truth), np.nan)
+        out = nans(len(self.truth))
         out[self.sample] = values
         return out
 

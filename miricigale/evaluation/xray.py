@@ -9,6 +9,7 @@ from scipy.special import expit, ndtr, ndtri
 
 from miricigale.evaluation.metrics import fraction_interval, one_by_one
 from miricigale.sed.xray import stern2015, xray_flux
+from miricigale.utils.arrays import finite_values
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
@@ -158,7 +159,7 @@ def completeness(values, found, edges):
     values, detected = one_by_one(values=values, found=found)
     # of others it is not known
     values = values[np.isfinite(detected)]
-    detected = detected[np.isfinite(detected)] > 0
+    detected = finite_values(detected) > 0
     edges = floats(edges)
     check_that(is_ascending(edges, min_size=2), "edges", "ascending", edges)
     n, _ = np.histogram(values, edges)

@@ -16,6 +16,7 @@ from miricigale.utils.ids import counted_ids, warn_of_duplicates
 from miricigale.utils.missing_values import plain_floats, without_codes
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
+from miricigale.utils.units import own_unit
 
 #: Fluxes from which on a fit leaves them out and flags it.
 _FLAGGED = 1e60
@@ -254,7 +255,7 @@ def without_codes_of(table, coded):
         flux_err[~np.isnan(coded[band])] = np.nan
         flux[flux == coded[band]] = np.nan
         for name, values in ((band, flux), (error, flux_err)):
-            out[name] = Column(values, unit=getattr(table[name], "unit", None))
+            out[name] = Column(values, unit=own_unit(table[name]))
     return out
 
 

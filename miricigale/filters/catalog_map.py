@@ -35,7 +35,7 @@ from miricigale.utils.missing_values import (
 from miricigale.utils.named_values import convert_values, field_names, field_values
 from miricigale.utils.options import check_choice, check_data, check_names, check_that, check_type
 from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU, flux_unit
+from miricigale.utils.units import FNU, flux_unit, own_unit
 from miricigale.utils.values import value_class
 
 #: Unit that a column without any has.
@@ -286,7 +286,7 @@ class CatalogMap:
             with silent_units():
                 out[ours] = table[theirs]
             unit = name_and_unit(theirs)[1]
-            if is_band(ours) and unit is not None and getattr(out[ours], "unit", None) is None:
+            if is_band(ours) and unit is not None and own_unit(out[ours]) is None:
                 out[ours].unit = unit
         check_names(self.units, f"column of {argument}", out.colnames + ["flux"])
         _plain_ids(out, argument)
@@ -322,7 +322,7 @@ class CatalogMap:
     def _unit_of_column(self, name, column, of_flux, argument):
         """Return the unit that the caller says a column has, or the file's; a warning where these differ."""
         asked_unit = self.units.get(name, self.units.get("flux") if of_flux else None)
-        column_unit = getattr(column, "unit", None)
+        column_unit = own_unit(column)
         if column_unit is not None:
             column_unit = flux_unit(column_unit) or u.Unit(column_unit)
         if asked_unit is None:
@@ -343,7 +343,7 @@ class CatalogMap:
         column = table[name]
         unit = self._unit_of_column(name, column, False, argument)
         is_asked = name in self.units
-        if unit is None or not (is_asked or getattr(column, "unit", None) is None):
+        if unit is None or not (is_asked or own_unit(column) is None):
             return
         if is_asked and column.dtype.kind in "USO" and unit.is_equivalent(u.deg):
             table[name] = _angles(column, unit, name, argument)

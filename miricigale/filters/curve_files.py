@@ -16,7 +16,7 @@ from miricigale.utils.options import check_data
 from miricigale.utils.table_files import read_table
 from miricigale.utils.table_formats import TABLE_FORMATS, table_suffix
 from miricigale.utils.text_tables import is_number_text
-from miricigale.utils.units import WAVE
+from miricigale.utils.units import WAVE, own_unit
 from miricigale.utils.values import value_class
 
 #: Units of wavelengths as headers name them.
@@ -189,7 +189,7 @@ def _of_table(path, unit):
 
 def _unit_of_column(column, name, path):
     """Unit of a column of wavelengths: its own, or the one in its name, such as ``wave_um`` or ``wave [AA]``."""
-    unit = getattr(column, "unit", None)
+    unit = own_unit(column)
     if unit is not None:
         return unit_of_wavelengths(unit)
     try:

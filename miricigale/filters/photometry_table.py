@@ -17,7 +17,7 @@ from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table, error_column
-from miricigale.utils.units import FNU, flux_unit
+from miricigale.utils.units import FNU, flux_unit, own_unit
 
 # what stands before or after the band in names of fluxes, magnitudes and their errors
 _ERROR = re.compile(
@@ -156,10 +156,10 @@ def _stated_units(table, names, bands, units):
         if _is_ab(table, names[band]):
             # magnitudes by their name or unit
             continue
-        if getattr(table[names[band]], "unit", None) is None:
+        if own_unit(table[names[band]]) is None:
             units_by_column[band] = unit
         error = error_column(band)
-        lacks_unit = error in names and getattr(table[names[error]], "unit", None) is None
+        lacks_unit = error in names and own_unit(table[names[error]]) is None
         if lacks_unit and unit != u.ABmag:
             units_by_column[error] = unit
     return units_by_column | by_name
@@ -170,7 +170,7 @@ def _units_in_names(table, names, bands):
     units = {}
     for band in bands:
         for name in (band, error_column(band)):
-            if name not in names or getattr(table[names[name]], "unit", None) is not None:
+            if name not in names or own_unit(table[names[name]]) is not None:
                 continue
             unit = name_and_unit(names[name])[1]
             if unit is not None:
@@ -381,7 +381,7 @@ def _find(text, bands):
 def _is_ab(table, name):
     if name is None:
         return False
-    unit = getattr(table[name], "unit", None)
+    unit = own_unit(table[name])
     if unit is None:
         label, unit = name_and_unit(name)
         if unit is None:

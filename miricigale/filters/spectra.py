@@ -8,7 +8,7 @@ from miricigale.utils.curve_columns import FLUX_NAME, curve_columns
 from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
-from miricigale.utils.units import FNU, WAVE, is_ascending, to_array
+from miricigale.utils.units import FNU, WAVE, is_ascending, own_unit, to_array
 
 
 def check_wave(wave):
@@ -70,7 +70,7 @@ def spectrum_arrays(sed, bands):
     order = slice(None, None, -1 if wave[-1] < wave[0] else 1)
     wave = check_wave(wave[order])
     flux = flux[order]
-    unit = getattr(flux, "unit", None)
+    unit = own_unit(flux)
     if unit is not None and (unit * u.sr).is_equivalent(FNU, u.spectral_density(1 * WAVE)):
         raise units_error("sed", "a flux density; multiply by the solid angle", unit)
     spectral = []

@@ -22,6 +22,7 @@ from miricigale.fitting.data.nuclei import (
 from miricigale.fitting.data.whole_points import WholePoints
 from miricigale.fitting.posterior.priors import known_redshifts
 from miricigale.fitting.results.results import FitResults
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import FitWarning, warn
 from miricigale.utils.ids import warn_of_duplicates
 from miricigale.utils.interactive import Interactive
@@ -86,8 +87,8 @@ class CatalogFits(Interactive):
             warn(text, FitWarning)
             table = table.copy(copy_data=False)
             for name in missing:
-                table[name] = np.full(len(table), np.nan) * FNU
-                table[error_column(name)] = np.full(len(table), np.nan) * FNU
+                table[name] = nans(len(table)) * FNU
+                table[error_column(name)] = nans(len(table)) * FNU
         warn_of_duplicates(read_ids(table), "photometry")
         self._warn_of_bands(table)
         text = negative_error_message(count_negative_errors(table, self._reader.fitted(table)))

@@ -306,7 +306,7 @@ class BayesFitter(CatalogFits):
         if self.engine == "grid":
             self.backend = GridFit.of_model(*arguments, scale_error=bool(scale_error), **of_grid)
             self.grid = self.backend.grid
-            warn_of_few_models(model, axes, self.grid)
+            warn_of_few_models(model, of_grid["axes"], self.grid)
         else:
             self.backend = SamplerFit.of_model(
                 *arguments, scale_error=bool(scale_error), sampler=self.engine

@@ -17,6 +17,7 @@ from miricigale.photometry.fit.result_table import new_ids
 from miricigale.photometry.images.arrays import nearest_values, pixel_scale
 from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.psf import make_psf, psf_image, rotate_psf
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import match_sky
 from miricigale.utils.units import ANGLE, FNU
@@ -382,5 +383,5 @@ def over_noise(model, xy):
     """Light of a model (a `~astropy.nddata.CCDData`) over the noise of its pixels, shape (n,); NaN outside."""
     values, inside = nearest_values(np.asarray(model.data, float), xy)
     noise, _ = nearest_values(np.asarray(model.uncertainty.array, float), xy)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         return np.where(inside, values / noise, np.nan)

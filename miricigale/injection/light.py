@@ -11,6 +11,7 @@ from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.psf import make_psf, psf_image, rotate_psf
 from miricigale.scene import Scene
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.units import ANGLE
 
@@ -80,7 +81,7 @@ def light_on_image(sources, flux, wcs, shape, psf, n_threads=None):
     names = ["sky", "profile", "half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
     rows = QTable(sources[names], copy=True)
     rows["id"] = np.arange(1, len(rows) + 1)
-    rows["redshift"] = np.full(len(rows), np.nan)
+    rows["redshift"] = nans(len(rows))
     # light has no color here
     band = "miri.f770w"
     if psf.filter is not None:

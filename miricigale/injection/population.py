@@ -11,6 +11,7 @@ from miricigale.photometry.detection.cutouts import own_segments
 from miricigale.photometry.images.arrays import image_arrays, pixel_scale
 from miricigale.photometry.shapes.shape_models import ShapeModels
 from miricigale.scene import as_sources
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import plain_floats
 from miricigale.utils.options import check_that
@@ -109,7 +110,7 @@ def _profile_fluxes(arrays, segments, labels, parameters, is_star, psf):
     """Return the light (uJy) of the profiles, by a fit to the pixels of their segments; NaN without a profile."""
     models = ShapeModels(psf / psf.sum())
     places = find_objects(segments)
-    flux = np.full(len(labels), np.nan)
+    flux = nans(len(labels))
     for k, label in enumerate(labels):
         usable = 0 < label <= len(places) and np.isfinite(parameters[k]).all()
         if not usable or places[label - 1] is None:
@@ -191,7 +192,7 @@ def read_sources(catalog, band, prior_band, wcs):
     bad = ~(flux > 0) | ~np.isfinite(flux)
     check_that(not bad.any(), "catalog", "positive fluxes", f"{np.count_nonzero(bad)} others")
     rows = QTable()
-    shapes = {name: np.full(len(table), np.nan) for name in SHAPE}
+    shapes = {name: nans(len(table)) for name in SHAPE}
     units = {"half_light_radius": ANGLE, "position_angle": u.deg}
     present = [name for name in SHAPE if name in table.colnames]
     require_columns(table, present, "catalog", units={k: units[k] for k in units if k in present})
@@ -219,7 +220,7 @@ def read_sources(catalog, band, prior_band, wcs):
     for name in SHAPE:
         rows[name] = np.where(extended, shapes[name], columns[name]) * units.get(name, 1)
     rows["flux"] = flux * FNU
-    prior_flux = np.full(len(table), np.nan)
+    prior_flux = nans(len(table))
     if prior_band == band:
         prior_flux = flux
     elif prior_band is not None:

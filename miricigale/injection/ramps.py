@@ -14,6 +14,7 @@ from miricigale.psf import miri_psf
 from miricigale.reduction import RampFit, Reducer, reduce_files
 from miricigale.reduction.references.detector_model import maps_of
 from miricigale.reduction.results import rate_image
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.options import check_data, check_that
@@ -226,7 +227,7 @@ def _rate(light, ramp, reducer, maps):
     fit = RampFit(plane, plane, plane, none + 1, none, flags, jumps)
     unit = reducer.calibrate(rate_image(reducer, ramp, maps, fit).image)
     brightness = np.asarray(unit.data, float)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         rate = light / brightness
     return np.where(np.isfinite(rate) & (brightness > 0), rate, 0.0)
 

@@ -15,6 +15,7 @@ from miricigale.injection.population import (
 from miricigale.instrument.image import Image
 from miricigale.photometry import ForcedFlags, detect_sources
 from miricigale.photometry.images.arrays import draw_places, nearest_values, pixel_scale
+from miricigale.utils.arrays import nans
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
@@ -348,6 +349,6 @@ def place_names(xy, shape):
 
 def _values_of_rows(values, rows):
     """Return the values of rows; NaN for those of -1."""
-    labels = np.full(len(rows), np.nan)
+    labels = nans(len(rows))
     labels[rows >= 0] = np.asarray(values)[rows[rows >= 0]]
     return labels

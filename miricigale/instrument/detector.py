@@ -8,6 +8,7 @@ from numpy.polynomial import polynomial as poly
 
 from miricigale.instrument.published_tables import filter_row, imager_filter, table
 from miricigale.instrument.siaf import aperture, imager_columns
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
@@ -211,7 +212,7 @@ class DetectorProperties:
             measured -= step
             if np.all(np.abs(step) < 1e-9 * (1 + target)):
                 break
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             clipped = np.where(linear > top, measured * linear / top, measured)
         return np.where(linear > 0, clipped, linear)
 

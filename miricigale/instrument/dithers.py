@@ -15,6 +15,7 @@ from miricigale.instrument.wcs import tangent_offset
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import reading, unpacked_size
+from miricigale.utils.named_values import first_value
 from miricigale.utils.options import check_data, check_names, check_that
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import require_columns
@@ -352,7 +353,7 @@ def _read_pointings(path, observation, exposure):
         [position for pattern in patterns.values() for position in pattern]
     ):
         patterns = {0: patterns[_chosen("exposure", exposure, patterns)]}
-    offsets = next(iter(patterns.values()))
+    offsets = first_value(patterns)
     if not _alike(offsets):
         msg = f"{path.name}: tiles of the observation have dithers that differ from one another"
         raise ValueError(msg)

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from miricigale.pages.rendering import render
-from miricigale.utils.files import replacing
+from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.parallel import chunks
 
 #: Sources whose details and pictures are in one file.
@@ -174,7 +174,7 @@ def saver(folder):
 
     def save(name, write):
         place = Path(folder) / name
-        place.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(place.parent)
         with replacing(place) as partial:
             write(partial)
 

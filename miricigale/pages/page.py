@@ -7,7 +7,7 @@ from markupsafe import Markup
 
 from miricigale.pages.rendering import image_of, macros, render
 from miricigale.pages.values import Missing
-from miricigale.utils.files import replacing
+from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.options import check_that
 
 
@@ -176,7 +176,7 @@ class Page:
             If the file exists and ``overwrite`` is False.
         """
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         with replacing(path, overwrite=overwrite) as partial:
             partial.write_text(self.to_html(), encoding="utf-8")
         return path

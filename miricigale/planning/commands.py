@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.utils.files import replacing
+from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.folder import check_folder
 from miricigale.utils.outputs import check_outputs
 from miricigale.utils.table_files import write_table
@@ -146,7 +146,7 @@ def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=F
     areas = None
     if config.survey.areas:
         areas = area_table(planner, planner.divide())
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     with replacing(folder / "plan.toml", overwrite=overwrite) as partial:
         partial.write_text(config.to_toml(), encoding="utf-8")
     tables = {"comparison": comparison}

@@ -6,7 +6,7 @@ from astropy.table import vstack
 
 from miricigale.refdata import resources
 from miricigale.sed import SEDModel
-from miricigale.utils.arrays import middles
+from miricigale.utils.arrays import middles, quiet_division
 from miricigale.utils.exceptions import argument_error, config_error
 from miricigale.utils.missing_values import floats, plain_floats
 from miricigale.utils.options import check_that
@@ -131,7 +131,7 @@ def _catalog_galaxies(config, executor):
     sources["size"] = np.where(np.isfinite(size) & (size > 0), size, 0.0) * u.arcsec
     if "frac_agn" in catalog.colnames:
         sources["frac_agn"] = floats(catalog["frac_agn"])
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         luminosity = np.log10(sources["luminosity"].value)
         is_complete = np.isfinite(sources["mass"].value) & np.isfinite(luminosity)
         inside = (luminosity >= options.luminosity[0]) & (luminosity <= options.luminosity[1])

@@ -3,6 +3,7 @@
 import numpy as np
 
 from miricigale.plotting.axes import TRUE, AxesArray, add_borders, resolve_axes, row_mask
+from miricigale.utils.arrays import finite_values
 from miricigale.utils.options import check_choice, check_that
 
 #: Color of lines over an image.
@@ -19,7 +20,7 @@ def filled(image):
 
 def _robust(image):
     """Return the median and robust standard deviation of the finite pixels, (0, 1) without any."""
-    values = image[np.isfinite(image)]
+    values = finite_values(image)
     if values.size == 0:
         return 0.0, 1.0
     middle = float(np.median(values))
@@ -34,7 +35,7 @@ def _robust(image):
 def _limits(image):
     """Return the values of the ends of the colors: from two sigma below the median to what is bright."""
     middle, sigma = _robust(image)
-    finite = image[np.isfinite(image)]
+    finite = finite_values(image)
     high = 1.0
     if finite.size:
         high = np.percentile(finite, 99.7)

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.plotting.axes import AxesArray, add_borders, legend, resolve_axes, row_mask
+from miricigale.utils.arrays import finite_values, quotient
 
 #: Upper limits: a bar, and an arrow down from it.
 _ARROW = {"fmt": "_", "uplims": True, "color": "tab:blue", "markersize": 10, "zorder": 4}
@@ -71,7 +72,7 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     edges = np.asarray(_value(edges), dtype=float)
     weights = np.asarray(weights, dtype=float)
     width = np.diff(np.log10(np.maximum(edges, 1e-300)) if log else edges)
-    density = np.divide(weights, width, out=np.zeros(weights.size), where=width > 0)
+    density = quotient(weights, width)
     drawn_before = ax.dataLim.intervalx.copy()
     ax.stairs(density, edges, **{"fill": True, "alpha": 0.5, **kwargs})
     _limit_data(ax, drawn_before, _occupied(edges, weights, density))
@@ -155,7 +156,7 @@ def plot_pdf_2d(
     y = np.asarray(y_edges, dtype=float)
     weights = np.asarray(weights, dtype=float)
     area = np.diff(x)[:, None] * np.diff(y)
-    density = np.divide(weights, area, out=np.zeros(weights.shape), where=area > 0)
+    density = quotient(weights, area)
     ax.pcolormesh(x, y, density.T, **{"cmap": "Blues", **kwargs})
     order = np.argsort(density, axis=None)[::-1]
     inside = np.empty(weights.size)
@@ -510,7 +511,7 @@ def plot_pulls(pull, *, ax=None, label=None, limit=5.0, **kwargs):
     """
     ax = resolve_axes(ax)
     pull = np.asarray(pull, dtype=float)
-    pull = np.clip(pull[np.isfinite(pull)], -limit, limit)
+    pull = np.clip(finite_values(pull), -limit, limit)
     x = np.linspace(-limit, limit, 201)
     ax.plot(x, np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi), color="0.4", linewidth=1)
     if pull.size:

@@ -7,6 +7,7 @@ from astropy.table import QTable, Table
 from miricigale.filters.photometry_table import as_photometry
 from miricigale.filters.surveys import flux_bands, is_band
 from miricigale.profiles import describe_faults, sersic_faults
+from miricigale.utils.arrays import nans
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.ids import id_column, likely_ids
@@ -23,7 +24,7 @@ from miricigale.utils.tables import (
     require_columns,
     unique_ids,
 )
-from miricigale.utils.units import FNU
+from miricigale.utils.units import FNU, own_unit
 
 _DECLARED = declared("miricigale.scene", "columns.toml")
 #: Columns that every catalog has, with their unit (None: dimensionless or not a number).
@@ -80,7 +81,7 @@ def _plain_column(table, name, unit, argument):
     check_that(values.ndim == 1, argument, wanted, got)
     if name != "position_angle":  # an angle on the sky may be -99
         values[without_codes(values)[0]] = np.nan
-    values = u.Quantity(values, getattr(table[name], "unit", None)).to(unit or u.one)
+    values = u.Quantity(values, own_unit(table[name])).to(unit or u.one)
     if unit:
         return values
     return values.value
@@ -191,7 +192,7 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     catalog["profile"] = _checked_profiles(catalog["profile"], argument)
     numbers = without(CATALOG_COLUMNS, ("id", "sky", "profile"))
     for name in catalog.colnames:
-        unit = getattr(catalog[name], "unit", None)
+        unit = own_unit(catalog[name])
         linear = isinstance(unit, u.UnitBase)  # a magnitude is none
         if "." in name and linear and unit.is_equivalent(FNU):
             numbers[name] = FNU
@@ -263,7 +264,7 @@ def _fill_columns(table, argument):
             _complete_sersic(table, missing, sersic, argument)
     for name in ("redshift", *missing):
         if name not in table.colnames:
-            table[name] = np.full(len(table), np.nan) * (CATALOG_COLUMNS[name] or u.one)
+            table[name] = nans(len(table)) * (CATALOG_COLUMNS[name] or u.one)
     if "profile" in table.colnames:
         return
     usable = np.full(len(table), not missing)

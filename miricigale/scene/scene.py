@@ -31,7 +31,7 @@ from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import middle_pixel
 from miricigale.utils.tables import Flags, described_columns
-from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, own_unit, positive, to_array
 
 #: PSFs with known pixel, frame and filter.
 _TYPED = (InstrumentPSF, PSFGrid)
@@ -249,7 +249,7 @@ class Scene(WithTable):
         wanted = f"a column of {self._catalog.colnames}"
         check_that(agn in self._catalog.colnames, "agn", wanted, repr(agn))
         column = self._catalog[agn]
-        unit = getattr(column, "unit", None)
+        unit = own_unit(column)
         is_share = unit is None or unit == u.one
         values = plain_floats(column, agn, "catalog")
         high = 1.0

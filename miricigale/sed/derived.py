@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.sed.chain import COLOR_BANDS, COLORS, UV_WINDOWS
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.named_values import subset
 from miricigale.utils.package_tables import declared
 
@@ -50,7 +51,7 @@ def galaxy_quantities(stars, rows, absorbed, sums, reference_row):
     visual = sums[:, 1]
     windows = sums[:, 2 : 2 + n]
     bands = sums[:, 2 + n :]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         logs = np.log10(windows)
         magnitude = -2.5 * np.log10(bands)
         a_v = 2.5 * np.log10(stars.visual[rows] / visual)

@@ -14,7 +14,7 @@ from miricigale.utils.missing_values import floats, mask_of
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import error_column, require_columns
-from miricigale.utils.units import FNU
+from miricigale.utils.units import FNU, own_unit
 
 #: Laws of extinction with R_V, as `dust_extinction` names them, and whom to cite.
 LAWS = declared("miricigale.sed", "extinction.toml")["laws"]
@@ -408,7 +408,7 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
         for column in (name, error_column(name)):
             if column not in out.colnames:
                 continue
-            unit = getattr(out[column], "unit", None)
+            unit = own_unit(out[column])
             linear = isinstance(unit, u.UnitBase) and (
                 unit.is_equivalent(FNU, u.spectral_density(1 * u.um)) or unit.is_equivalent(u.mgy)
             )

@@ -15,6 +15,7 @@ from miricigale.sed.parameter import default_values
 from miricigale.utils.configuration import conf
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import make_folder
 
 _log = logging.getLogger(__name__)
 
@@ -87,7 +88,7 @@ def cached_grid(model, axes, filters, make):
     if grid.galaxy.nbytes + grid.agn.nbytes > limit or not _unchanged(model):
         return grid
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         # another thread, process or machine may be at the same grid
         grid.write(path, overwrite=True)
         _make_room(path.parent, limit, keep=path)

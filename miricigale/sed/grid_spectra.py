@@ -8,6 +8,7 @@ from miricigale.sed.cells import cell_means, edges_around
 from miricigale.sed.chain import STELLAR
 from miricigale.sed.cosmology import distance
 from miricigale.sed.tables import dilution
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import places
 from miricigale.utils.options import check_that
@@ -93,7 +94,7 @@ def draw_fluxes(grid, index, scale, names, extra, model):
     formed; ``names`` and ``extra`` come from `band_names`; ``model`` is that of the grid, for bands
     that this has not, or None.
     """
-    out = np.full(scale.shape + (len(names),), np.nan)
+    out = nans(scale.shape + (len(names),))
     in_grid = [i for i, name in enumerate(names) if name in grid.filters]
     columns = [grid.filters.index(names[i]) for i in in_grid]
     for row in range(len(index)) if in_grid else ():

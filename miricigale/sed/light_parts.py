@@ -11,6 +11,7 @@ import numpy as np
 from miricigale.sed.chain import STELLAR, VISUAL, Stars
 from miricigale.sed.derived import galaxy_quantities
 from miricigale.sed.gridding import BandSums, Starlight, agn_table
+from miricigale.utils.arrays import nans
 from miricigale.utils.values import value_class
 
 #: Time spans in Gyr over which star-formation rates are averaged, by quantity.
@@ -164,9 +165,7 @@ def quantities_of_parts(starlight, absorbed, dust, age, reference_row):
         columns[name] = columns[name] / (np.minimum(age, span) * _YEARS)
     visual_age = columns.pop("visual_age")
     visual = columns.pop("visual_stars")
-    columns["age_light"] = np.divide(
-        visual_age, visual, out=np.full(len(visual), np.nan), where=visual > 0
-    )
+    columns["age_light"] = np.divide(visual_age, visual, out=nans(len(visual)), where=visual > 0)
     # sums over the light take the place of the spectra
     no_spectra = dict.fromkeys(("young", "old", "nebular_young", "nebular_old", "dust_power"))
     stars = Stars(**no_spectra, **columns)

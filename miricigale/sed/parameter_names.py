@@ -10,8 +10,10 @@ from astropy.table import QTable, Table
 from miricigale.sed.component import COMPONENTS
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.named_values import first_value
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.package_tables import declared
+from miricigale.utils.units import own_unit
 
 #: Names of parameters that are usual elsewhere, with ours; and those that have other meanings in tables.
 _OTHER_NAMES = {"z": "redshift", "fracAGN": "frac_agn"}
@@ -69,7 +71,7 @@ def by_our_names(values, parameters=(), *, short=False):
         if ours in names:
             continue
         value = out[theirs]
-        if unit and getattr(value, "unit", None) is None:
+        if unit and own_unit(value) is None:
             value = u.Quantity(value, unit)
         out[ours] = value
         del out[theirs]
@@ -266,7 +268,7 @@ def plain_mass(values):
         return values
     out = values.copy()
     name = logs[0]
-    unit = getattr(out[name], "unit", None)
+    unit = own_unit(out[name])
     if unit == u.dex(u.Msun):
         out["mass"] = out[name]
     else:
@@ -284,6 +286,6 @@ def single_models(parameters):
     lengths = {name: len(value) for name, value in arrays.items()}
     got = ", ".join(f"{length} of {name!r}" for name, length in lengths.items())
     check_that(len(set(lengths.values())) == 1, "parameters", "arrays of one length", got)
-    n_models = next(iter(lengths.values()))
+    n_models = first_value(lengths)
     for row in range(n_models):
         yield parameters | {name: value[row] for name, value in arrays.items()}

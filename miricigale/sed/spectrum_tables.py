@@ -15,7 +15,7 @@ from miricigale.utils.curve_columns import (
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
-from miricigale.utils.units import FNU
+from miricigale.utils.units import FNU, own_unit
 
 
 def spectrum_columns(table, path):
@@ -49,7 +49,7 @@ def spectrum_columns(table, path):
     fnu = _without_flagged(fnu, table)
     lights = []
     for name in table.colnames:
-        unit = getattr(table[name], "unit", None)
+        unit = own_unit(table[name])
         is_other = name not in (wave_name, flux_name) and not is_quality(name)
         if is_other and isinstance(unit, u.UnitBase) and unit.is_equivalent(FNU):
             lights.append(name)
@@ -70,7 +70,7 @@ def spectrum_table(sed):
 
 def _with_unit(column, parse):
     """Return a column as a quantity, its unit read by ``parse``; None without one."""
-    unit = getattr(column, "unit", None)
+    unit = own_unit(column)
     if unit is None:
         return None
     unit = parse(unit)

@@ -13,6 +13,7 @@ from miricigale.sed.cosmology import distance
 from miricigale.sed.derived import DERIVED, agn_quantities, galaxy_quantities, scaled_quantities
 from miricigale.sed.parameter_names import LIVING_MASS, by_our_names
 from miricigale.sed.spectrum import SED
+from miricigale.utils.arrays import nans
 from miricigale.utils.caching import cached
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import ModelWarning, warn
@@ -322,8 +323,8 @@ def _evaluate_rows(model, table, filters):
     check_that(not reserved, "filters", "without names of other columns", sorted(reserved))
     values = _columns(model, table)
     flags = _row_flags(model, values, n)
-    flux = np.full((n, len(filters)), np.nan)
-    derived = {name: np.full(n, np.nan) for name in names}
+    flux = nans((n, len(filters)))
+    derived = {name: nans(n) for name in names}
     good = np.flatnonzero(flags == 0)
     far = np.zeros(n)
     far[good] = distance(values["redshift"][good], model.cosmology)

@@ -1,8 +1,18 @@
-"""Small operations on arrays: middles of cells, places about a middle, peaks, and steps that thin out."""
+"""Small operations on arrays: middles, places on images, peaks, ratios, boxes, and steps that thin out."""
 
 import numpy as np
 
 from miricigale.utils.options import check_that
+
+
+def nans(shape):
+    """Return a new array of NaN."""
+    return np.full(shape, np.nan)
+
+
+def finite_values(values):
+    """Return those values of an array that are finite, shape (m,)."""
+    return values[np.isfinite(values)]
 
 
 def middles(edges):
@@ -30,6 +40,24 @@ def check_light(data, argument):
     """Refuse what is no image with light (a `ValueError`)."""
     good = data.ndim == 2 and np.all(np.isfinite(data)) and data.sum() > 0
     check_that(good, argument, "a finite 2D array with a positive sum", data.shape)
+
+
+def quiet_division():
+    """Return a context in which divisions by 0, and operations without a result, do not warn."""
+    return np.errstate(divide="ignore", invalid="ignore")
+
+
+def quotient(numerator, denominator, otherwise=0.0):
+    """Divide arrays; ``otherwise`` where the denominator is not above 0."""
+    shape = np.broadcast_shapes(np.shape(numerator), np.shape(denominator))
+    out = np.full(shape, otherwise)
+    return np.divide(numerator, denominator, out=out, where=denominator > 0)
+
+
+def box_shape(box):
+    """Return the shape (ny, nx) of a box of rows and columns, which are slices."""
+    rows, columns = box
+    return rows.stop - rows.start, columns.stop - columns.start
 
 
 def thinning_step(n, most):

@@ -5,7 +5,7 @@ import re
 import astropy.units as u
 
 from miricigale.utils.options import check_data
-from miricigale.utils.units import FLAM
+from miricigale.utils.units import FLAM, own_unit
 
 #: Units as STScI and others write them, in lower case.
 _WAVE_UNITS = {
@@ -105,7 +105,7 @@ def curve_columns(table, value_name, path):
 
 def _is_wave(table, name):
     """Whether a column holds wavelengths by its unit, or without one by its name."""
-    unit = unit_of_wavelengths(getattr(table[name], "unit", None))
+    unit = unit_of_wavelengths(own_unit(table[name]))
     if unit is None or isinstance(unit, u.UnrecognizedUnit):
         return _WAVE_NAME.search(name) is not None
     return isinstance(unit, u.UnitBase) and unit.is_equivalent(u.m)

@@ -148,6 +148,11 @@ def is_path(value):
     return isinstance(value, (str, os.PathLike))
 
 
+def make_folder(path):
+    """Make a folder (`pathlib.Path`) and those that it is in, where they are not there yet."""
+    path.mkdir(parents=True, exist_ok=True)
+
+
 def split_extension(path):
     """
     Take ``file.fits[EXTENSION]`` apart.

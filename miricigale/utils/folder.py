@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from miricigale.utils.content_hash import file_sha256
 from miricigale.utils.exceptions import DataError, data_error
-from miricigale.utils.files import PARTIAL, replacing, writing
+from miricigale.utils.files import PARTIAL, make_folder, replacing, writing
 from miricigale.utils.lock import FolderLock
 from miricigale.utils.named_values import without
 from miricigale.utils.options import check_that
@@ -86,7 +86,7 @@ class FileFolder:
         """
         path = self.path(name)
         with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
         with replacing(path) as partial:
             writer(partial)
         return path
@@ -251,7 +251,7 @@ class RecordFolder(FileFolder):
             )
 
     def __enter__(self):
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder)
         self._lock.__enter__()
         try:
             # another process may have changed it since it was looked at

@@ -18,6 +18,11 @@ def field_names(cls):
     return [field.name for field in dataclasses.fields(cls)]
 
 
+def first_value(mapping):
+    """Return the first value of a mapping, which has one at least."""
+    return next(iter(mapping.values()))
+
+
 def subset(mapping, names):
     """Return the values of some keys of a dictionary, or of some columns of a table, in the order of ``names``."""
     return {name: mapping[name] for name in names}

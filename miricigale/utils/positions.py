@@ -7,6 +7,7 @@ import numpy as np
 from astropy.coordinates import Angle, SkyCoord, UnitSphericalRepresentation
 from astropy.time import Time
 
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import CatalogWarning, argument_error, units_error, warn
 from miricigale.utils.missing_values import (
     floats,
@@ -16,7 +17,7 @@ from miricigale.utils.missing_values import (
     without_codes,
 )
 from miricigale.utils.options import check_that
-from miricigale.utils.units import angle_unit
+from miricigale.utils.units import angle_unit, own_unit
 
 _WANTED = "one SkyCoord, text such as '150.1 +2.2' or '10h00m24s +02d12m00s', or (ra, dec) in deg"
 #: Columns of right ascension and declination, in lower case and without ``_j2000``: those of surveys, VizieR and
@@ -322,7 +323,7 @@ def _known_floats(column, name, argument):
 
 def _factor(column, unit, kind, name, argument):
     """Factor from the unit of a column, by default ``unit``, to this one."""
-    column_unit = u.Unit(getattr(column, "unit", None) or unit)
+    column_unit = u.Unit(own_unit(column) or unit)
     if not column_unit.is_equivalent(unit):
         raise units_error(argument, kind, column_unit, column=name)
     return column_unit.to(unit)
@@ -399,7 +400,7 @@ def _warn_of_rounding(column, degrees, scale, name, argument):
 def _degrees(table, name, text_unit, argument):
     """Angles in degrees, NaN where they are missing; text that is no number is in ``text_unit``."""
     column = table[name]
-    unit = angle_unit(getattr(column, "unit", None) or u.deg)
+    unit = angle_unit(own_unit(column) or u.deg)
     if not u.Unit(unit).is_equivalent(u.deg):
         raise units_error(argument, "an angle", unit, column=name)
     if column.dtype.kind in "OSU" and _is_sexagesimal(column):
@@ -425,7 +426,7 @@ def _is_sexagesimal(column):
 def _of_text(column, name, unit, argument):
     """Angles of text in degrees, NaN where they are missing."""
     texts, missing = _texts(column)
-    values = np.full(texts.shape, np.nan)
+    values = nans(texts.shape)
     for row in np.flatnonzero(~missing):
         try:
             values[row] = Angle(str(texts[row]), unit).deg

@@ -7,12 +7,13 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.files import is_path
 from miricigale.utils.frames import as_column, frame_columns, is_frame
 from miricigale.utils.ids import id_column, ids_and_missing
 from miricigale.utils.options import check_least, check_that, check_type
-from miricigale.utils.units import ANGLE, flux_unit, to_array
+from miricigale.utils.units import ANGLE, flux_unit, own_unit, to_array
 
 
 class Flags(enum.IntFlag):
@@ -255,7 +256,7 @@ def require_columns(table, names, argument, *, units=None):
     for name, unit in (units or {}).items():
         if name not in table.colnames:
             continue
-        have = getattr(table[name], "unit", None)
+        have = own_unit(table[name])
         if have is not None:
             have = flux_unit(have) or u.Unit(have)
         # magnitudes are no units of flux
@@ -377,7 +378,7 @@ def match_sky(coords, reference, *, radius):
     check_least(limit, "radius", 0)
     n = len(reference)
     index = np.full(n, -1)
-    separation = np.full(n, np.nan)
+    separation = nans(n)
     if n and len(coords):
         nearest, sep, _ = match_coordinates_sky(reference, coords)
         sep = sep.to_value(u.arcsec)

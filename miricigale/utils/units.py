@@ -7,6 +7,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.missing_values import without_mask
 from miricigale.utils.named_values import field_values
@@ -217,7 +218,7 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     """
     unit = u.Unit(unit)
     value, mask = without_mask(value)
-    if isinstance(getattr(value, "unit", None), u.UnitBase) and unit.is_equivalent(u.Jy):
+    if isinstance(own_unit(value), u.UnitBase) and unit.is_equivalent(u.Jy):
         # maggies, which astropy ties to no flux
         flux = flux_unit(value.unit)
         if flux is not None:
@@ -242,7 +243,7 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)
     except u.UnitConversionError:
         wanted = _convertible(unit, "convertible to a number without a unit")
-        raise units_error(name, wanted, getattr(value, "unit", None)) from None
+        raise units_error(name, wanted, own_unit(value)) from None
     if mask is not None:
         array = np.where(mask, np.nan, array)
     if ndim is not None and array.ndim != ndim:
@@ -267,6 +268,11 @@ class Frozen:
     def __reduce__(self):
         values = field_values(self)
         return functools.partial(type(self), **values), ()
+
+
+def own_unit(value):
+    """Return the unit that a value or column has; None without one."""
+    return getattr(value, "unit", None)
 
 
 def scalar(value, unit, name):
@@ -307,7 +313,7 @@ def check_count(value, name, least=1):
 def ab_magnitude(flux):
     """AB magnitudes of flux densities, as plain numbers; NaN where they are not positive."""
     value = to_array(flux, FNU, "flux")
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with quiet_division():
         return np.where(value > 0, 23.9 - 2.5 * np.log10(value), np.nan)
 
 

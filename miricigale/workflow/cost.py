@@ -7,7 +7,7 @@ from astropy.table import QTable
 
 from miricigale.instrument import imager_columns
 from miricigale.utils.missing_values import floats
-from miricigale.utils.named_values import convert_values
+from miricigale.utils.named_values import convert_values, first_value
 from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.grids import grid_of, patch_bands, study_patches
@@ -119,7 +119,7 @@ class _Size:
         self.n_drawn = inside * self.native / n_pixels
         # the box about the fields has corners that no field covers
         first, last = imager_columns()
-        height = next(iter(self.exposures.values())).shape[0]
+        height = first_value(self.exposures).shape[0]
         share = len(study_pointings(config)) * (last - first) * height / n_pixels
         self.n_imaged = int(inside * min(1.0, share))
         self.pictured = min(self.n_imaged, config.report.pictures)

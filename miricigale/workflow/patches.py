@@ -26,7 +26,7 @@ from miricigale.photometry.detection.prior_catalog import read_catalog
 from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import cached_by_file, replacing
+from miricigale.utils.files import cached_by_file, make_folder, replacing
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_least, check_that
 from miricigale.utils.outputs import check_output
@@ -344,7 +344,7 @@ def measure_patches(
     )
     table = read_table(runner.run().path("table.fits"), wanted="the table")
     if output is not None:
-        Path(output).parent.mkdir(parents=True, exist_ok=True)
+        make_folder(Path(output).parent)
         with replacing(output, overwrite=overwrite) as partial:
             write_table(table, partial)
     return table

@@ -9,6 +9,7 @@ import numpy as np
 from miricigale import psf, sed
 from miricigale.instrument import flat_field, miri_detector
 from miricigale.sed import components
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.random import stream
 from miricigale.workflow.morphology import add_clumps
 
@@ -289,7 +290,7 @@ def point_columns(model, parameters, bands):
     total = model.fluxes(parameters, bands)
     columns = {}
     for band in bands:
-        with np.errstate(invalid="ignore", divide="ignore"):
+        with quiet_division():
             share = 1.0 - galaxies[band].value / total[band].value
         columns[point_column(band)] = np.clip(np.nan_to_num(share), 0.0, 1.0)
     return columns

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import llvmlite.binding as llvm
 
+from miricigale.utils.files import make_folder
 from miricigale.utils.parallel import parallel_map, threads
 
 # shown by the command line at any verbosity
@@ -172,7 +173,7 @@ def compile_job(name):
     JOBS[name][0]()
     path = _marker(name)
     with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         path.touch()
     return is_compiled(name)
 

@@ -21,7 +21,7 @@ from miricigale.pages.browser import (
 )
 from miricigale.plotting.axes import MEASURED
 from miricigale.sed.cells import cell_means
-from miricigale.utils.arrays import thinning_step
+from miricigale.utils.arrays import quiet_division, thinning_step
 from miricigale.utils.named_values import places
 from miricigale.utils.units import FNU, WAVE
 
@@ -112,7 +112,7 @@ class _Objects:
             if not np.isfinite(percentiles).any():
                 continue
             if key == "mass":
-                with np.errstate(divide="ignore", invalid="ignore"):
+                with quiet_division():
                     percentiles = np.log10(percentiles)
             for k, level in enumerate(("16 %", "50 %", "84 %")):
                 table[f"{key}_{k}"] = percentiles[:, k]

@@ -26,9 +26,10 @@ from miricigale.fitting.survey.survey import (
     on_nodes,
     with_calibration,
 )
+from miricigale.utils.arrays import nans
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import OtherResultsError
-from miricigale.utils.files import replacing
+from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.named_values import places, rows_of
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
@@ -132,7 +133,7 @@ class SourceSample:
 
     def _seen_by_long_bands(self, data):
         """Find rows whose flux in the longest of the other bands is above five times the error of a long band."""
-        flux = np.full(len(data), np.nan)
+        flux = nans(len(data))
         for i in self._short:
             flux = np.where(data.measured[:, i], data.flux[:, i], flux)
         is_detectable = flux[:, None] > MIN_SIGNAL * data.flux_err[:, self._long]
@@ -351,7 +352,7 @@ def calibrate_file(fitter, rows, output, *, column=None, options):
             calibration = _bands_of_file(fitter, rows, name, options)
         else:
             calibration = _redshifts_of_file(fitter, rows, column, name, options)
-        output.mkdir(parents=True, exist_ok=True)
+        make_folder(output)
         with replacing(path) as partial:
             calibration.write(partial, overwrite=True)
     if column is None:

@@ -13,6 +13,7 @@ from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.posterior.posterior import randomized_ranks
 from miricigale.fitting.results.pulls import without_warnings
 from miricigale.fitting.survey.survey import bands_in_catalog
+from miricigale.utils.arrays import nans
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names, check_that, check_type
@@ -343,7 +344,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
         blank = quantity_table(photometry, copy=True)
         for name in group:
             # a band without flux and limit takes no part in the fit
-            blank[name] = np.full(len(blank), np.nan) * FNU
+            blank[name] = nans(len(blank)) * FNU
             blank[f"{name}_limit"] = np.zeros(len(blank), dtype=bool)
         results |= dict.fromkeys(group, fitter.fit(blank, **options))
     predicted = np.empty((len(photometry), len(bands)))

@@ -16,6 +16,7 @@ from miricigale.fitting.data.nuclei import WHOLE
 from miricigale.fitting.results.pulls import without_warnings
 from miricigale.pages import number
 from miricigale.plotting.axes import WIDTH, new_figure
+from miricigale.utils.arrays import finite_values
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.tables import described_table
 
@@ -245,7 +246,7 @@ def classes_section(page, columns, names, ids):
     figure, axes = new_figure(1, len(non_galaxies), size=(WIDTH / 2, 3.2))
     for ax, name in zip(axes[0], non_galaxies, strict=True):
         ratio = columns[f"log_ratio_{name}"]
-        ratio = ratio[np.isfinite(ratio)]
+        ratio = finite_values(ratio)
         ax.hist(np.clip(ratio, -_SPAN, _SPAN), np.linspace(-_SPAN, _SPAN, 61), color="0.75")
         ax.axvline(0.0, color="0.3", lw=0.8)
         ax.set(xlabel=f"ln evidence, {name} over galaxy", ylabel="objects")

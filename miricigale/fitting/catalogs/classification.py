@@ -5,8 +5,9 @@ import numpy as np
 from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.results.percentile_columns import LEVELS
 from miricigale.fitting.results.table_columns import ODDS
+from miricigale.utils.arrays import nans, quiet_division
 from miricigale.utils.missing_values import floats
-from miricigale.utils.named_values import places
+from miricigale.utils.named_values import first_value, places
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_table
@@ -87,7 +88,7 @@ def compare_classes(results, *, prior=None):
     True
     """
     columns = class_columns(results, prior=prior)
-    first = next(iter(results.values()))
+    first = first_value(results)
     return described_table({"id": (first.ids, "identifier"), **columns}, dict(first.meta))
 
 
@@ -102,7 +103,7 @@ def class_columns(results, *, prior=None):
     evidence = np.array([results[name].log_evidence for name in names], dtype=float)
     in_all_fits = np.isfinite(evidence).all(axis=0)
     # P_c = pi_c Z_c / sum of pi_k Z_k, shifted by the largest exponent so that it cannot overflow
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         log_posterior = np.where(in_all_fits, evidence, np.nan) + np.log(weight)
         shifted = np.exp(log_posterior - log_posterior.max(axis=0))
         probability = shifted / shifted.sum(axis=0)
@@ -179,7 +180,7 @@ def _redshift_columns(fit):
     if not _has_free_redshift(fit):
         spread = np.where(np.isfinite(best), 0.0, np.nan)
         columns = dict.fromkeys(_MEANINGS, best)
-        return columns | {"std": spread, "odds": np.full(best.shape, np.nan)}
+        return columns | {"std": spread, "odds": nans(best.shape)}
     columns = {"mean": fit.mean("redshift").value, "std": fit.std("redshift").value, "best": best}
     columns |= zip(_PERCENTILES, fit.percentile("redshift", LEVELS).value.T, strict=True)
     return columns | {"odds": fit.redshift_odds}

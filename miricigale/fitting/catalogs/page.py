@@ -20,7 +20,7 @@ from miricigale.fitting.results.object_plots import draw_objects
 from miricigale.pages import Link, Page, SectionWriter
 from miricigale.plotting.axes import WIDTH, new_figure, plain_text
 from miricigale.plotting.comparison import plot_redshifts
-from miricigale.utils.arrays import thinning_step
+from miricigale.utils.arrays import finite_values, thinning_step
 from miricigale.utils.named_values import convert_values, without
 from miricigale.utils.package_tables import declared
 
@@ -149,7 +149,7 @@ def _bands(numbers):
     for i, name in enumerate(numbers.meta["filters"]):
         ratio = numbers["ratio"][:, i]
         pull = numbers["pull"][:, i]
-        yield name, ratio[np.isfinite(ratio)].astype(float), pull[np.isfinite(pull)]
+        yield name, finite_values(ratio).astype(float), finite_values(pull)
 
 
 def _notices(page, numbers):
@@ -185,7 +185,7 @@ def _summary(page, numbers):
 
 
 def _median(values):
-    values = values[np.isfinite(values)]
+    values = finite_values(values)
     if len(values):
         return np.median(values)
     return np.nan

@@ -3,6 +3,7 @@
 import numpy as np
 from astropy.table import Table, vstack
 
+from miricigale.utils.arrays import nans, quiet_division
 from miricigale.utils.missing_values import plain_floats
 from miricigale.utils.named_values import places
 from miricigale.utils.options import check_that
@@ -47,7 +48,7 @@ def _numbers(part):
     bands = places(part.fitted_filters, part.filters)
     measured = np.isfinite(part.sigma[:, bands]) & ~part.limit[:, bands]
     error = part.flux_err[:, bands]
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with quiet_division():
         model = part.best_flux[:, bands]
         flux = part.flux[:, bands]
         ratio = np.where(measured & (model > 0), flux / model, np.nan)
@@ -66,7 +67,7 @@ def _numbers(part):
     if part.outlier is not None:
         out["wrong"] = part.outlier[:, bands] > 0.5
     for name, parameter in (("z", "redshift"), ("frac", "frac_agn"), ("mass", "stellar_mass")):
-        values = np.full((n, 3), np.nan)
+        values = nans((n, 3))
         if parameter in part.parameters:
             values = np.asarray(part.percentile(parameter, [0.16, 0.5, 0.84]).value)
         elif parameter in part.constants:
@@ -104,7 +105,7 @@ def known_redshifts(rows, name, step=1):
     if name is None:
         name = next((column for column in KNOWN_REDSHIFTS if column in names), None)
     if name is None:
-        return None, np.full(len(range(0, rows.n_rows, step)), np.nan)
+        return None, nans(len(range(0, rows.n_rows, step)))
     check_that(name in names, "z_spec", f"one of the columns {list(names)}", repr(name))
     chunks = thinned(map(rows.chunk, range(rows.n_chunks)), step)
     z = np.concatenate([plain_floats(chunk[name], name, "photometry") for chunk in chunks])

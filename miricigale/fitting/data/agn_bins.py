@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
@@ -99,7 +100,7 @@ class AGNBins:
         z_bin = np.where((z_bin < 0) | (z_bin >= n_z), n_z, z_bin)
         frac_bin = np.searchsorted(self.frac_agn[1:-1], frac_agn, side="right") + 1
         frac_bin = np.where(frac_agn > 0, frac_bin, 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             log_l = np.log10(luminosity)
         l_bin = np.searchsorted(self.log_luminosity, log_l, side="right")
         l_bin = np.where(np.isfinite(log_l) & (frac_bin > 0), l_bin, 0)

@@ -8,13 +8,14 @@ from astropy.table import QTable
 
 from miricigale.filters import Filter
 from miricigale.filters.library import SEDPY
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.missing_values import first_word, own_mask
 from miricigale.utils.named_values import attributes
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import Flags, columns_among, error_column, read_ids, require_columns
-from miricigale.utils.units import FNU, flux_unit, to_array
+from miricigale.utils.units import FNU, flux_unit, own_unit, to_array
 from miricigale.utils.values import value_class
 
 #: S/N of the best model in all bands together below which an object is flagged.
@@ -308,14 +309,14 @@ class PhotometryReader:
         columns = flux_columns(filters)
         require_columns(table, ["id"] + list(columns), "photometry")
         for name in columns:
-            if getattr(table[name], "unit", None) is None:
+            if own_unit(table[name]) is None:
                 got = "no unit: give one, as unit='uJy' in Python or --flux-unit uJy on the command line"
                 raise units_error("photometry", f"convertible to {FNU}", got, column=name)
         require_columns(table, [], "photometry", units=dict.fromkeys(columns, FNU))
         n = len(table)
         shape = (n, len(self.bands))
-        flux = np.full(shape, np.nan)
-        flux_err = np.full(shape, np.nan)
+        flux = nans(shape)
+        flux_err = nans(shape)
         sigma = np.full(shape, np.inf)
         limit = np.zeros(shape, dtype=bool)
         flags = np.zeros(n, dtype=int)
@@ -416,7 +417,7 @@ def is_filter(name):
 
 def _is_flux(column):
     """Whether a column has a unit of flux density."""
-    unit = getattr(column, "unit", None)
+    unit = own_unit(column)
     try:
         return unit is not None and (flux_unit(unit) or u.Unit(unit)).is_equivalent(FNU)
     except (TypeError, ValueError):
@@ -440,7 +441,7 @@ def limits(table, name):
     text = np.char.strip(np.char.lower(data_values.astype(str)))
     is_true = np.isin(text, _TRUE)
     is_readable = is_true | np.isin(text, _FALSE)
-    if getattr(values, "unit", None) is not None:
+    if own_unit(values) is not None:
         is_readable = is_true = np.zeros(len(table), dtype=bool)
     if data_values.shape != (len(table),) or not np.all(is_readable | mask):
         wanted = f"a table whose column {column!r} is boolean"

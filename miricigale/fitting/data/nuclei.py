@@ -14,7 +14,7 @@ from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.missing_values import own_mask
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU, flux_unit
+from miricigale.utils.units import FNU, flux_unit, own_unit
 
 #: Ends of the names of columns of `nucleus_table`: of the flux, its correlation and its mark as an upper limit.
 NUCLEUS = "_nucleus"
@@ -135,7 +135,7 @@ def with_units(table, unit):
             continue
         parsed = unit_of_fluxes(of_band)
         for name in (column, error_column(column)):
-            if getattr(table[name], "unit", None) is None and parsed != u.ABmag:
+            if own_unit(table[name]) is None and parsed != u.ABmag:
                 unit_of_column[name] = parsed
     if not unit_of_column:
         return table
@@ -246,7 +246,7 @@ def nucleus_table(table, columns):
 
 def _fluxes(table, name):
     """Read fluxes or errors of a column in uJy, NaN where masked."""
-    unit = getattr(table[name], "unit", None)
+    unit = own_unit(table[name])
     parsed = None
     if unit is not None:
         parsed = flux_unit(unit) or unit
@@ -261,7 +261,7 @@ def _fluxes(table, name):
 def _numbers(table, name):
     """Read numbers of a column without unit (10 % is 0.1), NaN where masked."""
     column = table[name]
-    unit = getattr(column, "unit", None) or u.dimensionless_unscaled
+    unit = own_unit(column) or u.dimensionless_unscaled
     if not unit.is_equivalent(u.dimensionless_unscaled):
         raise units_error("photometry", "a number without a unit", repr(str(unit)), column=name)
     mask = np.broadcast_to(np.asarray(own_mask(column)), (len(table),))

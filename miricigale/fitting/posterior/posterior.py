@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.fitting._core import percentile_places
 from miricigale.fitting.data.likelihood import FitFlags
-from miricigale.utils.arrays import middles
+from miricigale.utils.arrays import middles, nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.missing_values import floats
@@ -77,7 +77,7 @@ def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):
     """
     edges = cell_edges(values, bounds)
     levels = np.asarray(levels, dtype=float)
-    out = np.full((pdf.shape[0], levels.size), np.nan)
+    out = nans((pdf.shape[0], levels.size))
     good = np.flatnonzero(np.isfinite(pdf).all(axis=1) & (pdf.sum(axis=1) > 0))
     place = np.empty((good.size, levels.size))
     percentile_places(pdf[good], levels, place)

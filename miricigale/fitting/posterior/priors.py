@@ -10,12 +10,13 @@ from miricigale.fitting.data.likelihood import FitFlags
 from miricigale.fitting.posterior.posterior import cell_edges
 from miricigale.fitting.posterior.quantities import column_values
 from miricigale.sed import COMPONENTS
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats, own_mask, without_mask
 from miricigale.utils.options import check_choice, check_names, check_that
 from miricigale.utils.random import stream
-from miricigale.utils.units import are_not_negative, is_ascending, is_number, to_array
+from miricigale.utils.units import are_not_negative, is_ascending, is_number, own_unit, to_array
 from miricigale.utils.values import value_class
 
 #: Power of the redshift in `magnitude_prior`.
@@ -232,7 +233,7 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
 
 def _add_axis(axes, name, column, kind, priors, bounds, rows=None, nodes=None):
     """Add the axis of a table's column; return the prior factor of each model."""
-    unit = getattr(column, "unit", None) or 1
+    unit = own_unit(column) or 1
     column = column_values(column)
     if nodes is None:
         # means of equal values may differ in the last digit
@@ -408,7 +409,7 @@ def magnitude_prior(magnitude, redshift=None):
     array([0.4, 0.8])
     """
     unmasked, mask = without_mask(magnitude)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         values = u.Quantity(unmasked, subok=True).to(u.ABmag).value
     if mask is None:
         values = np.asarray(values, dtype=float)
@@ -492,7 +493,7 @@ def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
     integral = total[:, -1:]
     is_usable = np.isfinite(integral[:, 0]) & (integral[:, 0] > 0)
     flags[~is_usable] |= FitFlags.NO_REDSHIFT
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         out = np.where(allowed & is_usable[:, None], np.log(weights / integral), -np.inf)
     flags[is_usable & ~np.isfinite(out).any(axis=1)] |= FitFlags.NO_MODEL
     return out

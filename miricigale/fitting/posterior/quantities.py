@@ -7,8 +7,9 @@ import numpy as np
 
 from miricigale.fitting import _core
 from miricigale.fitting.posterior.posterior import cell_percentiles
+from miricigale.utils.arrays import nans, quotient
 from miricigale.utils.options import check_that
-from miricigale.utils.units import LUMINOSITY, MASS, frozen_array
+from miricigale.utils.units import LUMINOSITY, MASS, frozen_array, own_unit
 from miricigale.utils.values import value_class
 
 #: Levels at which the distributions of derived quantities are kept.
@@ -43,7 +44,7 @@ def column_values(column):
 
 def unit_of(column):
     """Return the unit of a column; dimensionless if it has none."""
-    return getattr(column, "unit", None) or u.dimensionless_unscaled
+    return own_unit(column) or u.dimensionless_unscaled
 
 
 def draws_summary(value, *, with_log=True, weight=None):
@@ -61,7 +62,7 @@ def draws_summary(value, *, with_log=True, weight=None):
         return _weighted_summary(value, weight, with_log)
     value = value[finite]
     if not value.size:
-        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
+        return nans(3), nans(DERIVED_LEVELS.size)
     lit = value[value > 0]
     log = np.nan
     if with_log and lit.size:
@@ -75,7 +76,7 @@ def _weighted_summary(value, weight, with_log):
     """Do what `draws_summary` does, of finite draws with weights."""
     total = weight.sum()
     if not total > 0:
-        return np.full(3, np.nan), np.full(DERIVED_LEVELS.size, np.nan)
+        return nans(3), nans(DERIVED_LEVELS.size)
     (values, middles, _), moments = _sorted_draws(value, weight, with_log)
     return moments, np.interp(DERIVED_LEVELS, middles, values)
 
@@ -217,8 +218,8 @@ class ShapeQuantities:
         cell. Rows of NaN give NaN.
         """
         shape = len(weights), len(self.names)
-        out = np.full(shape + (3,), np.nan)
-        quantiles = np.full(shape + (len(levels),), np.nan)
+        out = nans(shape + (3,))
+        quantiles = nans(shape + (len(levels),))
         for i, (order, start, nodes) in enumerate(self._nodes):
             if nodes.size == 0:
                 continue
@@ -226,7 +227,7 @@ class ShapeQuantities:
             part = np.take(weights, order, axis=1)
             total = part.sum(axis=1, keepdims=True)
             # an object may have all its weight on models without a value
-            part = np.divide(part, total, out=np.full(part.shape, np.nan), where=total > 0)
+            part = quotient(part, total, np.nan)
             value = self.values[i, order]
             mean = np.sum(part * value, axis=1)
             out[:, i, 0] = mean
@@ -379,7 +380,7 @@ class Quantities:
         moments, quantiles = self.shape.summarize(out.galaxy, DERIVED_LEVELS)
         parts = [(out.moments, out.quantiles), (moments, quantiles)]
         if self.fraction is not None:
-            share = np.column_stack([out.share, np.full(len(out.share), np.nan)])
+            share = np.column_stack([out.share, nans(len(out.share))])
             parts.append((share[:, None], out.share_quantiles[:, None]))
         return tuple(np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from miricigale.fitting.posterior.posterior import cell_edges
+from miricigale.utils.arrays import finite_values
 from miricigale.utils.options import check_names, check_that
 from miricigale.utils.values import value_class
 
@@ -67,7 +68,7 @@ def draw_panel(draws, name):
     if name in draws.axes and (draws.on_nodes or draws.axes[name].label):
         axis = draws.axes[name]
         return DrawPanel(values, cell_edges(axis.values, axis.bounds), False)
-    good = values[np.isfinite(values)]
+    good = finite_values(values)
     check_that(good.size, "names", "of parameters with values in the draws", repr(name))
     is_log = bool(draws.extensive(name) and np.all(good > 0))
     if is_log:

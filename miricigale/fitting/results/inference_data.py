@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from miricigale.utils.named_values import first_value
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_names, check_that
 
@@ -43,7 +44,7 @@ def inference_data(rows, draws, describe, photometry=None):
         columns = np.moveaxis(np.asarray(values, float), -1, 0)[None]
         attributes = {"units": rows.unit(name).to_string(), "long_name": describe(name)}
         posterior[name] = (("chain", "draw", *along), columns, attributes)
-    n_draws = next(iter(posterior.values()))[1].shape[1]
+    n_draws = first_value(posterior)[1].shape[1]
     coords = objects | {"chain": [0], "draw": np.arange(n_draws)}
     attributes = {"inference_library": "miricigale"}
     if version := rows.meta.get("version"):

@@ -5,6 +5,7 @@ from astropy.table import QTable
 
 from miricigale.sed import grid_spectra
 from miricigale.utils.named_values import places
+from miricigale.utils.units import own_unit
 
 
 def models_of_draws(draws):
@@ -43,7 +44,7 @@ def _parameter_table(draws, table, model):
         # draws without AGN have any AGN model
         column = table[name][np.maximum(model, 0)]
         if name in draws.axes:
-            column = draws.drawn[name] * (getattr(column, "unit", None) or 1.0)
+            column = draws.drawn[name] * (own_unit(column) or 1.0)
         out[name] = column
     return out
 

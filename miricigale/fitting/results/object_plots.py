@@ -5,7 +5,7 @@ from urllib.parse import quote
 
 from miricigale.fitting.results.drawing import fitted_curves
 from miricigale.plotting.axes import WIDTH, plain_text
-from miricigale.utils.files import replacing
+from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.progress import progress
 
 #: Inches of the picture of one object.
@@ -101,7 +101,7 @@ def write_plots(results, folder, ids=None, *, overwrite=False, progress_bar=Fals
                 continue
             if filters is None:
                 filters = fitted_curves(result)
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             path = folder / f"{quote(key, safe='')}.png"
             title = f"{plain_text(key)}: reduced chi2 {result.reduced_chi2:.2f}"
             with replacing(path, overwrite=overwrite) as partial:

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 
 from miricigale.fitting.results.sample_flags import NOT_CONVERGED_TEXT
+from miricigale.utils.arrays import finite_values
 from miricigale.utils.exceptions import CatalogWarning, FitWarning, warn
 
 #: Signal-to-noise ratio of the fluxes that count.
@@ -85,7 +86,7 @@ def wide_bands(results):
             ~(good & has_several_models[:, None] & (results.flux > _MIN_SIGNAL * results.flux_err))
         ] = np.nan
     for name, column in zip(results.filters, pull.T, strict=True):
-        pulls = column[np.isfinite(column)]
+        pulls = finite_values(column)
         if pulls.size >= _MIN_FLUXES:
             n_bands += 1
             scatter = 1.4826 * np.median(pulls)

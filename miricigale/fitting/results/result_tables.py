@@ -8,6 +8,7 @@ from miricigale.filters.band_table import BandTable
 from miricigale.fitting.data.likelihood import FitFlags, filter_names
 from miricigale.fitting.results.percentile_columns import LEVELS
 from miricigale.fitting.results.table_columns import FIELDS, ODDS, TEXTS
+from miricigale.utils.arrays import quotient
 from miricigale.utils.options import check_names
 from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.units import FNU
@@ -16,7 +17,7 @@ from miricigale.utils.units import FNU
 def reduced_chi2(chi2, n_bands):
     """Return chi2 over the number of bands less one, shape (n,); NaN of a single band."""
     degrees = np.asarray(n_bands) - 1
-    return np.divide(chi2, degrees, out=np.full(degrees.shape, np.nan), where=degrees > 0)
+    return quotient(chi2, degrees, np.nan)
 
 
 def result_table(results, names=None):

@@ -23,6 +23,7 @@ from miricigale.fitting.results.posterior_weights import PosteriorWeights
 from miricigale.fitting.results.result_tables import flux_table, reduced_chi2, result_table
 from miricigale.fitting.results.sample_flags import worst_bands
 from miricigale.fitting.results.table_columns import OUTLIER, TEXTS
+from miricigale.utils.arrays import nans
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.flag_arrays import FlagField
 from miricigale.utils.object_rows import PerObject, PerObjectDict, of_id
@@ -497,7 +498,7 @@ class FitResults(FitRows):
         z, from the distribution that is linear within each cell of the redshifts. NaN at known redshifts.
         """
         rows = self._several()
-        out = np.full(len(rows), np.nan)
+        out = nans(len(rows))
         if "redshift" in self.axes and not self.redshift_fixed:
             z = rows.median("redshift").value
             axis = self.axes["redshift"]

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from miricigale.fitting.data.likelihood import HIGH_CHI2, FitFlags
-from miricigale.utils.arrays import thinning_step
+from miricigale.utils.arrays import quiet_division, thinning_step
 from miricigale.utils.exceptions import FitWarning, warn
 
 #: What a warning of fits that are not converged begins with, after their number.
@@ -121,7 +121,7 @@ def worst_bands(results):
         Number of the band in ``results.filters``; -1 of objects without.
     """
     measured = np.isfinite(results.sigma) & ~results.limit
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with quiet_division():
         residual = np.where(measured, (results.flux - results.best_flux) / results.sigma, 0.0)
         square = np.nan_to_num(np.square(residual))
         if square.shape[1]:

@@ -16,6 +16,7 @@ from miricigale.fitting.results.drawing import CORNER, labeled
 from miricigale.fitting.results.listed_models import fluxes_between_nodes, models_of_draws
 from miricigale.fitting.results.percentile_columns import LEVELS, suffix
 from miricigale.sed import grid_spectra
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.flag_arrays import FlagField
@@ -415,7 +416,7 @@ model : `~miricigale.sed.SEDModel`, optional
         if extra:
             model = self._model()
         rows = self._several()
-        out = np.full(rows.scale.shape + (len(names),), np.nan)
+        out = nans(rows.scale.shape + (len(names),))
         fitted = rows.fitted
         if not self.on_nodes:
             for i in np.flatnonzero(fitted):

@@ -21,8 +21,9 @@ from miricigale.fitting.samplers import CITATIONS, get_sampler
 from miricigale.fitting.samplers.run import Calls, FluxModel, positive_normal, systematic_draws
 from miricigale.fitting.samplers.space import Space, redshift_axis
 from miricigale.sed import SEDModel
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.named_values import attributes, convert_values
+from miricigale.utils.named_values import attributes, convert_values, first_value
 from miricigale.utils.options import check_that, check_type
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
@@ -246,13 +247,13 @@ class SamplerFit:
             **dict.fromkeys(("model_flux", "model_flux_std", "best_flux"), (len(self.filters),)),
             **dict.fromkeys(("chi2", "log_evidence", "log_evidence_err", "n_effective"), ()),
         }
-        out = {name: np.full((n,) + shape, np.nan) for name, shape in shapes.items()}
+        out = {name: nans((n,) + shape) for name, shape in shapes.items()}
         out |= {
             "n_calls": np.zeros(n, np.int64),
             "converged": np.zeros(n, bool),
-            "pdf": {name: np.full((n, size[name]), np.nan) for name in axes},
-            "pairs": {(x, y): np.full((n, size[x], size[y]), np.nan) for x, y in pairs},
-            "best": {name: np.full(n, np.nan) for name in tuple(axes) + quantities},
+            "pdf": {name: nans((n, size[name])) for name in axes},
+            "pairs": {(x, y): nans((n, size[x], size[y])) for x, y in pairs},
+            "best": {name: nans(n) for name in tuple(axes) + quantities},
         }
         for row in np.flatnonzero((flags & FitFlags.UNFITTED) == 0):
             posterior = self._sample(data._take(row), spaces[row], seed, axes, pairs)
@@ -301,7 +302,7 @@ class SamplerFit:
         ``values`` has all parameters but mass by name, each of shape (m,); ``mass`` is in solar masses
         formed, 1 by default.
         """
-        n = len(next(iter(values.values())))
+        n = len(first_value(values))
         if mass is None:
             mass = np.ones(n)
         table = QTable(values | {"mass": mass}, copy=False)

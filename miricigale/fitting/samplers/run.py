@@ -5,6 +5,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from scipy.special import erfcx, log_ndtr
 
+from miricigale.utils.arrays import quiet_division
+
 _STEPS = 100
 #: Below this the sum of x and the hazard is taken from its series.
 _FAR = -100.0
@@ -127,7 +129,7 @@ def best_scale(model, flux, sigma, limit):
     ratio = (flux / sigma)[~limit]
     p = measured @ ratio
     q = np.sum(measured * measured, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         scale = np.where(q > 0, np.maximum(p, 0.0) / q, 0.0)
         if not limit.any():
             return scale, np.where(q > 0, 1.0 / q, 0.0)

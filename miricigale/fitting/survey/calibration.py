@@ -16,6 +16,7 @@ from miricigale.fitting.survey.band_errors import (
     prior_of_band,
     select_fluxes,
 )
+from miricigale.utils.arrays import nans
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import places
@@ -343,7 +344,7 @@ def calibrate_zero_points(results, *, reference=None):
         wanted = f"a band with {_N_BAND} sources of S/N above 5"
         raise argument_error("reference", wanted, f"{reference} with {n[bands.index(reference)]}")
     factor = np.ones(len(bands))
-    scatter = np.full(len(bands), np.nan)
+    scatter = nans(len(bands))
     has_factor = n >= _N_BAND
     for i in np.flatnonzero(has_factor):
         rows = good[:, columns[i]]

@@ -20,6 +20,7 @@ from miricigale.fitting.survey.band_errors import (
 )
 from miricigale.fitting.survey.calibration import measure_priors, measure_template_error
 from miricigale.refdata import locate
+from miricigale.utils.arrays import nans, quotient
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import DataError, FitWarning, warn
 from miricigale.utils.files import replacing
@@ -265,7 +266,7 @@ def _read_bands(table):
         if name in table.colnames:
             values = table[name]
         else:
-            values = np.full(len(table), np.nan)
+            values = nans(len(table))
         columns[name] = (values, text)
     return described_table(columns)
 
@@ -468,7 +469,7 @@ def _longer(before, after, power):
     for name, weights in after.items():
         old = before.get(name, np.full(weights.size, 1.0 / weights.size))
         # old (new / old)^power
-        step = np.divide(weights, old, out=np.zeros(weights.size), where=old > 0) ** power * old
+        step = quotient(weights, old) ** power * old
         longer[name] = step / step.sum()
     return longer
 

@@ -7,7 +7,7 @@ from miricigale.photometry.commands.exposure_files import with_exposures
 from miricigale.photometry.commands.file_inputs import Inputs
 from miricigale.photometry.commands.point_files import PointInputs
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import replacing
+from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.named_values import without_none
 from miricigale.utils.outputs import check_output, check_outputs
 from miricigale.utils.parallel import check_memory
@@ -151,7 +151,7 @@ def measure_files(
         bar.update()
         bar.set_description("page")
         for path in written:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
         if output is not None:
             with replacing(output, overwrite=overwrite) as partial:
                 write_table(table, partial)

@@ -25,7 +25,7 @@ from miricigale.plotting.images import (
 )
 from miricigale.plotting.posteriors import plot_pulls
 from miricigale.psf.star_fit import TERMS
-from miricigale.utils.arrays import thinning_step
+from miricigale.utils.arrays import finite_values, nans, thinning_step
 from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import plain_rows, row_dicts
@@ -184,7 +184,7 @@ def _pairs(meta):
 def _pulls_rms(pulls):
     if pulls is None or not np.isfinite(pulls).any():
         return np.nan
-    return float(mad_std(pulls[np.isfinite(pulls)]))
+    return float(mad_std(finite_values(pulls)))
 
 
 def _summary(band):
@@ -338,7 +338,7 @@ def _stars(page, stars, band):
             has_data = np.isfinite(before.star.sigma)
             plot_image(np.where(has_data, star.data, np.nan), ax=row[0], title="star", **form)
             for ax, star_fit, title in ((row[1], before, "model"), (row[2], after, "corrected")):
-                pull = np.full(star.data.shape, np.nan)
+                pull = nans(star.data.shape)
                 pull[has_data] = star_fit.residual * star_fit.weight
                 plot_image(pull, ax=ax, title=f"{title}, chi2 {star_fit.chi2:.2f}", **pulls)
         page.figure("figure", figure, **facts)

@@ -12,6 +12,7 @@ from photutils.segmentation import SegmentationImage, make_2dgaussian_kernel
 from miricigale.photometry.detection.segments import dilate_segments, dilation_rule
 from miricigale.photometry.images.arrays import image_arrays, pixel_scale
 from miricigale.photometry.images.mosaics import as_mosaic
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats
@@ -321,7 +322,7 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
 
 def _purity(n_positive, n_negative):
     """Return the share of real detections; NaN without any."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         return np.where(n_positive > 0, 1 - n_negative / n_positive, np.nan)
 
 
@@ -372,7 +373,7 @@ def _extract(flux, arrays, settings):
 def _check_sky(flux, arrays, settings):
     """Refuse an image whose sky is above the threshold: all of it would be one source."""
     usable = arrays.usable
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         snr = np.where(usable, flux / arrays.sigma, 0.0)
     low, middle = np.percentile(snr[usable], [10, 50])
     # in noise they are 1.3 apart, in a crowded field much more
@@ -426,7 +427,7 @@ def bright_centroids(flux, labels, fallback):
     centroids = []
     for values, otherwise in ((x, fallback[0]), (y, fallback[1])):
         moment = np.bincount(label, weight * values, n + 1)[1:]
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             centroids.append(np.where(total > 0, moment / total, otherwise))
     return centroids
 
@@ -441,7 +442,7 @@ def _catalog(objects, detected, labels, arrays, meta):
     scale = pixel_scale(arrays.wcs)
     x, y = bright_centroids(flux, detected, (objects["x"], objects["y"]))
     sky = arrays.wcs.pixel_to_world(x, y) if n else SkyCoord([], [], unit="deg")
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         snr = total / noise
     flags = objects["flag"].astype(int) & sum(int(flag) for flag in DetectionFlags)
     columns = {

@@ -10,6 +10,7 @@ from astropy.table import QTable, Table
 from miricigale.instrument import epoch_of
 from miricigale.photometry.images.arrays import nearest_values, sky_to_pixels
 from miricigale.photometry.images.fits_images import open_map
+from miricigale.utils.arrays import nans
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, data_error, warn
 from miricigale.utils.files import is_path, open_fits, split_extension
@@ -256,7 +257,7 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
     """Return the label of each source's segment: by id if ids are those of segments, by position otherwise."""
     sky = sources["sky"]
     is_placed = np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)
-    xy = np.full((len(sources), 2), np.nan)
+    xy = nans((len(sources), 2))
     if is_placed.any():
         xy[is_placed] = sky_to_pixels(sky[is_placed], wcs)
     labels_at, inside = nearest_values(segments, xy)

@@ -8,6 +8,7 @@ import scipy.sparse
 from astropy.stats import mad_std
 from astropy.table import QTable
 
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
@@ -104,7 +105,7 @@ class ErrorCalibration:
         # pulls and relative deviations of measured sources
         snr = true[good] / noise[good]
         pull = (flux[good] - true[good]) / error[good]
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             ratio = flux[good] / true[good] - 1.0
         texts = declared("miricigale.photometry", "columns.toml")["calibration"]
         rows = (_row(snr, pull, ratio, member) for member in _members(snr))

@@ -7,6 +7,7 @@ import numpy as np
 
 from miricigale.filters import as_photometry
 from miricigale.filters.band_names import known_filter
+from miricigale.utils.arrays import nans
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.ids import id_column
 from miricigale.utils.options import check_that
@@ -18,7 +19,7 @@ from miricigale.utils.tables import (
     read_ids,
     require_columns,
 )
-from miricigale.utils.units import FNU, to_array
+from miricigale.utils.units import FNU, own_unit, to_array
 from miricigale.utils.values import value_class
 
 #: What turns the median of absolute values into a standard deviation.
@@ -43,7 +44,7 @@ class Binned:
         return (flux < self.low) | (flux > self.high)
 
     def rows(self):
-        nan = np.full(len(self.flux), np.nan)
+        nan = nans(len(self.flux))
         low = np.full(len(self.flux), self.low)
         high = np.full(len(self.flux), self.high)
         return [self.flux, self.error, low, high, nan, nan]
@@ -159,7 +160,7 @@ def common_bands(truth, measured):
     shared = [name for name in truth.colnames if name in measured.colnames and name not in errors]
     bands = []
     for name in shared:
-        unit = getattr(truth[name], "unit", None)
+        unit = own_unit(truth[name])
         if unit is not None and u.Unit(unit).is_equivalent(FNU):
             bands.append(name)
     wanted = "tables that share a column of fluxes with a unit (or 'filters' given)"

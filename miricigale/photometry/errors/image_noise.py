@@ -16,6 +16,7 @@ from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.images.sky_noise import sky_noise
 from miricigale.photometry.templates.normal_equations import noise_correlation
 from miricigale.psf import psf_image
+from miricigale.utils.arrays import nans
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_positive
 from miricigale.utils.package_tables import declared
@@ -227,7 +228,7 @@ def _weights(diameters, psf, scale):
     half = int(np.ceil(reach))
     shape = (2 * half + 1,) * 2
     apertures = {}
-    light = np.full(shape, np.nan)
+    light = nans(shape)
     if psf is not None:
         light = psf_image(psf, pixel_scale=scale * ANGLE, shape=shape[0])
         apertures["psf"] = light / np.sum(light**2), psf.fwhm.to_value(ANGLE) / scale, 1.0

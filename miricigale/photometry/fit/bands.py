@@ -18,7 +18,9 @@ from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.utils.meta import provenance
+from miricigale.utils.named_values import first_value
 from miricigale.utils.options import check_that
+from miricigale.utils.units import own_unit
 
 
 def measure_bands(images, kernels, templates, **options):
@@ -242,7 +244,7 @@ def join_bands(results):
     if bands:
         meta["bands"] = bands
     joined = QTable(meta=meta)
-    first = next(iter(tables.values()))
+    first = first_value(tables)
     joined["id"] = np.array(ids) if ids else np.asarray(first["id"])[:0]
     if all(np.array_equal(table["id"], first["id"]) for table in tables.values()):
         joined["sky"] = first["sky"]
@@ -274,7 +276,7 @@ def spread_rows(values, index, column):
     if column == "flags":
         empty = int(ForcedFlags.NO_DATA)
     spread = np.where(index >= 0, np.asarray(values)[index], empty)
-    unit = getattr(values, "unit", None)
+    unit = own_unit(values)
     if unit is None:
         return spread
     return spread * unit

@@ -7,6 +7,7 @@ from miricigale.photometry.detection.residual_sources import ResidualPeaks, resi
 from miricigale.photometry.fit.pixel_scatter import pixel_scatter
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.templates.normal_equations import noise_correlation, stated_correlation
+from miricigale.utils.arrays import nans, quiet_division
 from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import chunks
 from miricigale.utils.values import value_class
@@ -64,7 +65,7 @@ def diagnose(fit, xy, scatter=None):
         fit, residual, residual + fit.arrays.usable * model, inverse_sigma
     ).T
     return_freed_memory()
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         residual_light = residual_light / (fit.total * core)
         core_flux = core_light / core
     is_out = np.ones(len(chi2), bool)
@@ -116,7 +117,7 @@ def _statistics(fit, residual, light, inverse_sigma):
     kernel), and the part of the template that is on the rim.
     """
     n = len(fit.bank.order)
-    statistics = np.full((n, 4), np.nan)
+    statistics = nans((n, 4))
     rim_light = np.zeros(n)
     if len(fit.rows):
         rim = rim_pixels(fit.arrays.usable)

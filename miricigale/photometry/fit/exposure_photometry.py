@@ -25,6 +25,7 @@ from miricigale.photometry.images.arrays import (
 from miricigale.photometry.images.coadd import Plane
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.templates.placement import Placement
+from miricigale.utils.arrays import nans, quiet_division
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import single_threaded, threads
@@ -205,8 +206,8 @@ class _Joint:
         #: Pixels by which each exposure's templates are moved.
         self._shifts = np.zeros((len(placed), 2))
         # what they are found to be, with errors, whether they are fitted or not
-        self._measured = np.full((len(placed), 2), np.nan)
-        self._errors = np.full((len(placed), 2), np.nan)
+        self._measured = nans((len(placed), 2))
+        self._errors = nans((len(placed), 2))
 
     def fit_all(self):
         """
@@ -290,7 +291,7 @@ class _Joint:
         # fluxes, skies and shifts together
         trial = self._fit(fit.parts, fit.xy[self._n :], gradients)
         variance = np.diag(trial.fit.common_covariance)
-        steps = np.full((len(fit.parts), 2), np.nan)
+        steps = nans((len(fit.parts), 2))
         errors = steps.copy()
         for k, places in enumerate(trial.places):
             if "shift" in places:
@@ -313,7 +314,7 @@ class _Joint:
 
         As for one image, the negative of the residual and Gaussian noise say how many are false.
         """
-        flux = np.full(len(self._catalog.id), np.nan)
+        flux = nans(len(self._catalog.id))
         flux[self._catalog.near_rows] = fit.flux
         xy = self._catalog.xy
         # peaks of the residual, and of its negative, which are false
@@ -381,7 +382,7 @@ class _Joint:
             total[source] += step_weight[:, None] * plane_step
             weight[source] += step_weight
             neighbors[source] += step_weight * neighbor_light[good]
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             return total / weight[:, None], weight**-0.5, neighbors / weight
 
     def _turns(self, part, xy):

@@ -27,6 +27,7 @@ from miricigale.photometry.fit.result_table import (
 from miricigale.photometry.fit.template_fit import gaussian_width, psf_covariance, row_covariances
 from miricigale.photometry.images.arrays import lengths
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN
+from miricigale.utils.arrays import nans, quiet_division
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS
@@ -178,8 +179,8 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     chi2, residual_fraction, core_flux, poor, checks = _compared(fit, models, residuals)
     terms, common, blending = _covariances(fit)
     joint = scipy.sparse.csr_array((n_all, n_all))
-    flux_err = np.full((4, n_all), np.nan)
-    flux = np.full(n_all, np.nan)
+    flux_err = nans((4, n_all))
+    flux = nans(n_all)
     measured = place[fit.rows]
     flux[measured] = fit.flux[fit.rows]
     if len(fit.rows):
@@ -264,7 +265,7 @@ def _compared(fit, models, residuals):
         area = part.arrays.areas()
         source = part.row_source
         row_light = np.zeros(len(part.source))
-        statistics = np.full((len(part.source), 4), np.nan)
+        statistics = nans((len(part.source), 4))
         residual_flux = np.asarray(residual * area, np.float32)
         # an exposure is its model and the residual
         light = residual_flux + part.arrays.usable * np.asarray(model * area, np.float32)
@@ -287,7 +288,7 @@ def _compared(fit, models, residuals):
                 residual_flux * part.inverse_sigma, model * area * part.inverse_sigma, part
             )
         )
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         chi2 = square / weight
         light_left = light_left / (fit.flux * core)
         core_flux = core_light / core
@@ -321,7 +322,7 @@ def _noise_check(white, model, part):
 
 def _covariances(fit):
     """Calculate covariances by noise, templates and PSF, that of the common parameters, and blending."""
-    blending = np.full(len(fit.xy), np.nan)
+    blending = nans(len(fit.xy))
     if not len(fit.rows):
         return [], None, blending
     filling = fit.noise_filling()
@@ -348,7 +349,7 @@ def _exposures(fit, images, models, residuals, inverse, common, checks, offsets)
     table["n_sources"] = list(map(_n_seen, fit.parts))
     # the constant term of each exposure's sky
     first = [places["sky"].start for places in fit.places]
-    errors = np.full(len(fit.common), np.nan)
+    errors = nans(len(fit.common))
     if common is not None:
         errors = np.sqrt(np.diag(common))
     table["sky"] = fit.common[first] * SURFACE_BRIGHTNESS

@@ -8,6 +8,7 @@ from miricigale.photometry.fit.diagnostics import diagnose
 from miricigale.photometry.fit.offsets import fit_offsets, settled, source_offsets
 from miricigale.photometry.fit.template_fit import TemplateFit
 from miricigale.photometry.images.arrays import local_maps
+from miricigale.utils.arrays import nans
 from miricigale.utils.units import ANGLE
 
 #: How often positions of new sources are refined.
@@ -94,7 +95,7 @@ def _new_positions(fit, catalog):
     Where the evidence decides (``second_pass`` is None) there are none unless they are few.
     """
     xy = catalog.xy + fit.displacement(catalog.xy)
-    flux = np.full(len(xy), np.nan)
+    flux = nans(len(xy))
     flux[catalog.near_rows[fit.bank.order]] = fit.total
     usable = fit.arrays.usable
     second_pass = fit.settings.second_pass

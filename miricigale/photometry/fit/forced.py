@@ -178,9 +178,9 @@ class ForcedPhotometer(Interactive):
     n_threads: int | None = None
 
     def __post_init__(self, psf, highres_psf, filter):
-        kernel = chosen_kernel(self.kernel, psf, highres_psf, filter)
         template = self.template
         check_choice(template, "template", ("auto", "cutout", "psf", "sersic"))
+        kernel = chosen_kernel(self.kernel, psf, highres_psf, filter)
         if psf is not None and highres_psf is None and template == "auto":
             template = "psf"
         # the kernel that all have in common: the mean, with PSFs in any case

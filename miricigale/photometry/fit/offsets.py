@@ -10,6 +10,7 @@ from miricigale.photometry.fit.template_fit import TemplateFit, row_snr
 from miricigale.photometry.images.arrays import lengths
 from miricigale.photometry.images.fields import SmoothField, legendre_terms, n_terms
 from miricigale.photometry.images.flags import ForcedFlags
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
@@ -169,7 +170,7 @@ def source_offsets(fit, residual, model, rows):
     (neighbor_light, n_pixels) = out[:, 16:].T
     # normal equations of light and steps along x and y, scaled to a unit diagonal
     scale = np.sqrt(products.diagonal(axis1=1, axis2=2))[:, :3]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         normal = products[:, :3, :3] / (scale[:, :, None] * scale[:, None])
         normal[~(np.linalg.det(normal) > 1e-12)] = np.nan
         inverse = np.linalg.inv(normal)

@@ -18,6 +18,7 @@ from miricigale.photometry.fit.template_fit import fit_covariances
 from miricigale.photometry.images.arrays import pixels_to_sky
 from miricigale.photometry.images.fields import SmoothField
 from miricigale.photometry.images.flags import ForcedFlags
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import chunks
@@ -77,7 +78,7 @@ class CatalogRows:
         n = len(sources.id)
         # sources far off have no template
         flags = np.zeros(n, int)
-        snr = np.full(n, np.nan)
+        snr = nans(n)
         kinds = np.full(n, "none", "U6")
         flags[near_rows] = templates.flags
         snr[near_rows] = templates.snr
@@ -137,10 +138,10 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     place = owner[fit.host[fit.bank.order]]
     main = fit.main
     # what was not measured is NaN
-    common = np.full((n_columns, n_columns), np.nan)
-    blending = np.full(len(place), np.nan)
-    flux = np.full(n_all, np.nan)
-    flux_err = np.full((4, n_all), np.nan)
+    common = nans((n_columns, n_columns))
+    blending = nans(len(place))
+    flux = nans(n_all)
+    flux_err = nans((4, n_all))
     joint = scipy.sparse.csr_array((2 * n_all, 2 * n_all))
     if len(fit.rows):
         *covariances, common, blending[fit.rows] = fit_covariances(fit, diagnostics.correlation)
@@ -193,7 +194,7 @@ def package(fit, diagnostics, new_xy, catalog, meta):
 
 def spread_over(values, place, n):
     """Spread values over their places among ``n`` sources; NaN elsewhere."""
-    spread = np.full(n, np.nan)
+    spread = nans(n)
     spread[place] = values
     return spread
 
@@ -374,8 +375,8 @@ def _components(fit, catalog, joint, place, n_all):
     if catalog.double is None and fit.settings.components == 1:
         return {}
     n = len(catalog.sky)
-    flux = np.full(n, np.nan)
-    error = np.full(n, np.nan)
+    flux = nans(n)
+    error = nans(n)
     second = fit.pairs[:, 1]
     flux[place[second]] = fit.flux[second]
     error[place[second]] = np.sqrt(joint.diagonal()[n_all + place[second]])

@@ -23,6 +23,7 @@ from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.photometry.images.fields import SmoothField
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.photometry.templates.normal_equations import correlated_draws
+from miricigale.utils.arrays import nans, quotient
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.flag_arrays import FlagField
@@ -263,7 +264,7 @@ class ForcedPhotometryResult(Tabular):
         variance = self.joint_covariance.diagonal()
         joint = self.joint_covariance.diagonal(n)
         size = np.sqrt(variance[:n] * variance[n:])
-        correlation = np.divide(joint, size, out=np.full(n, np.nan), where=size > 0)
+        correlation = quotient(joint, size, np.nan)
         return np.where(np.isfinite(self.flux_point.value), correlation, np.nan)
 
     @functools.cached_property
@@ -281,7 +282,7 @@ class ForcedPhotometryResult(Tabular):
         width = self.psf_fwhm.to_value(ANGLE) / pixel_scale(image.wcs) / gaussian_sigma_to_fwhm
         total = scipy.ndimage.gaussian_filter(square, width, mode="constant")
         weight = scipy.ndimage.gaussian_filter(usable.astype(float), width, mode="constant")
-        chi2 = np.divide(total, weight, out=np.full(total.shape, np.nan), where=usable)
+        chi2 = np.divide(total, weight, out=nans(total.shape), where=usable)
         return Image(chi2, unit="", wcs=image.wcs, mask=~usable, meta=dict(image.meta))
 
     def images_in(self, unit):

@@ -14,6 +14,7 @@ from miricigale.photometry.templates.normal_equations import (
     normal_matrix,
     sandwich_matrix,
 )
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import chunks
@@ -446,7 +447,7 @@ class BankEquations(typing.NamedTuple):
         white = list(map(arrays.whitened, columns))
         data = arrays.whitened(arrays.flux)
         matrix, projection, power, light = normal_matrix(bank, inverse_sigma, [data] + white)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             excess = bank.noise_terms() / np.where(power > 0, power, np.inf)
         return cls(
             matrix,

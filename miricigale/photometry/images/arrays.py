@@ -9,6 +9,7 @@ from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
 from miricigale.instrument import ImageFacts, north_up_wcs, pixel_area_map
 from miricigale.photometry.images.fields import legendre_terms
 from miricigale.photometry.images.sky_noise import mask_filled
+from miricigale.utils.arrays import is_inside, nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import middle_pixel, plain_positions
@@ -271,7 +272,7 @@ def sky_pixels(sky, wcs, shape, margin):
 
     NaN for positions outside of the image, of a shape, and of a rim of ``margin`` pixels.
     """
-    xy = np.full((len(sky), 2), np.nan)
+    xy = nans((len(sky), 2))
     ny, nx = shape
     middle = wcs.pixel_to_world(*middle_pixel(shape))
     # a circle about the image: a WCS may fail, or wrap, far from it
@@ -289,9 +290,8 @@ def sky_pixels(sky, wcs, shape, margin):
 
 def nearest_values(plane, xy):
     """Return values of a plane at the nearest pixels, (n, 2) (0 outside), and whether a position is on it."""
-    ny, nx = plane.shape
     column, row = np.rint(np.where(np.isfinite(xy), xy, -1.0)).astype(int).T
-    inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
+    inside = is_inside(column, row, plane.shape)
     values = np.zeros(len(xy), plane.dtype)
     values[inside] = plane[row[inside], column[inside]]
     return values, inside

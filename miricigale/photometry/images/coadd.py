@@ -4,6 +4,7 @@ import numpy as np
 import scipy.ndimage
 from astropy.wcs.utils import pixel_to_pixel
 
+from miricigale.utils.arrays import quotient
 from miricigale.utils.values import value_class
 
 #: Pixels between the nodes at which coordinates are calculated; bilinear between them, the distortion of the
@@ -57,8 +58,7 @@ class Plane:
             values = np.asarray(image_weight, float).ravel()[pixels[shown]]
             total[shown] += values * np.asarray(image, float).ravel()[pixels[shown]]
             weight[shown] += values
-        mean = np.divide(total, weight, out=np.zeros(self.shape), where=weight > 0)
-        return mean, weight
+        return quotient(total, weight), weight
 
 
 def _nearest(wcs, shape, image_wcs, size):

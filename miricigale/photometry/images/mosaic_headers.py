@@ -7,6 +7,7 @@ import numpy as np
 
 from miricigale.instrument.image_planes import PLANES
 from miricigale.photometry.images.fits_images import filter_name, find_image, open_image
+from miricigale.utils.arrays import finite_values
 from miricigale.utils.values import value_class
 
 #: Position angles that differ by less are one (deg).
@@ -55,7 +56,7 @@ def angles_of_exposures(hdus):
     if "HDRTAB" not in hdus or "PA_APER" not in hdus["HDRTAB"].columns.names:
         return None
     angles = np.asarray(hdus["HDRTAB"].data["PA_APER"], dtype=float)
-    angles = np.round(angles[np.isfinite(angles)], 1)
+    angles = np.round(finite_values(angles), 1)
     if not angles.size:
         return None
     apart = (angles - angles[0] + 180.0) % 360.0 - 180.0

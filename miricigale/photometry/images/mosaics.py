@@ -42,6 +42,7 @@ from miricigale.photometry.images.mosaic_headers import (
 )
 from miricigale.photometry.images.pixel_marks import marked_good
 from miricigale.photometry.images.sky_noise import mask_filled, sky_noise
+from miricigale.utils.arrays import box_shape, quiet_division
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
 from miricigale.utils.files import is_path
 from miricigale.utils.options import check_data, check_that
@@ -231,8 +232,7 @@ class MosaicFile:
         check_data(wcs is not None, self.path, "has no celestial coordinates (WCS) in its header")
         if self.section is not None:
             wcs = cut_wcs(wcs, self.section, self.path)
-            rows, columns = self.section
-            shape = rows.stop - rows.start, columns.stop - columns.start
+            shape = box_shape(self.section)
 
         def get(key):
             return header.get(key, first.get(key))
@@ -583,7 +583,7 @@ _POWERS = {"error": 1, "variance": 2, "inverse_variance": -2}
 
 def _sigma(kind, values):
     """Return 1-sigma errors in the unit of the image, infinite where there are none."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         if kind == "error":
             return values
         if kind == "variance":

@@ -6,6 +6,7 @@ import scipy.ndimage
 from miricigale.photometry.detection.cutouts import Cutout
 from miricigale.photometry.shapes.rectangles import hull, rectangle_corner
 from miricigale.photometry.shapes.shapes import Neighbors, Shape, not_fitted
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.parallel import chunks
 from miricigale.utils.values import value_class
 
@@ -47,7 +48,7 @@ class Segments:
         places = list(self.places)
         totals = self.totals.copy()
         ratio = self.ratio.copy()
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             # noise from light and signal-to-noise
             variance = np.where(self.ratio > 0, (self.totals / self.ratio) ** 2, 0.0)
         for group in groups:

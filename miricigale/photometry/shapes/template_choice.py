@@ -33,6 +33,7 @@ from miricigale.photometry.shapes.source_models import (
     segment_cutout,
 )
 from miricigale.photometry.shapes.wings import adjust_wings
+from miricigale.utils.arrays import box_shape, nans, quiet_division
 from miricigale.utils.parallel import parallel_map
 
 #: Standard deviations of chi^2 by which a profile may miss the core.
@@ -125,7 +126,7 @@ def cutouts(
     # sources whose segment is bright enough to be looked at
     segments = Segments.of(data, variance, segmentation)
     flags = np.zeros(len(label), int)
-    snr = np.full(len(label), np.nan)
+    snr = nans(len(label))
     templates = [None] * len(label)
     fitted = not_fitted(len(label))
     chosen = []
@@ -220,7 +221,7 @@ class _Lights:
     def _is_contaminated(self, model, label, neighbor_light):
         """Return whether the light of neighbors is another than when a model was fitted, by its chi^2."""
         change = neighbor_light - model.neighbor_light
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             chi2 = change * change / self.variance[model.stamp]
         # an upper limit, on all pixels of the stamp, is enough for most
         if np.sum(chi2, dtype=float) < 0.99 * _CONTAMINATED_CHI2:
@@ -487,9 +488,8 @@ class _Lights:
 
     def _image(self, stamp, shape):
         """Draw the light of a profile on a stamp."""
-        rows, columns = stamp
-        size = rows.stop - rows.start, columns.stop - columns.start
-        return np.float32(shape.flux) * self.fitter.profiles(size, shape.parameters)[0]
+        profile = self.fitter.profiles(box_shape(stamp), shape.parameters)[0]
+        return np.float32(shape.flux) * profile
 
     def _own_and_free(self, stamp, label, together=()):
         """Return which pixels are a source's own, and which are free of others; those fitted together are none."""

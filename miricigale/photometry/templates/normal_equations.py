@@ -21,6 +21,7 @@ from miricigale.photometry._core.stamps import (
 )
 from miricigale.photometry.images.arrays import stamp_starts
 from miricigale.photometry.templates.templates import Block, batches
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.memory import return_freed_memory
 from miricigale.utils.parallel import chunks, parallel_map
@@ -53,7 +54,7 @@ def correlated_draws(covariance, keys, size, seed):
     """
     error = np.sqrt(covariance.diagonal())
     rows = np.flatnonzero(error > 0)
-    draws = np.full((size, len(error)), np.nan)
+    draws = nans((size, len(error)))
     if not len(rows):
         return draws
     # correlations instead of covariances

@@ -32,6 +32,7 @@ from miricigale.photometry.images.sky_noise import warn_of_sky
 from miricigale.photometry.shapes.shapes import not_fitted
 from miricigale.photometry.shapes.template_choice import cutouts
 from miricigale.profiles import ellipse_to_pixels, sersic_stamp
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.meta import provenance
@@ -124,7 +125,7 @@ class SourceTemplates:
         unique_ids(self.id, "id")
         # values of columns that are not given
         nothing = {
-            "sersic": np.full((n, 4), np.nan), "flags": np.zeros(n, int), "snr": np.full(n, np.nan),
+            "sersic": nans((n, 4)), "flags": np.zeros(n, int), "snr": nans(n),
             "fitted": not_fitted(n),
         }  # fmt: skip
         shapes = dict.fromkeys(_ROWS + OPTIONAL, (n,)) | {"sersic": (n, 4)}

@@ -31,6 +31,7 @@ from miricigale.instrument.image_planes import noise_kind, plane_data, plane_sha
 from miricigale.instrument.keywords import keyword_text
 from miricigale.instrument.product_files import PLANES
 from miricigale.reduction.images.images import flagged_image, sigma
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.exceptions import DataError, argument_error, data_error
 from miricigale.utils.files import is_path, open_fits
 from miricigale.utils.named_values import without, without_none
@@ -292,7 +293,7 @@ def scaled_planes(planes, before, after):
         scaled = {"AREA": planes["AREA"]}
     if before.uncertainty is None:
         return scaled
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         factor = np.square(sigma(after) / sigma(before))
     return scaled | {name: planes[name] * factor for name in _VARIANCES if name in planes}
 
@@ -350,7 +351,7 @@ def _error(hdus, shape, path):
     values = _plane(hdus, "ERR", shape, path)
     if values is None:
         return None
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         kind = noise_kind(hdus["ERR"])
         if kind == "variance":
             return np.sqrt(values)

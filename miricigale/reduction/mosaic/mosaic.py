@@ -23,6 +23,7 @@ from miricigale.reduction.images.images import (
     sigma,
 )
 from miricigale.utils import sep_tools
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
@@ -170,7 +171,7 @@ def pixel_map(wcs_in, wcs_out, shape):
         return x, y
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         # splines know no NaN; images on the other side of the sky come here
-        return np.full((2, ny, nx), np.nan)
+        return nans((2, ny, nx))
     rows = np.arange(ny, dtype=float)
     columns = np.arange(nx, dtype=float)
     x_of_nodes = RectBivariateSpline(nodes_y, nodes_x, x)

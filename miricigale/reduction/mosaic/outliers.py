@@ -14,6 +14,7 @@ from miricigale.reduction.images.images import (
 )
 from miricigale.reduction.mosaic.extended_outliers import extended_outliers
 from miricigale.reduction.mosaic.mosaic import add_image, extent_of, pixel_maps_of, weight_map
+from miricigale.utils.arrays import box_shape
 from miricigale.utils.options import check_positive
 from miricigale.utils.parallel import chunks
 from miricigale.utils.values import value_class
@@ -226,7 +227,7 @@ def _median_of(images, wcs, weights, pixel_maps):
         extent = extent_of((x, y), shape)
         if extent is not None:
             rows, columns = extent
-            size = rows.stop - rows.start, columns.stop - columns.start
+            size = box_shape(extent)
             sink = Drizzle(kernel="square", fillval="NAN", out_shape=size, disable_ctx=True)
             weight = np.where(plain_mask(im), 0.0, weight / (np.max(weight) or 1.0))
             moved = x - columns.start, y - rows.start

@@ -10,6 +10,7 @@ from numpy.polynomial import Polynomial
 from miricigale.detector import Ramp
 from miricigale.instrument import DQ
 from miricigale.reduction.ramps.rampfit import fit_result
+from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.optional_packages import require
 
@@ -125,7 +126,7 @@ def _result(planes, flags, groups, first, last):
     jumped[:, : first + 1] = jumped[:, last:] = False
     k, g, y, x = np.nonzero(jumped)
     # differences are counted from the first group that takes part
-    events = np.stack([y, x, k, g - first - 1, np.full(k.size, np.nan)], axis=1)
+    events = np.stack([y, x, k, g - first - 1, nans(k.size)], axis=1)
     number = jumped.sum(axis=(0, 1)).astype(np.int16)
     return fit_result(rate, var_poisson, var_read, n_used, number, flags, events, first)
 

@@ -20,6 +20,7 @@ from miricigale.reduction._core.batched_pixels import fit_pixels
 from miricigale.reduction._core.pixel import own_charge
 from miricigale.reduction.ramps.showers import find_showers
 from miricigale.reduction.references.reference_maps import read_variance
+from miricigale.utils.arrays import is_inside
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats, without_mask
 from miricigale.utils.options import check_positive, check_shape, check_that
@@ -417,7 +418,7 @@ def _cut_again(events, threshold, usable, n_diff, showers):
     for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         y = large[:, 0] + dy
         x = large[:, 1] + dx
-        inside = (y >= 0) & (y < ny) & (x >= 0) & (x < nx)
+        inside = is_inside(x, y, (ny, nx))
         inside[inside] = usable[y[inside], x[inside]]
         pixels.append(y[inside] * nx + x[inside])
         cuts.append(cut[inside])

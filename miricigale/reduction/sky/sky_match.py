@@ -4,6 +4,7 @@ import numpy as np
 
 from miricigale.reduction.images.images import check_images, plain_mask, with_data
 from miricigale.reduction.mosaic.mosaic import pixel_maps_of
+from miricigale.utils.arrays import is_inside
 from miricigale.utils.named_values import without_none
 
 # pixels of the grid that are averaged before images are compared
@@ -105,7 +106,7 @@ def _means(im, pixels, shape):
     good = ~plain_mask(im) & np.isfinite(x) & np.isfinite(y)
     column = np.floor((x[good] + 0.5) / _CELL).astype(int)
     row = np.floor((y[good] + 0.5) / _CELL).astype(int)
-    inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
+    inside = is_inside(column, row, (ny, nx))
     cell = (row * nx + column)[inside]
     if not cell.size:
         return cell, np.empty(0)

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import distance_transform_edt
 
+from miricigale.utils.arrays import nans
 from miricigale.utils.values import value_class
 
 #: Clipping of a box, in standard deviations, and what it leaves of that of a Gaussian.
@@ -243,7 +244,7 @@ def _filtered(values, size):
     window = np.lib.stride_tricks.sliding_window_view(padded, (size, size))
     window = window.reshape(values.shape + (-1,))
     valid = np.isfinite(values) | (np.isfinite(window).sum(axis=-1) >= 3)
-    out = np.full(values.shape, np.nan)
+    out = nans(values.shape)
     out[valid] = np.nanmedian(window[valid], axis=-1)
     return out
 

@@ -15,7 +15,7 @@ from miricigale.refdata.libraries.table import LibraryTable, verify_library, wri
 from miricigale.refdata.lookup import data_folder, file_sha256, record_path, stored_record
 from miricigale.refdata.registry import resource
 from miricigale.utils.exceptions import DataError, data_error
-from miricigale.utils.files import PARTIAL, replacing
+from miricigale.utils.files import PARTIAL, make_folder, replacing
 from miricigale.utils.options import check_names
 from miricigale.utils.progress import progress
 
@@ -166,7 +166,7 @@ def _installing(target):
     """
     record_file = record_path(target)
     record = {}
-    target.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(target.parent)
     lock = FileLock(target.with_name(f".{target.name}.lock"))
     with lock, contextlib.ExitStack() as last, replacing(target) as partial:
         # no other process writes: these are left over from ones that were interrupted

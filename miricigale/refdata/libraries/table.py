@@ -11,8 +11,8 @@ from astropy.table import Table
 from miricigale.utils.arrays import middles
 from miricigale.utils.caching import cached_property
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import cached_by_file, open_fits
-from miricigale.utils.named_values import convert_values, subset
+from miricigale.utils.files import cached_by_file, make_folder, open_fits
+from miricigale.utils.named_values import convert_values, first_value, subset
 from miricigale.utils.options import check_data, check_shape, check_that
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, is_ascending, to_array
@@ -112,7 +112,7 @@ class LibraryTable:
     @property
     def n_rows(self):
         """Number of spectra of each kind."""
-        return len(next(iter(self.spectra.values())))
+        return len(first_value(self.spectra))
 
     @cached_property
     def levels(self):
@@ -247,7 +247,7 @@ def write_library(library, path):
         else:
             arrays[_extension(name)] = u.Quantity(array, unit, copy=False)
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     text |= {"name": library.name, "meta": library.meta}
     write_parts(path, _LAYOUT, text=text, arrays=arrays, tables={"ROWS": rows}, overwrite=True)
 

@@ -18,7 +18,7 @@ from miricigale.plotting.axes import (
     panels,
 )
 from miricigale.plotting.comparison import plot_error_function, plot_offsets, plot_relation
-from miricigale.utils.arrays import middles
+from miricigale.utils.arrays import finite_values, middles
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.labels import band_label, band_title, by_wavelength
 from miricigale.workflow.stages.conditions import has_flag
@@ -32,7 +32,7 @@ def magnitude_figure(table, bands):
     figure, axes = panels(bands, height=3.3, **_SHARED)
     true = {name: ab_magnitude(table[f"{name}_true"]) for name in bands}
     measured = {name: ab_magnitude(table[name]) for name in bands}
-    magnitudes = np.concatenate([values[np.isfinite(values)] for values in true.values()])
+    magnitudes = np.concatenate([finite_values(values) for values in true.values()])
     high = magnitudes.max(initial=20) + 1.5
     for name, ax in axes.items():
         ax.plot(true[name], measured[name], ".", ms=3.5, color=MEASURED, alpha=0.7)
@@ -135,7 +135,7 @@ def limit_figure(entries):
     ):
         if np.any(rows & np.isfinite(proposal)):
             ax.plot(wave[rows], proposal[rows], "D", color="0.35", mfc=fill, label=label)
-    shown = np.concatenate([limits[np.isfinite(limits)] for limits in values.values()])
+    shown = np.concatenate([finite_values(limits) for limits in values.values()])
     low = 20
     high = 26
     if shown.size:
@@ -178,7 +178,7 @@ def point_figure(points, bands):
     """Draw measured over true flux of the bright point sources of each band; triangles lie beyond."""
     figure, [[ax]] = new_figure(size=(WIDTH, 3.2))
     ratios = [(points[n]["flux"] / points[n]["flux_true"]).to_value(u.one) for n in bands]
-    finite = np.concatenate([ratio[np.isfinite(ratio)] for ratio in ratios])
+    finite = np.concatenate([finite_values(ratio) for ratio in ratios])
     far = 0.0
     if finite.size:
         far = np.percentile(np.abs(finite - 1), 98, method="higher")

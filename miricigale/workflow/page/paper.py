@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.evaluation import Estimate, StudyResults, TruthResults, compare_with_paper
 from miricigale.pages import number, sentence
-from miricigale.utils.named_values import subset
+from miricigale.utils.named_values import first_value, subset
 from miricigale.workflow.labels import texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags, has_flag
 from miricigale.workflow.stages.sample import matched_errors
@@ -23,7 +23,7 @@ def study_results(config, truths, tables, metrics):
     reference first; ``metrics`` are those of the report.
     """
     bands = config.exposures.filters
-    reference = next(iter(tables.values()))
+    reference = first_value(tables)
     # the paper's limits are where the median absolute difference is a fifth of the flux
     errors = matched_errors(
         reference.matched,

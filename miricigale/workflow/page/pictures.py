@@ -12,7 +12,7 @@ from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_
 from miricigale.plotting.images import filled, mark_sky, plot_color, plot_image, plot_model_residual
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.psf.wiener import energy_error
-from miricigale.utils.arrays import middles, peak_index
+from miricigale.utils.arrays import finite_values, middles, peak_index
 from miricigale.utils.positions import middle_pixel
 from miricigale.workflow.labels import band_title
 
@@ -61,7 +61,7 @@ def _zooms(planes, scale):
     size = round(_ZOOM / scale)
     light = 0
     for plane in planes:
-        snr = plane / sigma_mad(plane[np.isfinite(plane)])
+        snr = plane / sigma_mad(finite_values(plane))
         light = light + np.nan_to_num(np.clip(snr, 0, _BRIGHT), nan=-_BRIGHT)
     total = uniform_filter(light, size, mode="constant", cval=-_BRIGHT * len(planes))
     middles = []
@@ -228,7 +228,7 @@ def subtraction_figure(rate, cal, reducer):
     part = _exposed([after])
     before = before[part]
     after = after[part]
-    sources = after > 3 * sigma_mad(after[np.isfinite(after)])
+    sources = after > 3 * sigma_mad(finite_values(after))
     figure, axes = new_figure(1, 3, size=(3.5, 3.5), width_ratios=(1, 1, 0.85))
     last = axes[0, 2]
     scale = _scale(cal)

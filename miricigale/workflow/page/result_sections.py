@@ -12,6 +12,7 @@ from miricigale.evaluation import (
 from miricigale.evaluation.estimates import outlier_share
 from miricigale.filters import Filter
 from miricigale.pages import Missing, number
+from miricigale.utils.named_values import first_value
 from miricigale.workflow.labels import (
     SET_LABELS,
     band_label,
@@ -93,7 +94,7 @@ def _write_examples(page):
         page.text("none")
         return
     if "mass" in page.first.truth.colnames:
-        key = next(iter(keys.values()))
+        key = first_value(keys)
         link = browse(page.first.name, key, key)
         page.figure("spectra", source_figures.spectra_figure(study, key, page.model), source=link)
     truths = [study.at(fraction) for fraction in EXAMPLES]

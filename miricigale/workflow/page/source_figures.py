@@ -8,7 +8,7 @@ from miricigale.filters import Filter
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure, plain_text
 from miricigale.plotting.curves import plot_filters, plot_spectrum
 from miricigale.plotting.posteriors import plot_pdf_2d
-from miricigale.utils.arrays import middles
+from miricigale.utils.arrays import middles, quotient
 from miricigale.utils.units import FNU
 from miricigale.workflow.labels import SET_LABELS, band_label, by_wavelength
 
@@ -168,7 +168,7 @@ def _draw_posteriors(ax, distributions):
         weights = np.asarray(weights, float)
         color, line, _ = _SETS[name]
         width = np.diff(edges)
-        density = np.divide(weights, width, out=np.zeros(width.size), where=width > 0)
+        density = quotient(weights, width)
         # straight lines between the middles of the cells, level to the ends
         density = np.pad(density / max(density.max(), 1e-300), 1, mode="edge")
         place = np.r_[edges[0], middles(edges), edges[-1]]

@@ -23,7 +23,9 @@ from miricigale.pages.browser import (
 )
 from miricigale.plotting.cutouts import Cutouts
 from miricigale.sed.cells import cell_means
+from miricigale.utils.arrays import nans, quotient
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import first_value
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE, ab_magnitude
 from miricigale.workflow.engine.stage import stage
@@ -138,7 +140,7 @@ class _Sources(StudyTables):
         if not self.compared:
             self.compared = list(self.results)[:2]
         # all sets are fitted with the same model
-        fits = next(iter(self.results.values())).first
+        fits = first_value(self.results).first
         self.units = {}
         parameters = []
         for parameter in fits.parameters:
@@ -158,14 +160,14 @@ class _Sources(StudyTables):
         if band in self.miri:
             flux = self.matched[band].to_value(FNU)
             return flux, self.matched[error_column(band)].to_value(FNU)
-        results = next(iter(self.results.values()))
+        results = first_value(self.results)
         k = results.first.filters.index(band)
         flux = self.of_sources(results.of("flux")[:, k])
         return flux, self.of_sources(results.of("flux_err")[:, k])
 
     def of_sources(self, values):
         """Return values of the rows of the fits as values of the sources, NaN without a fit."""
-        out = np.full(len(self.truth), np.nan)
+        out = nans(len(self.truth))
         out[self.sampled] = values
         return out
 
@@ -198,8 +200,7 @@ class _Sources(StudyTables):
             columns[f"chi2_{unit}"] = self.of_sources(fits["reduced_chi2"])
         for band in self.miri:
             flux, error = self._measured(band)
-            unknown = np.full(len(flux), np.nan)
-            columns[f"sn_{band}"] = np.divide(flux, error, out=unknown, where=error > 0)
+            columns[f"sn_{band}"] = quotient(flux, error, np.nan)
             digits[f"sn_{band}"] = 3
         for key in ("n_detected", "selection", "association"):
             columns[key] = matched[key]

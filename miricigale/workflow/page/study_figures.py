@@ -32,7 +32,9 @@ from miricigale.plotting.axes import (
     plain_text,
 )
 from miricigale.plotting.comparison import plot_offsets, plot_redshifts
+from miricigale.utils.arrays import finite_values, quiet_division, quotient
 from miricigale.utils.missing_values import floats
+from miricigale.utils.named_values import first_value
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.labels import (
     SET_LABELS,
@@ -136,7 +138,7 @@ def histogram_figure(study, quantity):
         inside = (truth.true("redshift") >= low) & (truth.true("redshift") < high)
         for k, (name, label) in enumerate(_main_sets(truth).items()):
             sample = values(truth, name)[inside]
-            sample = sample[np.isfinite(sample)]
+            sample = finite_values(sample)
             color = STYLES[k][0]
             ax.hist(np.clip(sample, *ends), bins, label=label, histtype="step", color=color, lw=1.6)
             if sample.size:
@@ -164,7 +166,7 @@ def histogram_figure(study, quantity):
         # space for the numbers
         ax.set(xlim=(bins[0], bins[-1]), ylim=(0, 1.3 * ax.get_ylim()[1]))
     label_outer(axes, xlabel, "sources")
-    handles = next(iter(axes.values())).get_legend_handles_labels()
+    handles = first_value(axes).get_legend_handles_labels()
     figure.legend(*handles, loc="outside upper left", ncols=3, fontsize=8, frameon=False)
     return figure
 
@@ -193,7 +195,7 @@ def disk_figure(study):
         if "all" not in truth.fits or "accretion_power" not in truth.truth.colnames:
             continue
         error = truth.power_error("all")
-        error = error[np.isfinite(error)]
+        error = finite_values(error)
         if error.size:
             true = truth.truth["accretion_power"][truth.sample].to_value(unit)
             fitted = truth.fits["all"]["accretion_power_mean"].to_value(unit)
@@ -351,7 +353,7 @@ def class_figure(tables):
         table = table[table["n"] > 0]
         counts = np.transpose([table[name] for name in classes])
         total = counts.sum(axis=1, keepdims=True)
-        share = np.divide(counts, total, out=np.zeros(counts.shape), where=total > 0)
+        share = quotient(counts, total)
         ax.imshow(share, cmap="Oranges", vmin=0, vmax=1.2, aspect="auto")
         for (i, j), value in np.ndenumerate(share):
             text = f"{100 * value:.0f} %\n{counts[i, j]}"
@@ -379,7 +381,7 @@ def band_residuals(results, bands):
         flux = results.of("flux")[:, k]
         error = results.of("flux_err")[:, k]
         model = results.of("best_flux")[:, k]
-        with np.errstate(invalid="ignore", divide="ignore"):
+        with quiet_division():
             good = (flux > 5 * error) & (model > 0)
             ratio = np.where(good, flux / model, 1.0)
         out[band] = np.where(good, -2.5 * np.log10(ratio), np.nan)
@@ -428,7 +430,7 @@ def rank_figure(ranks):
     for label, ax in axes.items():
         n_max = 0
         for k, (name, values) in enumerate(by_name[label].items()):
-            n, edges = np.histogram(values[np.isfinite(values)], _RANK_BINS, (0, 1))
+            n, edges = np.histogram(finite_values(values), _RANK_BINS, (0, 1))
             n_max = max(n_max, n.sum())
             ax.stairs(
                 n * _RANK_BINS / max(n.sum(), 1),

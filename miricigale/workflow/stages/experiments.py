@@ -7,6 +7,7 @@ from miricigale.evaluation import photoz_metrics, recovery_metrics
 from miricigale.evaluation.coverage import interval_share
 from miricigale.fitting import GridSettings
 from miricigale.photometry.errors.error_model import HERSCHEL_DEPTHS
+from miricigale.utils.arrays import finite_values, nans, quiet_division
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import convert_values
 from miricigale.workflow.derived import rows_of
@@ -119,7 +120,7 @@ def ranked_table(results, sample, seed):
     """Return the table of results with the ranks of the true values (``<name>_rank``), for coverage."""
     table = results.to_table()
     for name in RANKED:
-        rank = np.full(len(table), np.nan)
+        rank = nans(len(table))
         # at known redshifts they have no odds
         if len(table) and (name != "redshift" or "redshift_odds" in table.colnames):
             rank = true_ranks(results, sample, name, seed)
@@ -151,10 +152,10 @@ def experiment_numbers(sample, table):
     photoz = photoz_metrics(true["redshift"], table["redshift_mean"])
     fraction = recovery_metrics(true["frac_agn"], table["frac_agn_mean"])
     width = floats(table["frac_agn_std"])
-    width = width[np.isfinite(width)]
-    power = np.full(len(true), np.nan)
+    width = finite_values(width)
+    power = nans(len(true))
     if "accretion_power" in true.colnames and "accretion_power_mean" in table.colnames:
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with quiet_division():
             power = np.log10(table["accretion_power_mean"] / true["accretion_power"]).value
     power = recovery_metrics(np.zeros(power.size), power)
     numbers = {

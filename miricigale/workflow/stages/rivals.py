@@ -7,6 +7,7 @@ from astropy.table import QTable, vstack
 from miricigale import photometry
 from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_metrics
 from miricigale.evaluation.estimates import median
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.missing_values import floats
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.engine.stage import stage
@@ -159,7 +160,7 @@ def rival_numbers(tables):
                 flux = table[method].value[rows]
                 error = table[error_column(method)].value[rows]
                 ratio = recovery_metrics(true, flux, relative=True)
-                with np.errstate(invalid="ignore", divide="ignore"):
+                with quiet_division():
                     pulls = recovery_metrics(np.zeros(true.size), (flux - true) / error)
                 row = {
                     "band": band,

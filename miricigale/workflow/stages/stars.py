@@ -6,6 +6,7 @@ from astropy.modeling.models import BlackBody
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet
+from miricigale.utils.arrays import quiet_division
 from miricigale.utils.named_values import places
 
 TEMPERATURES = np.geomspace(2000, 30000, 120) * u.K
@@ -31,7 +32,7 @@ def star_fluxes(catalog, measured, wanted):
     data = np.array([catalog[name].to_value(u.uJy) for name in measured]).T
     good = np.isfinite(data) & (data > 0)
     # least squares in the logarithm: equal relative errors, the scale is the mean ratio
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with quiet_division():
         ratio = np.where(good[:, None], np.log(data[:, None] / models[None][:, :, fitted]), 0.0)
     count = np.maximum(good.sum(axis=1), 1)[:, None]
     scale = ratio.sum(axis=2) / count

@@ -7,6 +7,7 @@ from astropy.stats import biweight_scale
 from miricigale import psf, scene
 from miricigale.evaluation import Estimate, match_truth
 from miricigale.photometry.errors.error_curves import limiting_flux, measured_curve
+from miricigale.utils.arrays import finite_values, quiet_division
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.derived import changed_config
@@ -146,13 +147,13 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
                 curves.append(curve)
                 off = (flux - true)[sample]
                 measures[name][k] = _measures(curve, off[faint[sample]])
-            with np.errstate(divide="ignore", invalid="ignore"):
+            with quiet_division():
                 detected = flux > 5 * curves[0].sigma(flux)
             # the images of the study, by rates too
             reference_name = STUDY
             if RATES in tables and name not in (STUDY, RATES):
                 reference_name = RATES
-            with np.errstate(divide="ignore", invalid="ignore"):
+            with quiet_division():
                 change = measures[name] - measures[reference_name]
                 change[:, 1] /= measures[reference_name][:, 1]
             if name == reference_name:
@@ -179,7 +180,7 @@ def _measures(curve, faint):
 
 def _half_width(draws):
     """Return half of the central 68 % of draws; NaN where there are none that are finite."""
-    draws = draws[np.isfinite(draws)]
+    draws = finite_values(draws)
     if draws.size == 0:
         return np.nan
     low, high = np.percentile(draws, [15.865, 84.135])
