@@ -236,19 +236,12 @@ class AGNSurvey:
             "agn_probability": _agn_probability(draws.probability, first),
             "agn_probability_shipped": _agn_probability(shipped, first),
         }
-        columns = {"id": sample.ids, "used": sample.used, "selected": sample.selected}
-        for name, values in probability.items():
-            columns[name] = nans(len(sample))
-            columns[name][sample.used] = values
-        columns |= {"redshift": sample.redshift, "log_luminosity": sample.log_luminosity}
-        texts = declared("miricigale.agn", "columns.toml")["sources"]
-        sources = described_columns(columns, texts)
+        sources = _table_of_sources(sample, probability)
         selected = sample.selected & sample.used
         pure = {}
         for name in probability:
-            pure[name] = self._counts(
-                sample.redshift, sample.log_luminosity, selected, np.nan_to_num(columns[name])
-            )
+            weight = np.nan_to_num(np.asarray(sources[name]))
+            pure[name] = self._counts(sample.redshift, sample.log_luminosity, selected, weight)
         numbers = SampleNumbers(
             bins=bins,
             limit=self.limit,
@@ -264,20 +257,29 @@ class AGNSurvey:
             injected=self._injected_counts(injected),
             seed=self.seed,
         )
-        meta = {"area_deg2": float(self.area), "limit": self.limit, "seed": self.seed}
-        meta |= {"n_all": len(sample), "n_used": int(sample.used.sum())}
-        meta |= {"classes": list(sample.tables)}
-        meta |= {"n_most": injections.n_most, "completeness_error": self.completeness_error}
-        meta |= {"injected_models": injections.n_models}
-        meta |= {"photon_noise": injections.photon_noise()}
         return AGNResult(
             numbers=numbers.by_luminosity(),
             totals=numbers.totals(),
             prior=prior_table(bins, prior, draws, all_redshifts),
             sources=sources,
             injected=injected,
-            meta=meta,
+            meta=self._meta(sample, injections),
         )
+
+    def _meta(self, sample, injections):
+        """Return what the result says of its making."""
+        return {
+            "area_deg2": float(self.area),
+            "limit": self.limit,
+            "seed": self.seed,
+            "n_all": len(sample),
+            "n_used": int(sample.used.sum()),
+            "classes": list(sample.tables),
+            "n_most": injections.n_most,
+            "completeness_error": self.completeness_error,
+            "injected_models": injections.n_models,
+            "photon_noise": injections.photon_noise(),
+        }
 
     def _injected_counts(self, injected):
         """Injected AGN by redshift and luminosity: all, and those that count; see `SampleNumbers`."""
@@ -305,6 +307,16 @@ class AGNSurvey:
         if weight is not None:
             weight = weight[chosen]
         return np.bincount(flat, weight, n_z * n_lum).reshape(n_z, n_lum)
+
+
+def _table_of_sources(sample, probability):
+    """Make the table of sources with their probabilities, NaN of those that were not used."""
+    columns = {"id": sample.ids, "used": sample.used, "selected": sample.selected}
+    for name, values in probability.items():
+        columns[name] = nans(len(sample))
+        columns[name][sample.used] = values
+    columns |= {"redshift": sample.redshift, "log_luminosity": sample.log_luminosity}
+    return described_columns(columns, declared("miricigale.agn", "columns.toml")["sources"])
 
 
 def _agn_probability(probability, first):

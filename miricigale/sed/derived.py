@@ -35,6 +35,21 @@ DERIVED = {
     for name, entry in declared("miricigale.sed", "derived.toml")["quantities"].items()
 }
 
+
+def model_columns(agn, xray):
+    """
+    Return the derived quantities that come with every evaluation of a model: `Derived` by name.
+
+    ``agn`` says whether it has an AGN, ``xray`` is its component of that role, or None.
+    """
+    columns = {name: entry for name, entry in DERIVED.items() if agn or entry.of != "agn"}
+    if xray is not None:
+        for name, (unit, text) in xray.columns.items():
+            # the relation is not linear: it is worked out after scaling
+            columns[name] = Derived(unit, text, False, "xray")
+    return columns
+
+
 _LOG_UV = np.log10(np.mean(UV_WINDOWS, axis=1))
 _BAND = {name: i for i, name in enumerate(COLOR_BANDS)}
 

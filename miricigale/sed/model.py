@@ -17,7 +17,7 @@ from miricigale.sed.component import (
     read_config,
 )
 from miricigale.sed.cosmology import COSMOLOGY
-from miricigale.sed.derived import DERIVED, Derived
+from miricigale.sed.derived import model_columns
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import default_values, parameter_table
@@ -382,12 +382,7 @@ class SEDModel(Interactive):
         columns : dict of str to `~miricigale.sed.Derived`
             Unit and description by name.
         """
-        columns = {n: entry for n, entry in DERIVED.items() if self.has_agn or entry.of != "agn"}
-        if xray := self.component("xray"):
-            for name, (unit, text) in xray.columns.items():
-                # the relation is not linear: it is worked out after scaling
-                columns[name] = Derived(unit, text, False, "xray")
-        return columns
+        return model_columns(self.has_agn, self.component("xray"))
 
     def __getstate__(self):
         state = self.__dict__.copy()
