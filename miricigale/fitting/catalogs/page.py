@@ -106,7 +106,8 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None, browser=
         # fits of stars and quasars with galaxies say nothing about the fit
         numbers = numbers[np.isin(columns["class"], ["galaxy", ""])]
     subtitle = f"{len(results)} objects, {len(numbers.meta['filters'])} bands"
-    report = Page(f"Fits of {Path(path).name}", subtitle=subtitle)
+    title = f"Fits of {Path(path).name}"
+    report = Page(title, subtitle=subtitle)
     page = SectionWriter(report, declared("miricigale.fitting"))
     if step > 1:
         page.notice("thinned", step=step, n=len(all_numbers))
@@ -116,13 +117,8 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None, browser=
     _summary(page, numbers)
     curves = fitted_curves(next(iter(results.parts())))
     if browser is not None and len(all_numbers):
-        title = f"Fits of {Path(path).name}"
         name = write_browser(browser, title, results, all_numbers, curves, step=step)
-        step_of_page = step * browser_step(len(all_numbers))
-        shown = "all objects"
-        if step_of_page > 1:
-            shown = f"one object in {step_of_page}"
-        page.text("browser", browser=Link("one by one", name), shown=shown)
+        _link(page, name, step * browser_step(len(all_numbers)))
     if columns is not None:
         classes_section(page, columns, list(classes), all_numbers["ids"])
     _redshifts(page, with_redshift, text)
@@ -133,6 +129,14 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None, browser=
     _left_out(page, rows, all_numbers)
     _settings(page, results)
     return page.report
+
+
+def _link(page, name, step):
+    """Link the page of single objects, which has one in ``step``."""
+    shown = "all objects"
+    if step > 1:
+        shown = f"one object in {step}"
+    page.text("browser", browser=Link("one by one", name), shown=shown)
 
 
 def _of_classes(numbers, columns):

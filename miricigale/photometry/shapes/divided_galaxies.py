@@ -93,9 +93,41 @@ def _groups(models, sources, is_source, links):
             group = groups[k]
             linked_group = groups[rows[linked]]
             if group is not linked_group:
-                group.extend(linked_group)
-                groups.update(dict.fromkeys(linked_group, group))
+                _merge(groups, group, linked_group)
     return [sorted(group) for k, group in groups.items() if len(group) > 1 and min(group) == k]
+
+
+def linked_groups(links, n, largest):
+    """
+    Join rows to groups by links between them, the strongest first.
+
+    Parameters
+    ----------
+    links : iterable of (float, int, int)
+        What they are sorted by, ascending, and the two rows.
+    n : int
+        Number of rows.
+    largest : int
+        Most rows of a group.
+
+    Returns
+    -------
+    groups : list of list of int
+        Those of several rows.
+    """
+    groups = {k: [k] for k in range(n)}
+    for _, row, neighbor in sorted(links):
+        group = groups[row]
+        neighbor_group = groups[neighbor]
+        if group is not neighbor_group and len(group) + len(neighbor_group) <= largest:
+            _merge(groups, group, neighbor_group)
+    return [group for k, group in groups.items() if len(group) > 1 and group[0] == k]
+
+
+def _merge(groups, group, other_group):
+    """Add the rows of a group to another one, and to what each row is in."""
+    group.extend(other_group)
+    groups.update(dict.fromkeys(other_group, group))
 
 
 def reaching_over(models, sources, segments, variance, is_source):

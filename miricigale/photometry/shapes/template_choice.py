@@ -14,6 +14,7 @@ from miricigale.photometry.shapes.divided_galaxies import (
     continued_groups,
     divided,
     joined_groups,
+    linked_groups,
     padded,
     reaching_over,
 )
@@ -397,15 +398,9 @@ class _Lights:
             return self._links(k, models[k], sources[k][0], rows)
 
         links_of_rows = parallel_map(links, range(len(models)), executor=self.executor)
-        groups = {k: [k] for k in range(len(models))}
-        # the strongest first; from groups that would be too large light is taken off
-        for _, row, neighbor in sorted(itertools.chain.from_iterable(links_of_rows)):
-            group = groups[row]
-            neighbor_group = groups[neighbor]
-            if group is not neighbor_group and len(group) + len(neighbor_group) <= _MAX_JOINT:
-                group.extend(neighbor_group)
-                groups.update(dict.fromkeys(neighbor_group, group))
-        joint_groups = [group for k, group in groups.items() if len(group) > 1 and group[0] == k]
+        # from groups that would be too large light is taken off
+        all_links = itertools.chain.from_iterable(links_of_rows)
+        joint_groups = linked_groups(all_links, len(models), _MAX_JOINT)
         sum_of_all = self._paint(models)
 
         def fit(group):
@@ -545,14 +540,20 @@ class _Lights:
             return new
         # is the profile as good as the image in the core?
         core = is_own & self.core[stamp]
-        n = np.count_nonzero(core)
         if self.select:
+            n = np.count_nonzero(core)
             # chi^2 of the profile on the core beyond that of noise
             residual = (data - new.image)[core]
             excess = np.sum(residual**2 / self.variance[stamp][core]) - n
             if excess < _EXCESS * np.sqrt(2 * max(n, 1)):
                 return dataclasses.replace(new, is_profile=True)
-        # the image in the core, the profile beyond, scaled to what is seen
+        return self._with_image(new, data, weight, core)
+
+    def _with_image(self, new, data, weight, core):
+        """Return a model whose template is the image in the core, beyond it the profile as far as it is seen."""
+        stamp = new.stamp
+        shape = new.shape
+        corner = rectangle_corner(stamp)
         profile = self._profile(shape, corner, light=shape.flux)
         origin = np.subtract(profile.origin, corner[::-1])
 
@@ -562,7 +563,7 @@ class _Lights:
         scale, outer, image = adjust_wings(
             profile.data,
             shape.semi_major(profile.data.shape, origin),
-            max(np.sqrt(n / (np.pi * shape.axes[1])), 2.0),
+            max(np.sqrt(np.count_nonzero(core) / (np.pi * shape.axes[1])), 2.0),
             convolve=convolve,
             data=data,
             weight=np.where(core, 0.0, weight),
