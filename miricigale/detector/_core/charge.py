@@ -354,11 +354,13 @@ def couple_neighbors(ramp, kernel):
     n_int, n_group, n_row, n_col = ramp.shape
     padded = np.empty((n_row + 2, n_col + 2), np.float32)
     for i, g in np.ndindex(n_int, n_group):
-        padded[1:-1, 1:-1] = ramp[i, g]
-        padded[0, 1:-1] = ramp[i, g, 0]
-        padded[-1, 1:-1] = ramp[i, g, -1]
-        padded[:, 0] = padded[:, 1]
-        padded[:, -1] = padded[:, -2]
+        # in loops: copies of whole arrays take seconds to compile, for their message of other shapes
+        for r in range(n_row + 2):
+            row = min(max(r - 1, 0), n_row - 1)
+            padded[r, 0] = ramp[i, g, row, 0]
+            for x in range(n_col):
+                padded[r, x + 1] = ramp[i, g, row, x]
+            padded[r, n_col + 1] = ramp[i, g, row, n_col - 1]
         for r in range(n_row):
             for x in range(n_col):
                 total = np.float32(0.0)

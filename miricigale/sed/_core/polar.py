@@ -141,7 +141,8 @@ def add_polar(grid, face_on, disk, dust, ebv, temperature, beta, share, dims_dis
             polar = share * lost / body
             total += share * lost
     else:
-        parts[0] = disk
+        for i in range(n):
+            parts[0, i] = disk[i]
     if not total > 0.0:
         return parts, power, total
     norm = 1.0 / total
