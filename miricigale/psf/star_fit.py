@@ -89,34 +89,24 @@ class FittedStar:
     """
 
     def __init__(self, star, offset, images, slope):
-        half = len(images) // 2
+        at, light, dx, dy, *terms = _splines_at(star, offset, images)
+        light = light + (slope @ star.place) @ terms[:_SLOPED]
+        columns, weight, solution = _solution(star, light, dx, dy)
         use = np.isfinite(star.sigma)
         data = star.data[use]
         sigma = star.sigma[use]
-        x = star.u[use] - offset[0]
-        y = star.v[use] - offset[1]
-        at = (y + half, x + half)
-        light, dx, dy, *terms = _core.cubic_splines(images, *at)
-        light = light + (slope @ star.place) @ terms[:_SLOPED]
-        columns = star.area * np.stack([light, -dx, -dy, np.ones_like(x)], axis=1)
-        weight = 1.0 / sigma
-        for _ in range(2):
-            solution = np.linalg.lstsq(columns * weight[:, None], data * weight)[0]
-            weight = 1.0 / np.hypot(sigma, _SCATTER * solution[0] * columns[:, 0])
         flux = solution[0]
-        # the shifts are in units of the flux; steps are of a cell at most
-        shift = solution[1:3] / (flux if flux > 0 else np.inf)
         self.star = star
         self.at = at
         self.flux = flux
         self.weight = weight
-        self.offset = offset + np.clip(shift, -1, 1)
+        self.offset = offset + _shift(solution)
         self.residual = data - columns @ solution
         #: What a change of the PSF by 1 is in each weighted pixel.
         self.scale = flux * star.area * weight
         self._basis = np.linalg.qr(columns * weight[:, None])[0]
         self._open_residual = self._without_own(self.residual * weight)
-        sloped = np.multiply.outer(star.place, terms[:_SLOPED]).reshape(-1, x.size)
+        sloped = np.multiply.outer(star.place, terms[:_SLOPED]).reshape(-1, data.size)
         self.columns = self._without_own((self.scale * np.concatenate([terms, sloped])).T)
         self.normal = self.columns.T @ self.columns
         self.right = self.columns.T @ self._open_residual
@@ -144,7 +134,48 @@ class FittedStar:
         return float(np.sum(self._without_own(self._open_residual - change) ** 2))
 
 
-def fitted_stars(psf, stars, *, slope=None, offsets=None):
+def _splines_at(star, offset, images):
+    """Return the places of a star's pixels that count, (2, n), and splines of images (ny, nx, k) there."""
+    half = len(images) // 2
+    use = np.isfinite(star.sigma)
+    at = (star.v[use] - offset[1] + half, star.u[use] - offset[0] + half)
+    return at, *_core.cubic_splines(images, *at)
+
+
+def _solution(star, light, dx, dy):
+    """Fit flux, flux times shifts, and background: columns (n, 4) of the fit, weights of pixels, solution (4,)."""
+    use = np.isfinite(star.sigma)
+    data = star.data[use]
+    sigma = star.sigma[use]
+    columns = star.area * np.stack([light, -dx, -dy, np.ones_like(light)], axis=1)
+    weight = 1.0 / sigma
+    for _ in range(2):
+        solution = np.linalg.lstsq(columns * weight[:, None], data * weight)[0]
+        weight = 1.0 / np.hypot(sigma, _SCATTER * solution[0] * columns[:, 0])
+    return columns, weight, solution
+
+
+def _shift(solution):
+    """Return the shift of a star's center in cells, one at most, (2,)."""
+    flux = solution[0]
+    # the shifts are in units of the flux
+    shift = solution[1:3] / (flux if flux > 0 else np.inf)
+    return np.clip(shift, -1, 1)
+
+
+def _moved(star, offset, images, slope):
+    """
+    Return the offset of a star's center after a step, as `FittedStar` has it, and nothing else.
+
+    ``images`` are the first of its own, without changes by terms if ``slope`` is zero.
+    """
+    _, light, dx, dy, *terms = _splines_at(star, offset, images)
+    if terms:
+        light = light + (slope @ star.place) @ terms
+    return offset + _shift(_solution(star, light, dx, dy)[-1])
+
+
+def fitted_stars(psf, stars, *, slope=None, offsets=None, steps=_STEPS):
     """
     Fit stars one by one.
 
@@ -157,7 +188,9 @@ def fitted_stars(psf, stars, *, slope=None, offsets=None):
     slope : `~numpy.ndarray`, shape (3, 2), optional
         How the first of `TERMS` change over the field.
     offsets : sequence of `~numpy.ndarray`, optional
-        Where their centers stand, for one step from there; by default steps from the catalog positions.
+        Where their centers stand at first; by default at the catalog positions.
+    steps : int, optional
+        Number of steps of each center.
 
     Returns
     -------
@@ -168,15 +201,18 @@ def fitted_stars(psf, stars, *, slope=None, offsets=None):
     images = np.stack([spline_filter(image) for image in images], axis=-1)
     if slope is None:
         slope = np.zeros((_SLOPED, 2))
-    steps = 1
     if offsets is None:
-        steps = _STEPS
         offsets = np.zeros((len(stars), 2))
-    for _ in range(steps):
-        fits = []
-        for star, offset in zip(stars, offsets, strict=True):
-            fits.append(FittedStar(star, offset, images, slope))
-        offsets = [fit.offset for fit in fits]
+    # all steps but the last need the light and its derivatives alone
+    n_images = 3
+    if slope.any():
+        n_images += _SLOPED
+    first_images = np.ascontiguousarray(images[..., :n_images])
+    fits = []
+    for star, offset in zip(stars, offsets, strict=True):
+        for _ in range(steps - 1):
+            offset = _moved(star, offset, first_images, slope)
+        fits.append(FittedStar(star, offset, images, slope))
     return fits
 
 
@@ -304,8 +340,8 @@ class StarPSF:
         """Changes of the first terms over the field, shape (3, 2)."""
         return self._state[len(TERMS) :].reshape(2, _SLOPED).T
 
-    def _fitted(self, stars, offsets=None):
-        return fitted_stars(self.at(), stars, slope=self.slope, offsets=offsets)
+    def _fitted(self, stars, offsets=None, steps=_STEPS):
+        return fitted_stars(self.at(), stars, slope=self.slope, offsets=offsets, steps=steps)
 
     def _solved(self, units, k):
         """Fit the first k terms: the stars, steps of terms where each is left out, covariance of `TERMS`."""
@@ -319,8 +355,14 @@ class StarPSF:
             inverse[fitted_terms] = np.linalg.inv((normal + prior)[fitted_terms])
             return inverse @ (right - prior @ self._state)
 
-        for last in np.arange(_STEPS + 1) == _STEPS:
-            fits = self._fitted(units, offsets)
+        n_rounds = _STEPS + 1
+        steps = 1
+        if k == 0:
+            # nothing that the stars have in common changes between the steps
+            n_rounds = 1
+            steps = _STEPS + 1
+        for last in np.arange(n_rounds) == n_rounds - 1:
+            fits = self._fitted(units, offsets, steps)
             offsets = [fit.offset for fit in fits]
             normal = sum(fit.normal for fit in fits)
             right = sum(fit.right for fit in fits)
