@@ -11,6 +11,8 @@ import matplotlib.pyplot as plt
 import pytest
 
 from miricigale.fitting.grid import model_tables
+from miricigale.fitting.grid.part_tables import MAX_MODELS, TOLERANCE, PartAxes
+from miricigale.sed import presets
 
 DOCS = Path(__file__).parents[1] / "docs"
 BUILT = {"_build", "changes", "how_to", "tutorials", "api", "sg_execution_times.rst"}
@@ -40,6 +42,7 @@ SMALLER = {
     "tutorials/by_hand": {"n_groups=60, n_integrations=2": "n_groups=20, n_integrations=1"},
     "tutorials/large_catalogs": {"n = 240": "n = 80", "chunk_rows=60": "chunk_rows=20"},
 }
+ALL_AXES = presets._values
 SUBPACKAGES = ("filters", "sed", "scene", "detector", "reduction", "photometry", "fitting")
 
 
@@ -65,16 +68,31 @@ def code_of(text):
             indent, options = len(line) - len(bare), True
 
 
+def few_redshifts(name):
+    """Axes of a preset, with every fourth of many redshifts."""
+    axes = ALL_AXES(name)
+    if len(axes.get("redshift", ())) > 40:
+        axes["redshift"] = axes["redshift"][::4]
+    return axes
+
+
+def coarse_part(axes, evaluate, refuses, n=MAX_MODELS, tolerance=TOLERANCE, powers=None):
+    """A table of models with ten times the error between its nodes."""
+    return PartAxes(axes, evaluate, refuses, n, 10 * tolerance, powers)
+
+
 @pytest.mark.slow
 @pytest.mark.pictures
 @pytest.mark.parametrize("path", SCRIPTS, ids=name_of)
 def test_example_runs_and_draws(path, tmp_path, monkeypatch):
-    """With the calls of the page, where these take long of fewer sources, and of models at fewer redshifts."""
+    """With the calls of the page, where these take long of fewer sources, and of fewer models."""
     folder = tmp_path / "work"
     folder.mkdir()
     monkeypatch.chdir(folder)
     monkeypatch.setattr(plt, "show", lambda: None)
     monkeypatch.setattr(model_tables, "REDSHIFT_STEP", 0.05)
+    monkeypatch.setattr(model_tables, "PartAxes", coarse_part)
+    monkeypatch.setattr(presets, "_values", few_redshifts)
     text = path.read_text(encoding="utf-8")
     for number, smaller in SMALLER.get(str(path.relative_to(EXAMPLES).with_suffix("")), {}).items():
         assert number in text
