@@ -108,28 +108,32 @@ def _limit(u):
 
 
 @njit(**PART)
-def _mixed(u, wrong, i):
+def _mixed(u, p):
     """
-    `_limit`, of one that is wrong with the prior probability wrong[i]: (1 - p) P + p.
+    `_limit`, of one that is wrong with a prior probability p > 0, in the precision of u: (1 - p) P + p.
 
     It is not convex, and where it is not no second derivative is returned, so that steps are of the detections.
     """
-    if wrong is None:
-        return _limit(u)
     first, second, third, factor, exponent = _limit(u)
     real = type(u)
     zero = real(0.0)
     unity = real(1.0)
-    p = real(wrong[i])
     good = (unity - p) * factor * exponential(max(exponent, real(-80.0)))
-    may_be_wrong = p > zero
-    total = good + p if may_be_wrong else unity
-    share = good / total if may_be_wrong else unity
+    total = good + p
+    share = good / total
     second = share * (second - (unity - share) * first * first)
-    return (
-        share * first, max(second, zero), third if share == unity else zero,
-        total if may_be_wrong else factor, zero if may_be_wrong else exponent,
-    )  # fmt: skip
+    return share * first, max(second, zero), third if share == unity else zero, total, zero
+
+
+@njit(**PART)
+def _add_limit(terms, i, m, derivatives):
+    """Add what `_limit` or `_mixed` returned to the sums of lane i, whose flux over its error is m for scale 1."""
+    first, second, third, factor, exponent = derivatives
+    terms[_G + i] += first * m
+    terms[_D + i] += second * m * m
+    terms[_H + i] += third * m * m * m
+    terms[_PRODUCT + i] *= factor
+    terms[_SUM + i] += exponent
 
 
 @njit(**PART)
@@ -169,7 +173,10 @@ def limited_scale(p, q, limits):
             m = limits.slope[i]
             u = s * m - limits.level[i]
             if u > _NOTHING:
-                first, second, third, factor, exponent = _mixed(u, limits.wrong, i)
+                if limits.wrong[i] > 0.0:
+                    first, second, third, factor, exponent = _mixed(u, limits.wrong[i])
+                else:
+                    first, second, third, factor, exponent = _limit(u)
                 g += first * m
                 d += second * m * m
                 h += third * m * m * m
@@ -215,14 +222,15 @@ def _best_scales(buffer, work, terms, limit, c, level, wrong, reference, close):
             galaxy = limit[j]
             agn = limit[n + j]
             top = real(level[j])
-            for i in range(BLOCK):
-                m = galaxy[i] + ratio * agn[i]
-                first, second, third, factor, exponent = _mixed(terms[_S + i] * m - top, wrong, j)
-                terms[_G + i] += first * m
-                terms[_D + i] += second * m * m
-                terms[_H + i] += third * m * m * m
-                terms[_PRODUCT + i] *= factor
-                terms[_SUM + i] += exponent
+            p_wrong = real(wrong[j])
+            if p_wrong > real(0.0):
+                for i in range(BLOCK):
+                    m = galaxy[i] + ratio * agn[i]
+                    _add_limit(terms, i, m, _mixed(terms[_S + i] * m - top, p_wrong))
+            else:
+                for i in range(BLOCK):
+                    m = galaxy[i] + ratio * agn[i]
+                    _add_limit(terms, i, m, _limit(terms[_S + i] * m - top))
             if j % _FACTORS == _FACTORS - 1 or j == n - 1:
                 for i in range(BLOCK):
                     work[_FACTOR + i] *= terms[_PRODUCT + i]

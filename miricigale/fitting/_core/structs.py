@@ -116,7 +116,7 @@ class Limits(NamedTuple):
     inverse: np.ndarray  # float64 (n_limits,): 1 / sigma
     slope: np.ndarray  # float64 (n_limits,), scratch: one model's fluxes over sigma
     dark: float  # sum of the limits' terms of chi2 for a model without light
-    wrong: np.ndarray | None  # float64 (n_limits,): prior fraction of wrong ones, of a mixture
+    wrong: np.ndarray  # float64 (n_limits,): prior fraction of wrong ones, 0 but for a mixture
 
 
 class Histograms(NamedTuple):

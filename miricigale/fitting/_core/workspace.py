@@ -170,7 +170,10 @@ def make_limits(limit, inverse, wrong):
         return None
     level = limit[bands] * inverse[bands]
     log = log_ndtr(level)
-    if wrong is not None:
+    if wrong is None:
+        # an array all the same: kernels are compiled once
+        wrong = np.zeros(bands.size)
+    else:
         wrong = wrong[bands]
         log = np.log((1.0 - wrong) * np.exp(log) + wrong, where=wrong > 0, out=log)
     dark = float(-2.0 * log.sum())
