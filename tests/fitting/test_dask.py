@@ -33,7 +33,7 @@ class Weighing(ProcessPoolExecutor):
 
 @pytest.fixture(scope="module")
 def photometry(fitter):
-    return draw_photometry(fitter.grid, 48, missing=0.1)[0]
+    return draw_photometry(fitter.grid, 24, missing=0.1)[0]
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +68,10 @@ def test_two_dask_workers_give_the_numbers_of_one_process(
     """And the bytes of its files, where one of them is killed."""
     distributed = pytest.importorskip("distributed")
     photometry = photometry.copy()
-    photometry["id"][40] = photometry["id"][3]
+    photometry["id"][20] = photometry["id"][3]
     photometry.write(tmp_path / "catalog.fits")
     one, two = (tmp_path / name for name in ("one", "two"))
-    arguments = {"path_in": tmp_path / "catalog.fits", "chunk_rows": 8}
+    arguments = {"path_in": tmp_path / "catalog.fits", "chunk_rows": 4}
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
     with (
         distributed.LocalCluster(**options) as cluster,
@@ -95,9 +95,9 @@ def test_two_dask_workers_give_the_numbers_of_one_process(
     for name in names[1:]:
         assert (one / name).read_bytes() == (two / name).read_bytes(), name
     table = results.to_table()
-    assert np.flatnonzero(table["flags"] & FitFlags.DUPLICATE_ID)[0] == 40
+    assert np.flatnonzero(table["flags"] & FitFlags.DUPLICATE_ID)[0] == 20
     for name, column in whole.to_table().items():
-        mine, theirs = (np.delete(np.asarray(one), 40) for one in (table[name], column))
+        mine, theirs = (np.delete(np.asarray(one), 20) for one in (table[name], column))
         assert_array_equal(mine, theirs, err_msg=name)
 
 
@@ -124,10 +124,10 @@ def test_workers_that_are_left_or_start_later_keep_a_function():
 def test_processes_get_the_grid_once(fitter, photometry, whole, process):
     assert len(pickle.dumps(fitter)) > 400_000
     process.n_bytes.clear()
-    assert_same(fitter.fit(photometry, executor=process, chunk_size=8), whole)
+    assert_same(fitter.fit(photometry, executor=process, chunk_size=4), whole)
     assert len(process.n_bytes) == 6
-    # 8 objects, 20 bands and redshifts
-    assert max(process.n_bytes) < 5000
+    # 4 objects, 20 bands and redshifts
+    assert max(process.n_bytes) < 3750
 
 
 def test_a_fault_in_a_worker_is_reported_and_leaves_no_file(process, tmp_path, monkeypatch):
