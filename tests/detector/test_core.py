@@ -128,7 +128,7 @@ def test_a_pixel_draws_the_same_beside_other_rows_and_dark_columns():
 @pytest.mark.slow
 def test_tracks_lie_in_all_directions_alike():
     # 160 hits per row, nearly each in a group of its own, along 12 pixels
-    settings = np.array([160, 1e6, 1, 0, 12, 0, 0, 0, 1, 0.0])
+    settings = (160.0, 1e6, 1.0, 0.0, 12.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     where, charge = cosmic_ray_deposits(KEY, 0, 500, (1, 2000000, 500, 500), settings)
     group, y, x = where
     # the angle of a complex second moment is twice that of the track
