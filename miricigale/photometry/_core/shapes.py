@@ -174,10 +174,13 @@ def shape_curves(kx, ky, shapes):
     -------
     curves : `~numpy.ndarray`, shape (n, m)
     """
-    kx = kx.astype(np.float32)
-    ky = ky.astype(np.float32)
-    table = profile_table()
     out = np.empty((len(shapes), 1, len(kx)), np.float32)
-    for shape, curve in zip(shapes, out, strict=True):
-        fill_curves(kx, ky, shape, profile_of(table, shape[1]), curve)
+    _fill_all(kx.astype(np.float32), ky.astype(np.float32), shapes, profile_table(), out)
     return out[:, 0]
+
+
+@njit()
+def _fill_all(kx, ky, shapes, table, out):
+    """Write the transforms of shapes, (n, 4), into an array, (n, 1, m)."""
+    for i in range(len(shapes)):
+        fill_curves(kx, ky, shapes[i], profile_of(table, shapes[i, 1]), out[i])

@@ -148,11 +148,13 @@ def _cutoff(kernel):
 def _bright_places(fit, half):
     """Return pixels (x, y) of the brightest sources, none within the square of a brighter one."""
     signal = row_snr(fit)
+    brightest = np.argsort(-signal)[:_MOST_SOURCES]
+    pixels = np.rint(fit.bank.xy[brightest[signal[brightest] >= _BRIGHT]]).astype(int)
+    is_free = np.ones(len(pixels), bool)
     places = []
-    for row in np.argsort(-signal)[:_MOST_SOURCES]:
-        if signal[row] < _BRIGHT:
-            break
-        place = np.rint(fit.bank.xy[row]).astype(int)
-        if all(np.max(np.abs(place - other)) > half for other in places):
+    for k, place in enumerate(pixels):
+        if is_free[k]:
             places.append(place)
+            distance = np.abs(pixels - place).max(axis=1)
+            is_free &= distance > half
     return places

@@ -137,36 +137,29 @@ class TemplateChanges:
         step = np.array([0.5 * self._size_scatter, 0.0, 0.0, 0.0])
         best = [parameters[2:], parameters[2:] + step, parameters[2:] - step]
         curves = shape_curves(plan.kx, plan.ky, np.concatenate([nodes, best]))
-        profile, larger, smaller = curves[len(nodes) :]
-        curves = curves[: len(nodes)]
-        # a point has no size
-        odds = fitted["point"]
-        base = np.ones_like(profile) if cutout is None else profile
-        mean = (1.0 - odds) * curves.mean(axis=0) + odds
-        # deviations of the nodes from the mean, of point and profile, and of size between bands
-        steps = np.sqrt((1.0 - odds) / len(nodes)) * (curves - mean)
-        scatter = (1.0 - odds) * (larger - smaller)
-        steps = np.concatenate([steps, [np.sqrt(odds) * (1.0 - mean), scatter]])
-        # light is blurred by what is not known of the center
-        kx = plan.kx
-        ky = plan.ky
-        cxx, cxy, _, cyy = fitted["covariance"][1:3, 1:3].ravel()
-        blur = np.exp(-0.5 * (cxx * kx * kx + 2 * cxy * kx * ky + cyy * ky * ky))
-        limit = min_power**2 * np.sum(plan.weight * base**2)
+        # the last is a point, which has no size
+        curves = np.concatenate([curves, np.ones_like(curves[:1])])
+        # all that follows is linear in the curves, and so are its products
+        white = curves * np.sqrt(plan.weight, dtype=float)
+        products = white @ white.T
+        steps, mean = _deviations(len(nodes), float(fitted["point"]))
+        base = -1 if cutout is None else len(nodes)
+        limit = min_power**2 * products[base, base]
         # directions that are independent in the image: eigenvectors of the products of the steps
-        value, vector = np.linalg.eigh((steps * plan.weight) @ steps.T)
-        is_strong = value > limit
-        directions = np.concatenate([vector.T[is_strong] @ steps, [mean * blur - base]])
-        # the last is no deviation, but what the mean of all that is possible has beyond the best
-        fixed = np.sum(plan.weight * directions[-1] ** 2) > limit
-        x, y = parameters[:2] - middle + half
-        if not fixed:
-            directions = directions[:-1]
+        value, vector = np.linalg.eigh(steps @ products @ steps.T)
+        directions = vector.T[value > limit] @ steps
+        directions = directions.astype(np.float32) @ curves
+        # what the mean of all that is possible has beyond the best, which is no deviation
+        beyond = mean.astype(np.float32) @ curves
+        beyond = beyond * _center_blur(plan, fitted["covariance"]) - curves[base]
+        fixed = np.sum(plan.weight * beyond**2, dtype=float) > limit
+        if fixed:
+            directions = np.concatenate([directions, beyond[None]])
         if not len(directions):
             return [], 0.0
+        x, y = parameters[:2] - middle + half
         origin = int(middle[1]) - half, int(middle[0]) - half
-        curves = directions.astype(np.float32)
-        changes = [Change(DrawnCutout(plan, curve, x, y, origin)) for curve in curves]
+        changes = [Change(DrawnCutout(plan, curve, x, y, origin)) for curve in directions]
         if fixed:
             changes[-1] = dataclasses.replace(changes[-1], fixed=True)
         return changes, 0.0
@@ -216,6 +209,50 @@ class TemplateChanges:
     def _blurred(self, images):
         """Blur images, (..., ny, nx), as much as the image is blurred compared with the high-resolution one."""
         return scipy.ndimage.gaussian_filter(images, self._blur, mode="constant", axes=(-2, -1))
+
+
+def _center_blur(plan, covariance):
+    """Return what is left of each frequency where the center is not known, 1 if it is."""
+    cxx, cxy, _, cyy = covariance[1:3, 1:3].ravel().tolist()
+    if not (cxx or cyy):
+        return np.float32(1.0)
+    kx = plan.kx
+    ky = plan.ky
+    return np.exp(-0.5 * (cxx * kx * kx + 2 * cxy * kx * ky + cyy * ky * ky))
+
+
+def _deviations(n, point):
+    """
+    Return how templates may deviate from their mean.
+
+    Parameters
+    ----------
+    n : int
+        Number of shapes that are possible.
+    point : float
+        Probability of a point.
+
+    Returns
+    -------
+    steps : `~numpy.ndarray`, shape (n + 2, n + 4)
+        Independent deviations, as sums of the shapes, the best one, it larger and smaller, and a point: those of
+        the shapes, that of point and profile, and that of the size between bands.
+    mean : `~numpy.ndarray`, shape (n + 4,)
+        The mean, in the same way.
+    """
+    mean = np.zeros(n + 4)
+    mean[:n] = (1.0 - point) / n
+    mean[-1] = point
+    steps = np.zeros((n + 2, n + 4))
+    steps[:n, :n] = np.eye(n)
+    steps[:n] -= mean
+    steps[:n] *= np.sqrt((1.0 - point) / n)
+    steps[n] = -mean
+    steps[n, -1] += 1.0
+    steps[n] *= np.sqrt(point)
+    steps[n + 1, n + 1] = 1.0 - point
+    steps[n + 1, n + 2] = point - 1.0
+    return steps, mean
 
 
 def _gaussian_variance(psf):
