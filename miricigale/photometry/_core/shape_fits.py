@@ -21,7 +21,7 @@ from miricigale.utils.compilation import njit
 Plan = collections.namedtuple("Plan", "kx ky weight response waves_y waves_x light_y light_x")
 
 #: Part of a source's light below which the frequencies of its image are left out.
-_FAINT = 1e-5
+_FAINT = 1e-4
 
 #: Least half-light radius (pixels), and largest ellipticity, that are fitted.
 _LEAST_RADIUS = 0.05

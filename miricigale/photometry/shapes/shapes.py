@@ -48,8 +48,9 @@ FITTED = np.dtype(
     ]
 )
 
-#: Largest number of steps of a fit.
+#: Largest number of steps of a fit, and of one of several sources: each of them is fitted again alone.
 _STEPS = 25
+_JOINT_STEPS = 4
 
 #: Changes of the expected parameters that the search begins with: ln radius over the expected one.
 _STARTS = np.zeros((3, 6))
@@ -233,7 +234,7 @@ class ShapeFitter(ShapeModels):
         start = np.array([shape.parameters for shape in shapes])
         half_widths = [half_width(parameters) for parameters in start]
         inner = self._stamp(data, weight, mean, half_widths)
-        solution = inner.minimum(start, mean, precision)
+        solution = inner.minimum(start, mean, precision, _JOINT_STEPS)
         if solution is None:
             return list(shapes), [None] * len(shapes)
         _, flux, parameters, _, covariance, matrix = solution
