@@ -2,15 +2,15 @@
 How often intervals hold the truth where it lies between the nodes of a grid, and what that costs.
 
     python benchmarks/intervals.py [--n 300] [--draws 0 200] [--grid small|large|survey] [--finer] [--seed 7]
-                                   [--model-error 0.1] [--scattered]
+                                   [--model-error 0.1] [--snr 10] [--scattered]
 
-Objects are models drawn from the prior: of any node, anywhere in its cell between the outermost nodes, computed by
-the chain itself, with S/N 10 in 21 bands, u* to MIPS 24, or for the axes of surveys in 14 of HST, NIRCam and MIRI.
-They are not scattered by the model error of the fit, which stands for what the models of a grid are off by, unless
-``--scattered``. ``--draws`` is ``interpolate`` of the fitter, ``--finer`` makes a finer grid. Grids have 0.8, 69
-and 20.5 million models. Printed are the parts of the truths in 68 and 95 % intervals, their binomial errors,
-milliseconds of CPU an object, in one call and one object a call, seconds to make the fitter, and the plain loop of
-``benchmarks/fit.py``.
+Objects are models drawn from the prior: of any node, anywhere in its cell between the outermost nodes, computed
+by the chain itself, with S/N ``--snr`` in 21 bands, u* to MIPS 24, or for the axes of surveys in 14 of HST,
+NIRCam and MIRI. They are not scattered by the model error of the fit, which stands for what the models of a
+grid are off by, unless ``--scattered``. ``--draws`` is ``interpolate`` of the fitter, ``--finer`` makes a finer
+grid. Grids have 0.8, 69 and 20.5 million models. Printed are the parts of the truths in 68 and 95 % intervals,
+their binomial errors, milliseconds of CPU an object, in one call and one object a call, seconds to make the
+fitter, and the plain loop of ``benchmarks/fit.py``.
 """
 
 import argparse
@@ -75,8 +75,8 @@ def drawn(fitter, n, rng):
     return out
 
 
-def objects(fitter, model, n, rng, extra):
-    """Photometry with noise of 10 % and of a further part, and true values by name."""
+def objects(fitter, model, n, rng, noise, extra):
+    """Photometry with noise and a further one, as parts of fluxes, and true values by name."""
     values, bands = drawn(fitter, 2 * n, rng), list(fitter.bands)
     values |= {name: np.full(2 * n, value) for name, value in fitter.backend.constants.items()}
     true = QTable({k: v * (model.parameters[k].unit or u.one) for k, v in values.items()})
@@ -88,8 +88,8 @@ def objects(fitter, model, n, rng, extra):
         true[name] = fluxes[name]
     table = QTable({"id": np.arange(n)})
     for name in bands:
-        table[name] = fluxes[name] * (1.0 + np.hypot(0.1, extra) * rng.normal(size=n))
-        table[f"{name}_err"] = 0.1 * fluxes[name]
+        table[name] = fluxes[name] * (1.0 + np.hypot(noise, extra) * rng.normal(size=n))
+        table[f"{name}_err"] = noise * fluxes[name]
     return table, true
 
 
@@ -108,6 +108,7 @@ def main():
     parser.add_argument("--finer", action="store_true")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--model-error", type=float, default=0.1)
+    parser.add_argument("--snr", type=float, default=10.0)
     parser.add_argument("--scattered", action="store_true")
     args = parser.parse_args()
     if args.grid == "survey":
@@ -120,7 +121,8 @@ def main():
     options = {"model_error": args.model_error}
     rng, n = np.random.default_rng(args.seed), args.n
     nodes = BayesFitter(grid, bands, **options, settings=GridSettings(interpolate=0))
-    table, true = objects(nodes, model, n, rng, args.scattered * args.model_error)
+    extra = args.scattered * args.model_error
+    table, true = objects(nodes, model, n, rng, 1.0 / args.snr, extra)
     for part in (0.68, 0.95):
         error = 100 * np.sqrt(part * (1 - part) / n)
         print(f"parts of {n} truths in {100 * part:.0f} % intervals, +- {error:.1f} %")

@@ -214,6 +214,7 @@ def test_workers_do_not_matter(fitter, table, results):
 def test_what_is_not_converged_is_flagged(grid, table, monkeypatch):
     monkeypatch.setattr("miricigale.fitting.grid.adaptive._MAX_PLACES_EACH", 1)
     monkeypatch.setattr("miricigale.fitting.grid.adaptive._MIN_MAX_PLACES", 512)
+    monkeypatch.setattr("miricigale.fitting.grid.tempering.N_PLACES", 64)
     fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=1000))
     n = len(table)
     with pytest.warns(
