@@ -505,7 +505,7 @@ FUNCTIONS = {
     "psf.grid_weights.y": (lambda x: psf.grid_weights(GRID, 0.5, x), X),
     "reduction.calibrate.flat": (
         lambda x: reduction.calibrate(
-            CCDData(np.ones((64, 72)), unit="adu/s"), filter="miri.f770w", subarray="SUB64",
+            CCDData(np.ones((64, 72)), unit="adu/s"), subarray="SUB64",
             flat=_image(x)[:1, 1:2], conversion=1.0).data, X),
     "reduction.fit_groups.data": (
         lambda x: reduction.fit_groups(_image(x).T[None, :, None, :], MAPS, group_time=3.0).rate, 1e3 * X),

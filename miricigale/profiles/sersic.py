@@ -29,7 +29,7 @@ def sersic_faults(radius, index, ratio, angle):
     Examples
     --------
     >>> import numpy as np
-    >>> from miricigale.profiles import sersic_faults
+    >>> from miricigale.profiles.sersic import sersic_faults
     >>> radius, index = np.array([0.3, 0.0]), np.array([np.nan, 4.0])
     >>> sersic_faults(radius, index, ratio=np.ones(2), angle=np.zeros(2))["half_light_radius"]
     array([False,  True])
@@ -57,7 +57,7 @@ def describe_faults(faults, sersic):
     Examples
     --------
     >>> import numpy as np
-    >>> from miricigale.profiles import describe_faults
+    >>> from miricigale.profiles.sersic import describe_faults
     >>> faults = {"half_light_radius": np.array([True, False]), "axis_ratio": np.zeros(2, bool)}
     >>> describe_faults(faults, np.ones(2, bool))
     '1 of 2 Sersic profiles are drawn as points: half_light_radius is missing or not positive in 1'

@@ -6,7 +6,7 @@ from astropy.table import QTable, Table
 
 from miricigale.filters.photometry_table import as_photometry
 from miricigale.filters.surveys import flux_bands, is_band
-from miricigale.profiles import describe_faults, sersic_faults
+from miricigale.profiles.sersic import describe_faults, sersic_faults
 from miricigale.utils.arrays import nans
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn

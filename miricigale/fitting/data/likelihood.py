@@ -20,6 +20,8 @@ from miricigale.utils.values import value_class
 
 #: S/N of the best model in all bands together below which an object is flagged.
 LOW_SIGNAL = 3.0
+#: What a warning of fits that are not converged begins with, after their number.
+NOT_CONVERGED_TEXT = "fits are not converged"
 #: Largest limit of the reduced chi2 above which an object is flagged.
 HIGH_CHI2 = 100.0
 #: Stellar mass in solar masses below which an object is flagged.

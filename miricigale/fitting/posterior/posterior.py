@@ -63,7 +63,7 @@ def check_levels(levels):
     if is_percent.any() and np.all((levels > 0) & (levels < 100)):
         # 0.1 beside 99.9 is a percentage, but 0.5 beside 84 need not be one
         parts = ", ".join(f"{level / 100:.6g}" for level in levels)
-        wanted += f": of numbers on both sides of 1 take parts, [{parts}] for percentages,"
+        wanted += f": of numbers on both sides of 1 take parts, [{parts}] for percentages"
     check_that(np.all((levels > 0) & (levels < 1)), "levels", wanted, levels)
     return levels
 

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from miricigale.fitting.results.sample_flags import NOT_CONVERGED_TEXT
+from miricigale.fitting.data.likelihood import NOT_CONVERGED_TEXT
 from miricigale.utils.arrays import finite_values
 from miricigale.utils.exceptions import CatalogWarning, FitWarning, warn
 

@@ -3,12 +3,10 @@
 import numpy as np
 from scipy.stats import chi2
 
-from miricigale.fitting.data.likelihood import HIGH_CHI2, FitFlags
+from miricigale.fitting.data.likelihood import HIGH_CHI2, NOT_CONVERGED_TEXT, FitFlags
 from miricigale.utils.arrays import quiet_division, thinning_step
 from miricigale.utils.exceptions import FitWarning, warn
 
-#: What a warning of fits that are not converged begins with, after their number.
-NOT_CONVERGED_TEXT = "fits are not converged"
 #: Smallest number of fits that are a sample.
 _MIN_SAMPLE = 50
 #: Largest number of fits that are looked at.

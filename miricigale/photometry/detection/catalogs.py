@@ -5,7 +5,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
 
-from miricigale.profiles import describe_faults, sersic_faults
+from miricigale.profiles.sersic import describe_faults, sersic_faults
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing_values import floats, mask_of
