@@ -7,12 +7,21 @@ import textwrap
 
 def filters(args):
     """List the filters."""
+    from astropy.table import unique, vstack
+
     from miricigale.filters import filter_table
 
-    table = filter_table(args.pattern)
-    if len(table) == 0:
-        print(f"no filter has {args.pattern!r} in its name, or at this wavelength", file=sys.stderr)
-        return 1
+    tables = []
+    for pattern in args.pattern or [""]:
+        table = filter_table(pattern)
+        if len(table) == 0:
+            print(f"no filter has {pattern!r} in its name, or at this wavelength", file=sys.stderr)
+            return 1
+        tables.append(table)
+    table = tables[0]
+    if len(tables) > 1:
+        table = unique(vstack(tables), keys="name")
+        table.sort("pivot")
     table.pprint_all()
     return 0
 

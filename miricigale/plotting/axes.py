@@ -1,5 +1,7 @@
 """Figures, axes, colors and legends that all plots share."""
 
+import weakref
+
 import numpy as np
 
 #: Inches across the figures of a page, which are shown at one width, so that letters have one size.
@@ -10,6 +12,10 @@ MEASURED = "#9a3412"
 SECOND = "#1d4ed8"
 #: Colors and markers of samples drawn over each other, such as those of band sets, in their order.
 STYLES = ((MEASURED, "o"), (SECOND, "s"), ("0.4", "^"), ("#15803d", "D"))
+
+
+#: Figures of several panels, beside which other plots are drawn.
+_PANEL_FIGURES = weakref.WeakSet()
 
 
 class AxesArray(np.ndarray):
@@ -29,7 +35,9 @@ class AxesArray(np.ndarray):
     """
 
     def __new__(cls, axes):
-        return np.asarray(axes, dtype=object).view(cls)
+        axes = np.asarray(axes, dtype=object).view(cls)
+        _PANEL_FIGURES.add(axes.figure)
+        return axes
 
     @property
     def figure(self):
@@ -206,9 +214,11 @@ def row_mask(rows, n, default):
 
 
 def resolve_axes(ax):
-    """Return the given axes, or those of pyplot's current figure."""
+    """Return the given axes, or those of pyplot's current figure; of a new one if that has panels of ours."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt
 
+    if plt.get_fignums() and plt.gcf() in _PANEL_FIGURES:
+        return plt.figure().gca()
     return plt.gca()

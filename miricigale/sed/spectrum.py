@@ -20,6 +20,7 @@ from miricigale.utils.files import reading
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import full_meta
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.table_files import read_table, write_table
 from miricigale.utils.table_formats import check_keeps_units
 from miricigale.utils.units import (
@@ -356,6 +357,7 @@ class SED(Frozen, WithTable):
         """
         return self.rest_frame(cosmology=cosmology).synthetic_magnitude(band)
 
+    @takes_other_keywords
     def luminosity(self, low=None, high=None, *, cosmology=COSMOLOGY):
         """
         Luminosity nu L_nu at the source, at `rest_wavelength` or others, or that between two rest wavelengths.

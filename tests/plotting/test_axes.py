@@ -1,7 +1,7 @@
 import matplotlib.pyplot as plt
 import pytest
 
-from miricigale.plotting.axes import new_figure, panel_columns, resolve_axes
+from miricigale.plotting.axes import AxesArray, new_figure, panel_columns, resolve_axes
 
 
 def test_a_new_figure_has_a_grid_of_axes_and_no_window():
@@ -32,3 +32,15 @@ def test_rows_of_panels_are_of_three_or_leave_fewer_places_empty(n):
     assert columns == min(n, 3) or (columns in (2, 4) and -n % columns < -n % 3)
     # seven skies, four ranges of redshift
     assert (panel_columns(7), panel_columns(4), panel_columns(18)) == (4, 2, 3)
+
+
+def test_plots_leave_the_panels_of_others_alone():
+    """After panels of ours, such as those of a corner plot, a plot has a figure of its own."""
+    figure, axes = plt.subplots(2, 2)
+    assert resolve_axes(None) is axes[1, 1]
+    AxesArray(axes)
+    own = resolve_axes(None)
+    assert own.figure is not figure
+    # which is then the current one
+    assert resolve_axes(None) is own
+    plt.close("all")

@@ -93,6 +93,8 @@ def test_data_names_licenses_and_checks_sums(capsys, monkeypatch, tmp_path):
 def test_filters_and_exposures_are_listed(capsys):
     # a published pivot, and times of the survey
     assert "15.06" in command(capsys, "filters", "miri.f1500w").out
+    rows = command(capsys, "filters", "F1500W", "F770W", "miri.f770w").out.splitlines()
+    assert [row.split()[0] for row in rows[-2:]] == ["miri.f770w", "miri.f1500w"]
     command(capsys, "filters", "nonsense", status=1)
     text = command(capsys, "plan").out
     assert all(word in text for word in ("miri.f2100w", "1665.0", "4662.0"))

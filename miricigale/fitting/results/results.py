@@ -28,6 +28,7 @@ from miricigale.utils.file_formats import read_write
 from miricigale.utils.flag_arrays import FlagField
 from miricigale.utils.object_rows import PerObject, PerObjectDict, of_id
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.values import value_class
 
 #: Part of the mean below which CIGALE gives no standard deviation.
@@ -447,6 +448,7 @@ class FitResults(FitRows):
         levels = np.minimum(first + np.cumsum(weights, axis=-1), 1.0)
         return edges, np.concatenate([first, levels], axis=-1)
 
+    @takes_other_keywords
     def probability(self, name, low=None, high=None):
         """
         Return the posterior probability that a parameter or derived quantity is within limits.

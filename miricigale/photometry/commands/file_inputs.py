@@ -338,7 +338,8 @@ def _check_headers(images, highres, kernels):
         is_modeled = file.psf is None and kernel is None
         if name is None and (file is not highres or is_modeled):
             lacking.append(
-                f"'{prefix}filter' must be given, for the header of {file.path} does not name it"
+                f"'{prefix}filter' must be given, for the header of {file.path} does not name it,"
+                " or not its instrument"
             )
         # the models of WFC3/IR have no orientation
         is_turned = name is None or (name in MODEL_FILTERS and not name.startswith("wfc3."))

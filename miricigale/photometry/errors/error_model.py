@@ -216,6 +216,7 @@ class ErrorModel(WithTable):
         return cls(curves, provenance(source="tables", statistic=statistic, bin_size=bin_size))
 
     @classmethod
+    @takes_other_keywords
     def from_depths(cls, depths, *, fractional=0.0):
         """
         Take errors from survey depths.
