@@ -36,6 +36,7 @@ def plot_corner(labels, marginals, joints, *, truths=None, figure=None):
     axes = figure.subplots(n, n, squeeze=False, sharex="col")
     if truths is None:
         truths = [None] * n
+    limits = []
     for row in range(n):
         for column in range(n):
             ax = axes[row, column]
@@ -44,6 +45,8 @@ def plot_corner(labels, marginals, joints, *, truths=None, figure=None):
             elif column == row:
                 plot_pdf(*marginals[row], ax=ax, truth=truths[row])
                 ax.set(ylabel="", yticks=[])
+                # without margins, as in the joint panels
+                limits.append(tuple(ax.dataLim.intervalx))
             else:
                 _joint(ax, joints[row, column], (truths[column], truths[row]))
             if row == n - 1:
@@ -55,7 +58,7 @@ def plot_corner(labels, marginals, joints, *, truths=None, figure=None):
                 ax.set_ylabel(labels[row])
             elif column < row:
                 ax.tick_params(axis="y", labelleft=False)
-    _limits(axes, n)
+    _set_limits(axes, limits)
     return AxesArray(axes)
 
 
@@ -69,11 +72,9 @@ def _joint(ax, cells, truth):
         ax.axhline(y, color="black", linestyle="--", linewidth=1)
 
 
-def _limits(axes, n):
-    """Give all panels of a row the same limits: those of the widest one."""
-    for row in range(1, n):
-        spans = [axes[row, column].get_ylim() for column in range(row)]
-        low = min(span[0] for span in spans)
-        high = max(span[1] for span in spans)
-        for column in range(row):
-            axes[row, column].set_ylim(low, high)
+def _set_limits(axes, limits):
+    """Give all panels of a parameter the limits of its own, in which its posterior is shown."""
+    for k, span in enumerate(limits):
+        axes[k, k].set_xlim(span)
+        for column in range(k):
+            axes[k, column].set_ylim(span)
