@@ -95,6 +95,30 @@ def test_places_have_the_shape_of_each_peak():
     assert_allclose(alone[:, 1].std(), 1.0, rtol=0.2)
 
 
+def test_impossible_places_count_as_such():
+    """Half of the places have no model, as ages above that of the universe: the evidence is halved."""
+    rng = np.random.default_rng(7)
+    score = rng.standard_normal((8192, 2))
+    is_possible = score[:, 0] > 0
+
+    def evaluate(label, score):
+        evaluated = np.zeros((len(score), 5))
+        evaluated[:, 0] = norm.logpdf(score).sum(axis=1)
+        impossible = score[:, 0] < 0
+        evaluated[impossible, 0] = _core.NEVER
+        # what a kernel says of the likelihood of no model means nothing
+        evaluated[impossible, 4] = np.nan
+        return evaluated, score.copy()
+
+    label = np.zeros(8192, int)
+    evaluated, place = evaluate(label, score)
+    places = TemperedPlaces(label, score, evaluated, place, np.arange(8192), 0.0)
+    tempered = temper(evaluate, places, norm.logpdf(score).sum(axis=1), ACTIVE, rng)
+    assert_allclose(tempered.log_evidence, np.log(is_possible.mean()), atol=1e-12)
+    assert tempered.score[:, 0].min() > 0
+    assert_allclose(tempered.score[:, 0].mean(), np.sqrt(2.0 / np.pi), atol=0.06)
+
+
 def test_the_same_seed_gives_the_same_places():
     assert_array_equal(_tempered(2).score, _tempered(2).score)
 

@@ -140,6 +140,8 @@ class AdaptiveSampler:
         #: What results rest on.
         self.collection = None
         self._first_wanted = wanted
+        #: Mixture fitted to the draws to begin with.
+        self._broad = None
         #: `PlacedModels` of places of a rising likelihood.
         self._tempered = None
 

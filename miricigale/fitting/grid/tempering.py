@@ -124,8 +124,10 @@ def temper(evaluate, places, log_density, active, rng):
     -------
     places : `TemperedPlaces`
     """
-    log_prior = places.evaluated[:, 0] - places.evaluated[:, 4] - log_density
-    log_prior[places.evaluated[:, 0] < _NO_MODEL] = -np.inf
+    possible = np.flatnonzero(places.evaluated[:, 0] > _NO_MODEL)
+    log_share = np.log(possible.size / len(log_density))
+    places = places.chosen(possible, places.log_evidence + log_share)
+    log_prior = places.evaluated[:, 0] - places.evaluated[:, 4] - log_density[possible]
     power = 0.0
     while True:
         log_like = places.evaluated[:, 4]
