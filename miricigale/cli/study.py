@@ -90,6 +90,7 @@ def depth(args):
     from miricigale.planning import depth_table, load_plan, plan_table
 
     _take_bands(args)
+    _refuse_with_depth(args, "--time", args.time)
     # a plan of these exposures alone
     args.config = None
     args.sets = None
@@ -177,10 +178,15 @@ def _check_plan_options(args):
     if args.quick:
         msg = "--quick is of the table of the CEERS exposures, which has no other option"
         raise ValueError(msg)
-    for option, value in (("--time", args.time), ("--hours", args.hours)):
-        if value is not None and args.depth is not None:
-            msg = f"wanted are {option} or --depth, not both"
-            raise ValueError(msg)
+    _refuse_with_depth(args, "--time", args.time)
+    _refuse_with_depth(args, "--hours", args.hours)
+
+
+def _refuse_with_depth(args, option, value):
+    """Refuse the value of an option beside ``--depth``."""
+    if value is not None and args.depth is not None:
+        msg = f"wanted are {option} or --depth, not both"
+        raise ValueError(msg)
 
 
 def _bands_of_sets(sets):

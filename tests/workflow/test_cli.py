@@ -118,6 +118,11 @@ def test_depths_of_exposures_are_those_of_the_function(capsys):
         assert float(row["saturation"]) < float(row["limit_etc"]) < float(row["limit"])
     bright = command(capsys, *words, "--background", "high").out.splitlines()[3].split()
     assert float(bright[names.index("limit")]) < float(rows[0]["limit"])
+    # the other way around: the exposure that reaches a limit
+    reached = command(capsys, "depth", "F1500W", "--depth", "24").out.splitlines()[3].split()
+    assert float(reached[names.index("limit")]) == pytest.approx(24.0, abs=0.03)
+    text = command(capsys, "depth", "F1500W", "--depth", "24", "--time", "1h", status=2).err
+    assert "wanted are --time or --depth, not both" in text
     # without options those of CEERS, as of plan
     assert command(capsys, "depth").out == command(capsys, "plan").out
 
