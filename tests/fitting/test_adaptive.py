@@ -15,7 +15,7 @@ from scipy.stats import multivariate_normal, multivariate_t, norm, qmc, t
 from helpers.grids import photometry_table
 from miricigale.fitting import BayesFitter, FitFlags, GridSettings, _core
 from miricigale.fitting.grid.peaks import redshift_peaks
-from miricigale.fitting.grid.place_sets import Collection, fitted_groups
+from miricigale.fitting.grid.place_sets import Collection, fitted_peaks
 from miricigale.fitting.grid.points import quasi_random
 from miricigale.fitting.grid.proposals import FittedParts
 from miricigale.fitting.posterior.quantities import (
@@ -141,12 +141,10 @@ def results(fitter, table):
 
 
 def test_parts_are_fitted_where_places_show_a_shape():
-    wanted = np.array([True, True, False, False])
-    assert_array_equal(fitted_groups(wanted, np.array([100, 20, 100, 0])), [0, 1])
-    assert_array_equal(fitted_groups(wanted, np.array([100, 19, 100, 0])), [0])
-    # six places with all of the weight, as of one in 5,229 sources of CEERS
-    assert_array_equal(fitted_groups(wanted, np.array([6, 0, 3000, 5])), [0, 2])
-    assert_array_equal(fitted_groups(wanted, np.array([6, 1, 0, 5])), [0, 1])
+    assert_array_equal(fitted_peaks(np.array([100, 20, 100, 0])), [0, 1, 2])
+    assert_array_equal(fitted_peaks(np.array([100, 19, 0])), [0])
+    # few places with all of the weight, as of one in 5,229 sources of CEERS
+    assert_array_equal(fitted_peaks(np.array([6, 0, 5])), [0, 2])
 
 
 @pytest.mark.slow
@@ -214,7 +212,8 @@ def test_workers_do_not_matter(fitter, table, results):
 def test_what_is_not_converged_is_flagged(grid, table, monkeypatch):
     monkeypatch.setattr("miricigale.fitting.grid.adaptive._MAX_PLACES_EACH", 1)
     monkeypatch.setattr("miricigale.fitting.grid.adaptive._MIN_MAX_PLACES", 512)
-    monkeypatch.setattr("miricigale.fitting.grid.tempering.N_PLACES", 64)
+    monkeypatch.setattr("miricigale.fitting.grid.tempering.MIN_PLACES", 64)
+    monkeypatch.setattr("miricigale.fitting.grid.tempering._PLACES_EACH", 0.0)
     fitter = BayesFitter(grid, model_error=0.0, settings=GridSettings(interpolate=1000))
     n = len(table)
     with pytest.warns(

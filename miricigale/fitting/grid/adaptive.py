@@ -5,8 +5,9 @@ Places are drawn from a mixture of t distributions, weighed by the posterior ove
 far, and the next mixture is fitted to them (adaptive multiple importance sampling: Cornuet et al. 2012, Scand.
 J. Stat. 39, 798). The first one is fitted to draws from the posterior on the nodes. Results rest on places
 drawn afterwards, from parts that do not depend on them: recycled weights are biased (Marin, Pudlo & Sedki 2019,
-Bernoulli 25, 2714), which takes from what has little weight. Points are quasi-random, and the same for all
-objects: nothing depends on the id or place of an object in its catalog.
+Bernoulli 25, 2714), which takes from what has little weight. Where errors are small, the mixture is fitted to
+places that follow a likelihood whose power rises (`~miricigale.fitting.grid.tempering`). Points are quasi-random,
+and the same for all objects: nothing depends on the id or place of an object in its catalog.
 """
 
 from dataclasses import replace
@@ -15,11 +16,11 @@ import numpy as np
 
 from miricigale.fitting import _core
 from miricigale.fitting.grid.labels import active_axes, labels_of_ranges
-from miricigale.fitting.grid.place_sets import Collection, WeightedPlaces, fitted_groups
+from miricigale.fitting.grid.place_sets import Collection, WeightedPlaces, fitted_peaks
 from miricigale.fitting.grid.placed_models import PlacedModels, places_to_values, thinned
 from miricigale.fitting.grid.points import quasi_random
 from miricigale.fitting.grid.proposals import MIN_WEIGHT, Places, fit_mixture
-from miricigale.fitting.grid.tempering import TemperedPlaces, prior_mixture, temper
+from miricigale.fitting.grid.tempering import TemperedPlaces, n_tempered, prior_mixture, temper
 
 #: Number of places in a round.
 ROUND_SIZE = 512
@@ -63,8 +64,8 @@ _LEAST_FLAT = 0.003
 _N_LOCAL = 16
 #: Part of the effective number that is wanted, below which the power of the likelihood is raised instead.
 _MIN_WEIGHED = 0.5
-#: Number of places from each of the mixtures that this begins with.
-_N_BROAD = 4096
+#: Number of places from each of the mixtures that this begins with, over that of the places it is done to.
+_BROAD_EACH = 2
 #: Distance of labels by which places are sorted, beyond all scores.
 _APART = 1e6
 #: Weight of the models that are left out of results.
@@ -122,7 +123,9 @@ class AdaptiveSampler:
         # at least those that parts are fitted to, and a first try
         max_places = max(max_places, _ADAPTING_ROUNDS * ROUND_SIZE + _N_TRIAL)
         self.max_places = max_places
-        n_points = max_places + 2 * _N_BROAD
+        self.n_tempered = n_tempered(wanted)
+        self.n_broad = _BROAD_EACH * -(-self.n_tempered // ROUND_SIZE) * ROUND_SIZE
+        n_points = max_places + 2 * self.n_broad
         self.points = quasi_random(n_axes, int(np.ceil(np.log2(n_points))), scramble)
         size = _SIZE_TO_BEGIN
         self.label = np.empty(size, np.int64)
@@ -332,8 +335,7 @@ class AdaptiveSampler:
         log = self.evaluated[rows, 0] - np.log(self.density[rows])
         weight = np.exp(np.maximum(log - log.max(), -700.0))
         peak = self.peak[rows]
-        is_wanted = np.ones(len(self.peaks), bool)
-        chosen = fitted_groups(is_wanted, np.bincount(peak, minlength=is_wanted.size))
+        chosen = fitted_peaks(np.bincount(peak, minlength=len(self.peaks)))
         return Places(
             label=self.label[rows],
             score=self.score[rows],
@@ -512,7 +514,8 @@ class AdaptiveSampler:
             return evaluated, place
 
         rng = np.random.default_rng(self.scramble)
-        tempered = temper(evaluate, broad, log_density, active_axes(self.labels), rng)
+        active = active_axes(self.labels)
+        tempered = temper(evaluate, broad, log_density, active, rng, self.n_tempered)
         # neighbors in redshift, label by label
         order = np.lexsort((tempered.place[:, 0], tempered.label))
         tempered = tempered.chosen(order, tempered.log_evidence)
@@ -545,7 +548,7 @@ class AdaptiveSampler:
         mixtures = (prior_mixture(self.labels), self._broad)
         ends = []
         for mixture in mixtures:
-            for _ in range(_N_BROAD // ROUND_SIZE):
+            for _ in range(self.n_broad // ROUND_SIZE):
                 ends.append(self._add_round(mixture, ROUND_SIZE))
         ends = np.concatenate(ends) - first
         rows = slice(first, self.n)

@@ -63,10 +63,7 @@ class LabelTable:
             key = tuple(cells)
             if key not in label_of_key:
                 first, count = np.array(cells).T
-                share = (
-                    share_below[np.arange(n_axes), first + count]
-                    - share_below[np.arange(n_axes), first]
-                )
+                share = prior_shares(share_below, first, count)
                 # a label without prior weight does not exist
                 if np.all(share > 0):
                     label_of_key[key] = len(rows)
@@ -183,6 +180,12 @@ def labels_of_ranges(labels):
         for range_code in codes:
             members.append(np.flatnonzero(code == range_code))
     return members
+
+
+def prior_shares(share_below, first, count):
+    """Return the prior's share in ranges of cells of each axis: shape of ``first``, (n_axes,) or (n, n_axes)."""
+    axes = np.arange(len(share_below))
+    return share_below[axes, first + count] - share_below[axes, first]
 
 
 def active_axes(labels):

@@ -147,24 +147,22 @@ def _with_columns(table, n):
     return larger
 
 
-def fitted_groups(is_wanted, number):
+def fitted_peaks(number):
     """
-    Select the groups of places, such as labels in peaks, that parts are fitted to.
+    Select the peaks that parts are fitted to.
 
     Parameters
     ----------
-    is_wanted : `~numpy.ndarray` of bool, shape (n_groups,)
-        Groups that have weight.
-    number : `~numpy.ndarray` of int, shape (n_groups,)
+    number : `~numpy.ndarray` of int, shape (n_peaks,)
         Number of places of each.
 
     Returns
     -------
-    groups : `~numpy.ndarray` of int
-        Those that are wanted and have places enough to show a shape. If there are none, the wanted ones with any
-        place, whose parts have the shape of all places, and the others that show one.
+    peaks : `~numpy.ndarray` of int
+        Those that have places enough to show a shape. If there are none, those with any place, whose parts have
+        the shape of all places.
     """
-    has_shape = number >= _MIN_FITTED_PLACES
-    if np.any(is_wanted & has_shape):
-        return np.flatnonzero(is_wanted & has_shape)
-    return np.flatnonzero((is_wanted | has_shape) & (number > 0))
+    peaks = np.flatnonzero(number >= _MIN_FITTED_PLACES)
+    if peaks.size:
+        return peaks
+    return np.flatnonzero(number)

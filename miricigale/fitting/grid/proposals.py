@@ -207,7 +207,7 @@ def _moments_of_peaks(places):
         flat = places.flat[rows]
         mean, cov = _mean_and_cov(places.score[rows], flat)
         # few places say little of a covariance: it is drawn to that of all peaks
-        shrinkage = n_axes / (n_axes + _effective_number(flat))
+        shrinkage = n_axes / (n_axes + effective_number(flat))
         moments[peak] = (mean, (1.0 - shrinkage) * cov + shrinkage * global_cov)
     return moments
 
@@ -273,6 +273,6 @@ def _mean_and_cov(score, weight):
     return mean, cov + 1e-6 * np.eye(n_axes)
 
 
-def _effective_number(weight):
+def effective_number(weight):
     """Compute the effective number of weights (Kish 1965)."""
     return weight.sum() ** 2 / np.sum(weight * weight)

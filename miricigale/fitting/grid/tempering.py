@@ -12,12 +12,15 @@ import numpy as np
 from scipy.special import gammaln
 
 from miricigale.fitting import _core
+from miricigale.fitting.grid.labels import prior_shares
 from miricigale.fitting.grid.moves import Moves, systematic
+from miricigale.fitting.grid.proposals import effective_number
 from miricigale.utils.values import value_class
 
-#: Number of places.
-N_PLACES = 2048
-#: Effective number, as a part of these, to which a step of the power takes their weights.
+#: Number of places for each of the effective number that is wanted, and the smallest number.
+_PLACES_EACH = 3.4
+MIN_PLACES = 512
+#: Effective number, as a part of the places, to which a step of the power takes their weights.
 _LEAST_EFFECTIVE = 0.5
 #: Sweeps of moves after each step.
 _N_SWEEPS = 10
@@ -83,9 +86,7 @@ def prior_mixture(labels):
     mixture : `~miricigale.fitting._core.Parts`
     """
     n_labels, n_axes = labels.first.shape
-    axes = np.arange(n_axes)
-    last = labels.first + labels.count
-    share = np.prod(labels.below[axes, last] - labels.below[axes, labels.first], axis=1)
+    share = prior_shares(labels.below, labels.first, labels.count).prod(axis=1)
     # largest density of a t distribution
     half = 0.5 * labels.n_active
     log_top = gammaln(0.5 * _core.FREEDOM + half) - gammaln(0.5 * _core.FREEDOM)
@@ -102,7 +103,12 @@ def prior_mixture(labels):
     )
 
 
-def temper(evaluate, places, log_density, active, rng):
+def n_tempered(wanted):
+    """Return the number of places whose likelihood rises, where an effective number is wanted."""
+    return max(int(_PLACES_EACH * wanted), MIN_PLACES)
+
+
+def temper(evaluate, places, log_density, active, rng, n):
     """
     Raise the power of the likelihood to 1.
 
@@ -119,10 +125,12 @@ def temper(evaluate, places, log_density, active, rng):
         Axes that have an effect.
     rng : `~numpy.random.Generator`
         Random numbers of the moves.
+    n : int
+        Number of places of the result.
 
     Returns
     -------
-    places : `TemperedPlaces`
+    places : `TemperedPlaces`, n of them
     """
     possible = np.flatnonzero(places.evaluated[:, 0] > _NO_MODEL)
     log_share = np.log(possible.size / len(log_density))
@@ -131,13 +139,13 @@ def temper(evaluate, places, log_density, active, rng):
     power = 0.0
     while True:
         log_like = places.evaluated[:, 4]
-        step = _next_step(log_prior, log_like, 1.0 - power)
+        step = _next_step(log_prior, log_like, 1.0 - power, _LEAST_EFFECTIVE * n)
         log_weight = log_prior + step * log_like
         highest = log_weight.max()
         weight = np.exp(log_weight - highest)
         log_evidence = places.log_evidence + highest + np.log(weight.mean())
-        places = places.chosen(systematic(weight, N_PLACES), log_evidence)
-        log_prior = np.zeros(N_PLACES)
+        places = places.chosen(systematic(weight, n), log_evidence)
+        log_prior = np.zeros(n)
         power += step
         is_last = 1.0 - power <= _LEAST_STEP
         n_sweeps = _N_SWEEPS
@@ -169,13 +177,12 @@ def _move(evaluate, places, active, power, n_sweeps, rng):
         moves.sweep(rng)
 
 
-def _next_step(log_prior, log_like, most):
+def _next_step(log_prior, log_like, most, goal):
     """
-    Find the step of the power, at most ``most``, at which weights have the effective number that is wanted.
+    Find the step of the power, at most ``most``, at which weights have the effective number ``goal``.
 
     The weights, (n,), are the exponentials of ``log_prior`` plus the step times ``log_like``.
     """
-    goal = _LEAST_EFFECTIVE * N_PLACES
     if _effective_number(log_prior + most * log_like) >= goal:
         return most
     low = _LEAST_STEP
@@ -193,6 +200,5 @@ def _next_step(log_prior, log_like, most):
 
 
 def _effective_number(log_weight):
-    """Compute the effective number of weights (Kish 1965)."""
-    weight = np.exp(log_weight - log_weight.max())
-    return weight.sum() ** 2 / np.sum(weight * weight)
+    """Compute the effective number of weights whose logarithms are known."""
+    return effective_number(np.exp(log_weight - log_weight.max()))

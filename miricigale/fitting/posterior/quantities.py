@@ -110,7 +110,8 @@ def percentile_error(values, weight, lineage=None):
     -----
     The share p of the draws below a value has the variance sum w^2 (I - p)^2, with I = 1 for draws below and 0 for
     those above. The percentiles at shares that are a standard error smaller and larger say what that means for the
-    value, also between two peaks, where there is no density to divide by.
+    value, also between two peaks, where there is no density to divide by. With lineages w (I - p) is summed over
+    each before it is squared (Lee & Whiteley 2018, Biometrika 105, 609).
     """
     (ascending, middles, square_upto), _ = _sorted_draws(values, weight, with_log=False)
     percentiles = np.interp(_INTERVAL, middles, ascending)
