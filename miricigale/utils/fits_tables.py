@@ -1,14 +1,11 @@
 """Tables in FITS files: what astropy reads otherwise than the file means it, and types that FITS does not have."""
 
+import io
 import warnings
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import Column, MaskedColumn, Table
-from astropy.table.meta import get_yaml_from_table
-from astropy.table.serialize import represent_mixins_as_columns
-from astropy.time import Time
-from astropy.utils.data_info import serialize_context_as
+from astropy.table import Column, MaskedColumn
 from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.exceptions import CatalogWarning, warn
@@ -19,8 +16,6 @@ from miricigale.utils.options import check_that
 LDAC_HEADER = "LDAC_IMHEAD"
 #: What astropy writes for a missing integer, if the column has no such number.
 _NULL = 999999
-#: Characters of a description in one comment, where astropy breaks lines.
-_COMMENT = 70
 #: Types that FITS does not have, or takes for truth values, by what stands for them.
 FITS_TYPES = {np.dtype(np.int8): np.int16, np.dtype(np.float16): np.float32}
 
@@ -133,49 +128,13 @@ def table_hdu(table):
     """Binary table of a table with any columns that astropy has; its meta as `fits_meta` has it."""
     table = fits_ready(table)
     table.meta = fits_meta(table.meta)
+    stream = io.BytesIO()
     with warnings.catch_warnings():
         # units such as dex are kept for astropy, and in the descriptions
         warnings.filterwarnings("ignore", "The unit .* could not be saved", AstropyUserWarning)
-        return described_hdu(table)
-
-
-def described_hdu(table):
-    """
-    Make the binary table that ``table.write`` makes, in two thirds of its time for hundreds of columns.
-
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        Any.
-
-    Returns
-    -------
-    hdu : `~astropy.io.fits.BinTableHDU`
-        What FITS has no keywords for (descriptions, and what columns such as coordinates are made of) is in its
-        comments, as astropy reads it. These are added at the end at once, where astropy finds a place for each.
-    """
-    with serialize_context_as("fits"):
-        plain = represent_mixins_as_columns(table, exclude_classes=(Time,))
-    described = any(column.info.description or column.info.meta for column in table.itercols())
-    if plain is table and not described:
-        return fits.table_to_hdu(table, character_as_bytes=True)
-    meta = dict(plain.meta)
-    comments = meta.pop("comments", [])
-    serialized = meta.pop("__serialized_columns__", {})
-    columns = Table(plain.columns, meta={"__serialized_columns__": serialized}, copy=False)
-    lines = list(comments)
-    lines.append("--BEGIN-ASTROPY-SERIALIZED-COLUMNS--")
-    for line in get_yaml_from_table(columns):
-        # a comment has room for 72 characters
-        while len(line) > _COMMENT:
-            lines.append(line[:_COMMENT] + "\\")
-            line = line[_COMMENT:]
-        lines.append(line)
-    lines.append("--END-ASTROPY-SERIALIZED-COLUMNS--")
-    columns.meta = meta
-    hdu = fits.table_to_hdu(columns, character_as_bytes=True)
-    hdu.header.extend([("COMMENT", line) for line in lines], end=True)
-    return hdu
+        table.write(stream, format="fits")
+    stream.seek(0)
+    return fits.open(stream)[1]
 
 
 def fits_ready(table):

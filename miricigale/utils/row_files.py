@@ -19,7 +19,6 @@ from miricigale.utils.files import open_fits, reading, replacing, split_extensio
 from miricigale.utils.fits_tables import (
     LDAC_HEADER,
     check_names_differ,
-    described_hdu,
     fits_ready,
     mask_scaled_nulls,
     names_in_header,
@@ -344,7 +343,7 @@ def _fits_rows(table):
     with warnings.catch_warnings():
         # FITS does not know dex; astropy does when it reads the table
         warnings.filterwarnings("ignore", "The unit 'dex' could not be saved in native FITS")
-        described_hdu(table).writeto(file)
+        table.write(file, format="fits")
     data = file.getvalue()
     with fits.open(io.BytesIO(data)) as hdus:
         header = hdus[1].header.copy()
