@@ -5,11 +5,11 @@ from miricigale.cli.options import declarations, destination, filled, refuse
 from miricigale.utils.named_values import attributes, without_none
 
 #: CPU-seconds of a fit of an object as a galaxy, and as each other class, without and with fluxes of nuclei.
-_SECONDS = {False: 0.05, True: 0.09}
+_SECONDS = {False: 0.06, True: 0.12}
 #: The same of an injected AGN, whose narrower posterior takes more models, with the default number of these, and
 #: with as many as the catalog.
-_INJECTED_SECONDS = {False: 0.05, True: 0.14}
-_INJECTED_SECONDS_IN_FULL = {False: 0.1, True: 0.27}
+_INJECTED_SECONDS = {False: 0.06, True: 0.18}
+_INJECTED_SECONDS_IN_FULL = {False: 0.11, True: 0.35}
 #: Options of the prior and its sources.
 _OF_PRIOR = ("segmentation", "catalog", "psf_stars")
 

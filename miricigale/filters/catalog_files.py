@@ -139,6 +139,23 @@ def catalog_messages(lost, pieces):
         yield f"taken as missing, by the number that stands there: {'; '.join(parts)}"
 
 
+def _fluxes_and_errors(table, bands):
+    """Yield bands whose fluxes and errors are columns of plain numbers, with both, (n,); readers refuse others."""
+    for name in bands:
+        error = error_column(name)
+        names = (name, error)
+        if not set(names) <= set(table.colnames):
+            continue
+        if any(np.ndim(table[n]) != 1 or table[n].dtype.kind == "c" for n in names):
+            continue
+        try:
+            values = plain_floats(table[name], name, "photometry")
+            errors = plain_floats(table[error], error, "photometry")
+        except ValueError:
+            continue
+        yield name, values, errors
+
+
 def codes_of(table, bands):
     """
     Return the numbers of a table that stand for no value (`miricigale.utils.missing_values`).
@@ -156,20 +173,7 @@ def codes_of(table, bands):
         By band the number, NaN in rows that have none; as `catalog_messages` takes it.
     """
     coded = {}
-    for name in bands:
-        error = error_column(name)
-        names = (name, error)
-        if not set(names) <= set(table.colnames):
-            continue
-        # the reader of the columns refuses others
-        if any(np.ndim(table[n]) != 1 or table[n].dtype.kind == "c" for n in names):
-            continue
-        try:
-            values = plain_floats(table[name], name, "photometry")
-            errors = plain_floats(table[error], error, "photometry")
-        except ValueError:
-            # the reader of these columns raises the error
-            continue
+    for name, values, errors in _fluxes_and_errors(table, bands):
         missing, no_error = without_codes(values, errors)
         # fits leave out, and flag, zeros with zero errors and what is beyond all measurements
         missing &= (values != 0) & (np.abs(values) < _FLAGGED)
@@ -196,16 +200,7 @@ def count_negative_errors(table, bands):
         By band.
     """
     counts = Counter()
-    for name in bands:
-        error = error_column(name)
-        if not {name, error} <= set(table.colnames):
-            continue
-        try:
-            values = plain_floats(table[name], name, "photometry")
-            errors = plain_floats(table[error], error, "photometry")
-        except ValueError:
-            # the reader of these columns raises the error
-            continue
+    for name, values, errors in _fluxes_and_errors(table, bands):
         missing, no_error = without_codes(values, errors)
         is_measured = np.isfinite(values) & ~missing & ~no_error
         n_negative = np.count_nonzero(is_measured & (errors < 0))

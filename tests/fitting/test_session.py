@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.grids import node_fitter
+from miricigale.fitting.posterior.posterior import shares_between
 
 
 @pytest.fixture(scope="module")
@@ -206,3 +207,12 @@ def test_brackets_are_completed(results):
 def test_errors_are_columns_by_the_names_of_attributes(results):
     assert_array_equal(results["redshift_err"], results.redshift_err)
     assert_array_equal(results[["redshift", "mass_err"]]["mass_err"], results.std("mass"))
+
+
+@pytest.mark.parametrize("low", [0.0, 1.0])
+def test_distributions_that_are_unknown_have_no_shares(low):
+    """Of objects that are not fitted, whatever the limit, below all values too."""
+    values = np.array([[0.5, 1.5], [0.5, 1.5]])
+    levels = np.array([[0.0, 1.0], [np.nan, np.nan]])
+    shares = shares_between(values, levels, low, None)
+    assert_allclose(shares, [1.5 - max(low, 0.5), np.nan])

@@ -116,6 +116,7 @@ def shares_between(values, levels, low, high):
     Returns
     -------
     shares : `~numpy.ndarray`, shape (m,)
+        NaN of distributions that are NaN.
     """
     shares = np.empty(len(levels))
     for row, (x, y) in enumerate(zip(values, levels, strict=True)):
@@ -127,6 +128,9 @@ def shares_between(values, levels, low, high):
         if high is not None:
             above = np.interp(high, x, y, left=0.0, right=1.0)
         shares[row] = above - below
+        if np.isnan(y).any():
+            # limits beyond the values would not ask for what is not known
+            shares[row] = np.nan
     return shares
 
 
