@@ -55,7 +55,7 @@ def _tempered(seed):
     evaluated, place = _evaluate(label, score)
     log_density = np.log(LABEL_PRIOR[label]) + norm.logpdf(score).sum(axis=1)
     places = TemperedPlaces(label, score, evaluated, place, np.arange(n), 0.0)
-    return temper(_evaluate, places, log_density, ACTIVE, rng, 2048)
+    return temper(_evaluate, places, log_density, ACTIVE, rng, 2048)[0]
 
 
 @pytest.mark.slow
@@ -113,7 +113,7 @@ def test_impossible_places_count_as_such():
     label = np.zeros(8192, int)
     evaluated, place = evaluate(label, score)
     places = TemperedPlaces(label, score, evaluated, place, np.arange(8192), 0.0)
-    tempered = temper(evaluate, places, norm.logpdf(score).sum(axis=1), ACTIVE, rng, 2048)
+    tempered, _ = temper(evaluate, places, norm.logpdf(score).sum(axis=1), ACTIVE, rng, 2048)
     assert_allclose(tempered.log_evidence, np.log(is_possible.mean()), atol=1e-12)
     assert tempered.score[:, 0].min() > 0
     assert_allclose(tempered.score[:, 0].mean(), np.sqrt(2.0 / np.pi), atol=0.06)

@@ -48,6 +48,9 @@ _EFFECTIVE_PART = 0.05
 _MIN_EFFECTIVE = 30
 #: Smallest number of places with weights that results rest on.
 _MIN_RESULT_PLACES = 2048
+#: The same where errors are small, for each of the effective number that is wanted: mixtures are good at once, and
+#: few places would be in the tails.
+_MIN_NARROW_EACH = 10
 #: Share of a mixture that is divided evenly among the labels, whatever their weight.
 _GUARD = 0.05
 #: Smallest share of each peak of the nodes.
@@ -72,6 +75,8 @@ _APART = 1e6
 _LEFT_OUT = 1e-4
 #: Largest number of models that results are of.
 _MAX_MODELS = 1536
+#: The same where errors are small, and weights nearly equal: fewer would not show the tails.
+_MAX_NARROW_MODELS = 6144
 #: Part of the effective number that is wanted, of what all places that may follow would give at most, below which
 #: no more are tried.
 _HOPELESS = 0.5
@@ -143,6 +148,11 @@ class AdaptiveSampler:
         #: What results rest on.
         self.collection = None
         self._first_wanted = wanted
+        self._min_places = _MIN_RESULT_PLACES
+        self._max_models = _MAX_MODELS
+        if is_narrow:
+            self._min_places = max(_MIN_RESULT_PLACES, _MIN_NARROW_EACH * wanted)
+            self._max_models = _MAX_NARROW_MODELS
         #: Mixture fitted to the draws to begin with.
         self._broad = None
         #: `PlacedModels` of places of a rising likelihood.
@@ -280,7 +290,7 @@ class AdaptiveSampler:
             rows = sample.rows
             n = self.n - first
             n_own = self.n - begin
-            sample = replace(sample, enough=sample.enough and n >= _MIN_RESULT_PLACES)
+            sample = replace(sample, enough=sample.enough and n >= self._min_places)
             n_each = np.bincount(self.group[rows], minlength=self.n_groups)
             missing = np.maximum(sample.wanted - n_each, 0.02 * sample.wanted)
             collection.missing = missing
@@ -375,8 +385,7 @@ class AdaptiveSampler:
         self.label[new] = label
         self.score[new] = score
         self._evaluate(label, score, self.place[new], self.evaluated[new], self.flux[new])
-        if self.borders.size:
-            self.peak[new] = np.searchsorted(self.borders, self._redshift(self.place[new, 0]))
+        self.peak[new] = self._peaks_of(self.place[new])
         self.group[new] = self._groups(label, self.peak[new])
         ends = self.n + np.searchsorted(label, np.arange(len(self.labels.n_active) + 1))[None]
         self.n += size
@@ -463,7 +472,7 @@ class AdaptiveSampler:
         indices = indices[np.lexsort((self.place[rows, 0], self.label[rows]))]
         rows = sample.rows.start + indices
         is_best = rows == rows[np.argmax(self.evaluated[rows, 4])]
-        max_models = _MAX_MODELS * self.wanted // self._first_wanted
+        max_models = self._max_models * self.wanted // self._first_wanted
         indices, weight = thinned(indices, weight[indices], is_best, max_models)
         rows = sample.rows.start + indices
         return self._placed(
@@ -515,7 +524,8 @@ class AdaptiveSampler:
 
         rng = np.random.default_rng(self.scramble)
         active = active_axes(self.labels)
-        tempered = temper(evaluate, broad, log_density, active, rng, self.n_tempered)
+        number = self.n_tempered
+        tempered, broader = temper(evaluate, broad, log_density, active, rng, number)
         # neighbors in redshift, label by label
         order = np.lexsort((tempered.place[:, 0], tempered.label))
         tempered = tempered.chosen(order, tempered.log_evidence)
@@ -534,13 +544,24 @@ class AdaptiveSampler:
             converged=True,
             lineage=tempered.lineage,
         )
-        peak = np.zeros(n, np.int64)
-        if self.borders.size:
-            peak = np.searchsorted(self.borders, self._redshift(place[:, 0]))
-        equal = np.ones(n)
-        places = Places(tempered.label, tempered.score, peak, equal, equal, evaluated[:, 0])
+        peak = self._peaks_of(place)
         share = np.bincount(self._groups(tempered.label, peak), minlength=self.n_groups)
+        # with broader ones, so that parts reach into the tails, where few places are
+        places = Places(
+            label=np.concatenate([tempered.label, broader.label]),
+            score=np.concatenate([tempered.score, broader.score]),
+            peak=np.concatenate([peak, self._peaks_of(broader.place)]),
+            flat=np.ones(n + len(broader.label)),
+            weight=np.concatenate([np.ones(n), np.zeros(len(broader.label))]),
+            log_target=np.concatenate([evaluated[:, 0], broader.evaluated[:, 0]]),
+        )
         return self._fit(places, n_local=_N_LOCAL), share
+
+    def _peaks_of(self, place):
+        """Find the peaks of redshift of places in the unit interval, (n,)."""
+        if not self.borders.size:
+            return np.zeros(len(place), np.int64)
+        return np.searchsorted(self.borders, self._redshift(place[:, 0]))
 
     def _broad_places(self):
         """Draw places of the prior and of the draws to begin with: `TemperedPlaces`, and ln of their density."""

@@ -130,7 +130,10 @@ def temper(evaluate, places, log_density, active, rng, n):
 
     Returns
     -------
-    places : `TemperedPlaces`, n of them
+    places : `TemperedPlaces`
+        Of the posterior, n of them.
+    broader : `TemperedPlaces`
+        Those of the last power below 1; those to begin with if there is none.
     """
     possible = np.flatnonzero(places.evaluated[:, 0] > _NO_MODEL)
     log_share = np.log(possible.size / len(log_density))
@@ -142,6 +145,7 @@ def temper(evaluate, places, log_density, active, rng, n):
         step = _next_step(log_prior, log_like, 1.0 - power, _LEAST_EFFECTIVE * n)
         log_weight = log_prior + step * log_like
         highest = log_weight.max()
+        broader = places
         weight = np.exp(log_weight - highest)
         log_evidence = places.log_evidence + highest + np.log(weight.mean())
         places = places.chosen(systematic(weight, n), log_evidence)
@@ -154,7 +158,7 @@ def temper(evaluate, places, log_density, active, rng, n):
             n_sweeps = _N_LAST_SWEEPS
         _move(evaluate, places, active, power, n_sweeps, rng)
         if is_last:
-            return places
+            return places, broader
 
 
 def _move(evaluate, places, active, power, n_sweeps, rng):
