@@ -6,10 +6,10 @@ from miricigale.cli.options import filled
 def reduce(args):
     """Reduce exposures."""
     from miricigale.reduction.commands.from_files import reduce_files
-    from miricigale.utils.options import check_data
+    from miricigale.utils.options import check_is_file
 
     for path in args.paths:
-        check_data(path.is_file(), "no file", path)
+        check_is_file(path)
     table = reduce_files(**filled(args, reduce_files), reducer=reducer_of(args))
     failed = table[table["status"] == "failed"]
     for row in failed:

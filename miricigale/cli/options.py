@@ -50,14 +50,15 @@ def _meant(name):
 
 def _nearest_command(name, names):
     """Say which command, or choice, may be meant; empty if none is near."""
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
-    if close:
-        return _meant(close[0])
+    # what is meant is more than what is spelled alike
     if "run" in names and name in _other_names("no_commands"):
         return f"; {_other_names('no_commands')[name]}"
     command = _other_names("commands").get(name)
     if command in names or command == "--help":
         return _meant(command)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    if close:
+        return _meant(close[0])
     return ""
 
 

@@ -7,7 +7,7 @@ from miricigale.cli.bibliography import bibtex
 from miricigale.utils.options import check_that
 from miricigale.utils.outputs import check_output
 
-#: Endings of files that may name what to cite.
+#: Endings of files that may be products.
 _PRODUCTS = (".fits", ".fit", ".gz", ".ecsv", ".parquet", ".asdf")
 
 
@@ -49,12 +49,12 @@ def open_product(path):
     from astropy.io.registry import IORegistryError
 
     from miricigale.utils.exceptions import data_error
-    from miricigale.utils.options import check_data
+    from miricigale.utils.options import check_is_file
 
     # of a reader for a file of another kind
     unsuitable = (OSError, ValueError, KeyError, TypeError, IORegistryError)
     path = Path(path)
-    check_data(path.is_file(), "no file", path)
+    check_is_file(path)
     if path.suffix.lower() == ".ini":
         from miricigale.cigale import read_pcigale_ini
 
@@ -76,9 +76,13 @@ def open_product(path):
 
 
 def show(args):
-    """Say what a file is, and draw it."""
+    """Say what a file is, and draw it; or what the files of a folder are."""
     from astropy.table import Table
 
+    if args.file.is_dir():
+        check_that(args.picture is None, "picture", "left out for a folder", args.picture)
+        show_folder(args.file)
+        return 0
     product = open_product(args.file)
     print(f"{args.file}: {type(product).__name__}")
     if isinstance(product, Table):
@@ -108,6 +112,44 @@ def show(args):
     plt.close()
     print(f"picture: {picture}")
     return 0
+
+
+def show_folder(folder):
+    """
+    Print what the products in a folder and below are, one line each.
+
+    Parameters
+    ----------
+    folder : `~pathlib.Path`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there are none.
+    """
+    from astropy.table import Table
+
+    from miricigale.utils.options import check_data
+
+    files = _product_files(folder)
+    check_data(files, folder, f"has no files of products ({', '.join(_PRODUCTS)})")
+    for file in files:
+        try:
+            product = open_product(file)
+        except OSError:
+            print(f"{file}: nothing that can be read")
+            continue
+        if isinstance(product, Table):
+            line = f"{len(product)} rows, {len(product.columns)} columns"
+        else:
+            line = repr(product).splitlines()[0]
+        print(f"{file}: {type(product).__name__}, {line}")
+
+
+def _product_files(folder):
+    """Return the files in a folder and below that may be products, in order."""
+    files = sorted(folder.rglob("*"))
+    return [file for file in files if file.suffix.lower() in _PRODUCTS and file.is_file()]
 
 
 def psf(args):
@@ -175,9 +217,7 @@ def citations_of(path):
     if not path.is_dir():
         return list(getattr(open_product(path), "meta", {}).get("citations", ()))
     citations = {}
-    for file in sorted(path.rglob("*")):
-        if file.suffix.lower() not in _PRODUCTS:
-            continue
+    for file in _product_files(path):
         try:
             product = open_product(file)
         except OSError:

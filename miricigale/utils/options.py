@@ -8,6 +8,8 @@ from miricigale.utils.exceptions import argument_error, data_error, unknown_name
 
 #: Letters of what came that a message shows; of anything longer it has the class.
 _LONGEST = 80
+#: Files of a folder that a message names.
+_MAX_FILES = 3
 
 
 def check_that(good, name, wanted, got):
@@ -64,6 +66,40 @@ def check_data(good, path, problem):
     """
     if not good:
         raise data_error(path, problem)
+
+
+def check_is_file(path):
+    """
+    Refuse a path that is no file; a folder is told from what does not exist, with some of its files.
+
+    Parameters
+    ----------
+    path : `~pathlib.Path`
+        The path.
+
+    Raises
+    ------
+    DataError
+        If there is no such file, or it is a folder.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from miricigale.utils.options import check_is_file
+    >>> check_is_file(Path("absent.fits"))
+    Traceback (most recent call last):
+    ...
+    miricigale.utils.exceptions.DataError: no file absent.fits
+    """
+    if path.is_dir():
+        files = sorted(file.name for file in path.iterdir() if file.is_file())
+        problem = "is a folder, wanted is a file"
+        if files:
+            problem += f": it has {', '.join(files[:_MAX_FILES])}"
+        if len(files) > _MAX_FILES:
+            problem += f" and {len(files) - _MAX_FILES} more"
+        raise data_error(path, problem)
+    check_data(path.is_file(), "no file", path)
 
 
 def check_shape(value, shape, name):

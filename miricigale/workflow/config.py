@@ -1,6 +1,7 @@
 """Typed run configuration: frozen dataclasses from TOML, strict about every key."""
 
 from importlib import resources
+from pathlib import Path
 from typing import ClassVar
 
 from miricigale.refdata import resources as known_resources
@@ -223,6 +224,8 @@ def load_config(source, *, quick=False, overrides=None):
             msg = "--quick belongs to presets; a configuration file already says how long to expose"
             raise ConfigError(msg)
         texts = [(source, read_text(source))]
+    elif Path(source).is_dir() and source not in preset_names():
+        raise ConfigError(_folder_problem(Path(source)))
     else:
         check_names([source], "preset", preset_names())
         names = [f"{source}.toml"]
@@ -231,3 +234,11 @@ def load_config(source, *, quick=False, overrides=None):
         folder = resources.files("miricigale.workflow") / "presets"
         texts = [(name, (folder / name).read_text(encoding="utf-8")) for name in names]
     return StudyConfig.from_texts(texts, overrides)
+
+
+def _folder_problem(folder):
+    """Say what to run in place of a folder."""
+    file = folder / "config.toml"
+    if file.is_file():
+        return f"{folder} is a folder; 'miricigale run {file} -o {folder}' resumes the run in it"
+    return f"{folder} is a folder without a config.toml, wanted is a preset or a configuration file"

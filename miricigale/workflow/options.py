@@ -123,6 +123,8 @@ def of_option(label, *errors):
 def read_text(path):
     """Return the text of a configuration file; a `ConfigError` names one that cannot be read."""
     path = Path(path).expanduser()
+    if path.is_dir():
+        raise config_error(path, "is a folder, wanted is a configuration file (TOML)")
     if not path.is_file():
         raise config_error("no configuration file", path)
     try:

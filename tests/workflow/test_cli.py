@@ -243,6 +243,11 @@ def test_help_names_presets_and_surveys(capsys):
         (["photometry", "a", "b", "--error", "c", "--weight", "d"], "must be at most one of them"),
         (["reduce", "absent_uncal.fits", "-o", "out"], "miricigale: no file absent_uncal.fits"),
         (["show", "absent.fits"], "miricigale: no file absent.fits"),
+        (["show", "."], "has no files of products (.fits, "),
+        (["reduce", ".", "-o", "x"], "is a folder, wanted is a file"),
+        (["run", "."], "is a folder without a config.toml, wanted is a preset or a configuration"),
+        (["calibrate", "c.fits"], "'--calibrate COLUMN' with known redshifts"),
+        (["convert", "a", "b"], "Table.read(FILE).write(OTHER) in Python"),
         (["-v", "-q", "filters"], "not allowed with argument"),
     ],
 )
@@ -361,6 +366,13 @@ def test_products_are_shown_cited_and_have_psfs(capsys, tmp_path, monkeypatch):
     assert Path("mine.png").read_text() == "mine"
     command(capsys, "show", "mosaic.fits", "--picture", "mine.png", "--overwrite")
     assert Path("mine.png").read_bytes().startswith(b"\x89PNG")
+    # a folder: its products, one line each
+    lines = command(capsys, "show", ".").out.splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["a_uncal.fits", "mosaic.fits", "t.ecsv"]
+    assert lines[0].startswith("a_uncal.fits: Ramp, ")
+    assert lines[2] == "t.ecsv: QTable, 2 rows, 1 columns"
+    told = command(capsys, "show", ".", "--picture", status=2).err
+    assert "--picture must be left out for a folder" in told
     assert command(capsys, "cite", "t.ecsv").out == "Nobody 2030\n"
     assert "ApJ 908, 144" in command(capsys, "cite").out
     # a folder names all of its products, BibTeX each once
