@@ -25,6 +25,10 @@ FRAMES = ("detector", "sky")
 _FACTS = ("pixel_scale", "frame", "oversampling", "origin", "angle", "includes", "filter")
 _FACTS += ("total_known", "position", "subarray", "pa_aper")
 
+#: Sums of an array with one value a pixel that are the part of the light in it: below, an image in any unit is
+#: meant, and above, one that was normalized on its grid.
+_STATED_PART = (0.85, 0.995)
+
 #: What the PSFs of a `PSFGrid` have in common.
 SHARED = ("frame", "angle", "includes", "filter", "total_known", "subarray")
 
@@ -509,7 +513,8 @@ def from_photutils(model, pixel_scale, *, x=None, y=None, **options):
     Parameters
     ----------
     model : `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel` or what `as_psf` takes
-        Normalized as photutils asks: sum ``oversampling**2`` over the infinite plane.
+        Normalized as photutils asks: sum ``oversampling**2`` over the infinite plane. An array or kernel whose
+        sum is 0.85 to 0.995 holds that part of the light; of any other sum it is normalized to 1.
     pixel_scale : `~astropy.units.Quantity`
         Pixel of the image that it is for.
     x, y : float, optional
@@ -535,19 +540,35 @@ def from_photutils(model, pixel_scale, *, x=None, y=None, **options):
     >>> print(f"{psf.fwhm:.3f}")
     0.300 arcsec
     """
+    part = _stated_part(model)
     model = as_psf(model, "model")
     oversampling = np.atleast_1d(model.oversampling)
     if np.any(oversampling != oversampling[0]):
         raise argument_error("model", "oversampled alike in x and y", oversampling.tolist())
     cells = int(oversampling[0])
     if isinstance(model, ImagePSF):
-        data = model.data
+        data = model.data * part
         options["origin"] = tuple(model.origin)
     else:
         check_that(x is not None and y is not None, "x, y", "given for a GriddedPSFModel", (x, y))
         yy, xx = (centered(n) * (1.0 / cells) for n in model.data.shape[1:])
         data = model.evaluate(*np.meshgrid(xx + x, yy + y), 1.0, x, y)
     return make_psf(data, pixel_scale, oversampling=cells, **options)
+
+
+def _stated_part(values):
+    """
+    Return the part of the light that an array or kernel states by its sum; 1 if its sum states none.
+
+    The same as of a file, whose sum `make_psf` takes for it.
+    """
+    array = getattr(values, "array", values)
+    if isinstance(values, (ImagePSF, GriddedPSFModel)) or not isinstance(array, np.ndarray):
+        return 1.0
+    total = float(np.sum(floats(array)))
+    if _STATED_PART[0] <= total < _STATED_PART[1]:
+        return total
+    return 1.0
 
 
 def _half_width(data, origin):
