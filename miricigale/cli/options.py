@@ -76,10 +76,12 @@ def _nearest_option(flag, names):
     option, sentence = _other_names("sentences").get(word, (None, ""))
     if option in flags:
         return f"; {sentence}"
-    # the last word of an option, such as --unit for --flux-unit
+    # the last word of an option, such as --unit for --flux-unit, or its first letters
     ending = [name for name in flags if name.endswith("-" + word_typed)]
-    if len(ending) == 1:
-        return _meant(ending[0])
+    beginning = [name for name in flags if name.startswith("--" + word_typed)]
+    for likely in (ending, beginning):
+        if len(likely) == 1:
+            return _meant(likely[0])
     # the dashes that all have make short names seem alike
     full_names = {name.lstrip("-"): name for name in flags}
     close = difflib.get_close_matches(word_typed, full_names, n=1, cutoff=0.65)
@@ -274,7 +276,10 @@ def make_parser(argv):
     group.add_argument("-v", "--verbose", action="store_true", help="say what is done")
     group.add_argument("-q", "--quiet", action="store_true", help="errors and warnings only")
     description = "Plan and analyze JWST/MIRI deep imaging."
-    parser = Parser(prog="miricigale", description=description, parents=[verbosity])
+    # a part of a name of another program, such as --model, would be taken for an option of ours
+    parser = Parser(
+        prog="miricigale", description=description, parents=[verbosity], allow_abbrev=False
+    )
     parser.add_argument("--version", action="store_true", help="print the version and stop")
     # parsers of commands by the name of their group, empty for that of the program
     parsers = {"": parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)}
@@ -291,6 +296,7 @@ def make_parser(argv):
             epilog="examples:\n  " + "\n  ".join(command["examples"]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             parents=[verbosity],
+            allow_abbrev=False,
         )
         if "call" not in command:
             parsers[name] = command_parser.add_subparsers(

@@ -86,7 +86,10 @@ def show(args):
     product = open_product(args.file)
     print(f"{args.file}: {type(product).__name__}")
     if isinstance(product, Table):
-        product.info("stats")
+        with warnings.catch_warnings():
+            # astropy formats statistics of columns without a value
+            warnings.simplefilter("ignore", FutureWarning)
+            product.info("stats")
     elif hasattr(product, "summary"):
         print(product.summary())
     else:

@@ -106,6 +106,9 @@ def depth(args):
 
 def _take_bands(args):
     """Take bands without an option as those of ``--bands``."""
+    for name in args.positional:
+        wanted = f"names of filters (a time is --time {name}, a magnitude --depth {name})"
+        check_that(not name[0].isdigit(), "BANDS", wanted, name)
     if args.positional:
         check_that(args.bands is None, "bands", "left out beside bands without it", args.bands)
         args.bands = args.positional
@@ -139,6 +142,11 @@ def plan(args):
         check_output(path, "output", overwrite=True, inputs=[args.config])
     # known at once, where fits take minutes
     Planner(config).exposure_table().pprint_all()
+    n_fits = len(config.exposures.sets) + 1
+    print(
+        f"what they yield follows from {n_fits} fits of a mock survey, some minutes; table and page: {folder}",
+        flush=True,
+    )
     begin = time.monotonic()
     with threads(config.plan.threads or None) as executor:
         comparison = write_plan(

@@ -235,6 +235,9 @@ def test_help_names_presets_and_surveys(capsys):
             "--bands must be left out beside bands without it",
         ),
         (["depth", "F444W"], "no imaging filter 'F444W'"),
+        (["depth", "F1500W", "3600"], "must be names of filters (a time is --time 3600, a magn"),
+        (["fit", "a.fits", "--model", "survey"], "--model survey; did you mean '--axes'?"),
+        (["fit", "a.fits", "--interp", "9"], "--interp 9; did you mean '--interpolate'?"),
         (
             ["run", "goodss", "--quick", "--plan", "--until", "mosaic"],
             "--until is 'mosaic', which is no",
