@@ -282,6 +282,11 @@ class ForcedPhotometer(Interactive):
             catalog = segmentation
             segmentation = None
         if isinstance(self.kernel, SampledPSFs):
+            # read once, so that what a file lacks is said once
+            if not are_exposures(image):
+                image = as_mosaic(image, "image")
+            if highres is not None:
+                highres = as_mosaic(highres, "highres")
             options = {"segmentation": segmentation, "catalog": catalog, "templates": templates}
             return self.on_pixels(image, highres).measure(image, highres, **options)
         if are_exposures(image):

@@ -463,12 +463,14 @@ class MosaicFile:
 
     def _tell_scale(self, kind, scale):
         """Log the noise of the sky in units of the map's errors; warn if it is far from 1."""
-        done = "which are scaled by it" if kind == "weight" else "which are kept"
-        text = "%s: noise is %.4g times the errors of the %s map, %s"
+        done = "errors are kept"
+        if kind == "weight":
+            done = "errors are multiplied by it"
+        text = "%s: noise is %.4g times the errors of the %s map; %s"
         _log.info(text, self.path, scale, kind, done)
         if not 1 / _ODD_SCALE < scale < _ODD_SCALE:
             msg = (
-                f"{self.path}: noise on the sky is {scale:.4g} times what the {kind} map says, {done}; "
+                f"{self.path}: noise on the sky is {scale:.4g} times what the {kind} map says ({done}); "
                 "is it the map of this image, in its unit?"
             )
             warn(msg, PhotometryWarning)
