@@ -5,8 +5,8 @@ import functools
 import numpy as np
 import scipy.fft
 
+from miricigale.photometry._core.profile_images import draw_curves, make_plan
 from miricigale.photometry._core.sampling import box_response
-from miricigale.photometry._core.shape_fits import draw_curves, make_plan
 from miricigale.photometry._core.shapes import fill_curves, profile_of, profile_table
 from miricigale.utils.missing_values import floats
 
@@ -42,7 +42,7 @@ class ShapeModels:
         return self._responses[size]
 
     def plan(self, size):
-        """Return the `~miricigale.photometry._core.shape_fits.Plan` of squares of an odd size (pixels)."""
+        """Return the `~miricigale.photometry._core.profile_images.Plan` of squares of an odd size (pixels)."""
         if size not in self._plans:
             self._plans[size] = make_plan(size, self._transform(_period((size,))), _PASSED)
         return self._plans[size]

@@ -8,7 +8,8 @@ import numpy as np
 import scipy.linalg
 from astropy.nddata import NoOverlapError, overlap_slices
 
-from miricigale.photometry._core.shape_fits import Plan, minimum, parameter_limits
+from miricigale.photometry._core.profile_images import Plan
+from miricigale.photometry._core.shape_fits import minimum, parameter_limits
 from miricigale.photometry._core.shapes import profile_table
 from miricigale.photometry._core.source_fits import (
     GAIN,

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 import scipy.ndimage
 
-from miricigale.photometry._core.shape_fits import Plan, draw_curves
+from miricigale.photometry._core.profile_images import Plan, draw_curves
 from miricigale.photometry._core.shapes import INDEX_RANGE, shape_curves
 from miricigale.photometry._core.source_fits import POINT_SIZE
 from miricigale.photometry.detection.cutouts import Cutout
@@ -46,7 +46,7 @@ class DrawnCutout:
     """
 
     plan: Plan
-    curve: np.ndarray  # As `~miricigale.photometry._core.shape_fits.draw_curves` takes it.
+    curve: np.ndarray  # As `~miricigale.photometry._core.profile_images.draw_curves` takes it.
     #: Place of its center on the square.
     x: float
     y: float
