@@ -20,6 +20,7 @@ from miricigale.fitting.data.nuclei import (
     with_units,
 )
 from miricigale.fitting.data.whole_points import WholePoints
+from miricigale.fitting.fitter_text import engine_name
 from miricigale.fitting.posterior.priors import known_redshifts
 from miricigale.fitting.results.results import FitResults
 from miricigale.utils.arrays import nans
@@ -45,12 +46,6 @@ class CatalogFits(Interactive):
     photometry.
     """
 
-    @property
-    def _engine_name(self):
-        if isinstance(self.engine, str):
-            return self.engine
-        return repr(self.engine)
-
     def _settings(self, filters=None):
         """Return what `~miricigale.fitting.BayesFitter.settings` does."""
         optional = {}
@@ -63,7 +58,7 @@ class CatalogFits(Interactive):
         if self.nuclei is True:
             optional["nuclear_stars"] = float(self.backend.given.nuclear_stars)
         return {
-            "engine": self._engine_name,
+            "engine": engine_name(self),
             "filters": list(filters or self.filters or self.bands),
             "model_error": dict(self._reader.model_error),
             "error_floor": dict(self._reader.error_floor),

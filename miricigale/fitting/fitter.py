@@ -6,13 +6,14 @@ from miricigale.filters.band_names import known_filter
 from miricigale.fitting.catalog_fits import CatalogFits
 from miricigale.fitting.data import fitted_bands
 from miricigale.fitting.data.likelihood import PhotometryReader, filter_names, per_band
-from miricigale.fitting.data.nuclei import WHOLE
 from miricigale.fitting.fitter_options import (
+    check_nuclei,
     check_scale_error,
     chosen_settings,
     errors_of_expected_flux,
     fitted_names,
 )
+from miricigale.fitting.fitter_text import facts, representation
 from miricigale.fitting.grid.grid_fit import GridFit
 from miricigale.fitting.results.pulls import warn_of_pulls
 from miricigale.fitting.results.sample_flags import (
@@ -27,7 +28,6 @@ from miricigale.fitting.survey.defaults import (
     DEFAULT,
     axes_of,
     chosen_calibration,
-    errors_and_priors,
     models_and_bands,
     own_curves,
     warn_of_changed_axes,
@@ -278,9 +278,7 @@ class BayesFitter(CatalogFits):
                 settings = replace(settings, mass_function=calibration.mass_function)
         self.engine = engine
         self.calibration = calibration
-        has_choice = isinstance(nuclei, bool) or nuclei == WHOLE
-        check_that(has_choice, "nuclei", f"True or False, or {WHOLE!r}", repr(nuclei))
-        check_that(on_grid or not nuclei, "nuclei", "False with a sampler", repr(nuclei))
+        check_nuclei(nuclei, engine)
         self.nuclei = nuclei
         self.template_error = of_grid["template_error"]
         self.model = None
@@ -432,29 +430,10 @@ class BayesFitter(CatalogFits):
         return new
 
     def _facts(self):
-        if self.waits:
-            return {
-                "BayesFitter": self._engine_name,
-                "models": repr(self.model),
-                "bands": "of the photometry",
-            }
-        return {
-            "BayesFitter": self._engine_name,
-            "models": repr(self.grid or self.model),
-            "bands": ", ".join(self.filters or self.bands),
-            "errors and priors": errors_and_priors(self),
-        }
+        return facts(self)
 
     def __repr__(self):
-        bands = "bands of the photometry"
-        if self.filters is not None:
-            bands = f"{len(self.filters)} bands"
-        if self.waits:
-            return f"<BayesFitter of {self.model!r}, {bands}>"
-        if self.engine == "grid":
-            return f"<BayesFitter of {self.grid!r}, {bands}>"
-        names = ", ".join(self.priors)
-        return f"<BayesFitter of {self.model!r}, {bands}, {self._engine_name}, free: {names}>"
+        return representation(self)
 
     @takes_other_keywords
     def fit(

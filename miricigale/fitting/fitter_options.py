@@ -1,6 +1,7 @@
 """Checks of the options of a fitter, before anything is made of them."""
 
 from miricigale.fitting.data.likelihood import filter_names, is_filter
+from miricigale.fitting.data.nuclei import WHOLE
 from miricigale.fitting.data.settings import GridSettings, SamplerSettings
 from miricigale.fitting.survey.band_errors import long_instruments
 from miricigale.utils.exceptions import argument_error
@@ -58,6 +59,13 @@ def check_scale_error(scale_error, compat):
         if compat:
             wanted = "False with compat='cigale'"
         raise argument_error("scale_error", wanted, repr(scale_error))
+
+
+def check_nuclei(nuclei, engine):
+    """Raise a `ValueError` if ``nuclei`` is none, or asked of a sampler."""
+    is_choice = isinstance(nuclei, bool) or nuclei == WHOLE
+    check_that(is_choice, "nuclei", f"True or False, or {WHOLE!r}", repr(nuclei))
+    check_that(engine == "grid" or not nuclei, "nuclei", "False with a sampler", repr(nuclei))
 
 
 def errors_of_expected_flux(bands, error_part):

@@ -25,7 +25,7 @@ from miricigale.fitting import (
     leave_out,
 )
 from miricigale.fitting.catalogs.class_names import chosen_classes
-from miricigale.fitting.survey.defaults import statement
+from miricigale.fitting.fitter_text import statement
 from miricigale.photometry import ErrorModel
 from miricigale.sed import SEDModel, presets
 from miricigale.utils.exceptions import FitWarning

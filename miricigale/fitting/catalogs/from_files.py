@@ -122,7 +122,7 @@ def fit_catalog(
     check_that(not nuclei or nucleus_columns(rows.colnames), "path", wanted, f"{rows.colnames}")
     # heavy imports only after the file was checked
     from miricigale.fitting import BayesFitter, GridSettings, fit_file
-    from miricigale.fitting.survey.defaults import statement
+    from miricigale.fitting.fitter_text import statement
     from miricigale.sed import SEDModel
     from miricigale.sed.components import GalacticExtinction
     from miricigale.sed.presets import grid_name
