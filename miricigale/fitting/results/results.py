@@ -1,6 +1,5 @@
 """What a fit returns: posteriors of the objects of a catalog."""
 
-import html
 import re
 from dataclasses import field
 
@@ -21,6 +20,7 @@ from miricigale.fitting.posterior.quantities import DERIVED_LEVELS, kept_percent
 from miricigale.fitting.results import drawing, histories, inference_data
 from miricigale.fitting.results.posterior_weights import PosteriorWeights
 from miricigale.fitting.results.result_tables import flux_table, reduced_chi2, result_table
+from miricigale.fitting.results.results_text import html_representation, representation
 from miricigale.fitting.results.sample_flags import worst_bands
 from miricigale.fitting.results.table_columns import OUTLIER, TEXTS
 from miricigale.utils.arrays import nans
@@ -35,8 +35,6 @@ from miricigale.utils.values import value_class
 CIGALE_LEAST_STD = 0.05
 #: Methods by the ending of a name, which are no columns of the table.
 _STATISTICS = {"err": "std", "median": "median"}
-#: Objects that a notebook shows.
-_SHOWN = 20
 
 
 @value_class
@@ -200,27 +198,10 @@ class FitResults(FitRows):
         super().__post_init__()
 
     def __repr__(self):
-        bands = f"{len(self.filters)} bands"
-        calibration = self.meta.get("fit", {}).get("calibration")
-        if calibration:
-            bands += f", errors and priors of {calibration}"
-        if self.isscalar:
-            key = np.asarray(self.ids).item()
-            flags = ""
-            if self.flags:
-                flags = f", {self.flags}"
-            text = f"chi2 {self.chi2:.4g} in {self.n_bands} of {bands}{flags}"
-            return f"<FitResults of {key!r}, {text}>"
-        good = int(np.count_nonzero(self.fitted))
-        n = len(self)
-        return f"<FitResults of {n} object{'s' * (n != 1)}, {good} fitted, {bands}>"
+        return representation(self)
 
     def _repr_html_(self):
-        table = self._several()[:_SHOWN].to_table()._repr_html_()
-        shown_text = ""
-        if not (self.isscalar or len(self) <= _SHOWN):
-            shown_text = f", the first {_SHOWN}"
-        return f"<p>{html.escape(repr(self))}{shown_text}</p>{table}"
+        return html_representation(self)
 
     @property
     def fitted(self):
@@ -333,10 +314,16 @@ class FitResults(FitRows):
             return self.median(name)
         if isinstance(name, str):
             parameter, _, suffix = name.rpartition("_")
-            parameter = self._named(parameter)
-            if parameter in self.parameters and suffix in _STATISTICS:
-                return getattr(self, _STATISTICS[suffix])(parameter)
+            statistic = self._statistic(self._named(parameter), suffix)
+            if statistic is not None:
+                return statistic
         return super()._column(name)
+
+    def _statistic(self, parameter, suffix):
+        """Return the errors or medians of a parameter, by the ending of a name; None if it is another."""
+        if parameter in self.parameters and suffix in _STATISTICS:
+            return getattr(self, _STATISTICS[suffix])(parameter)
+        return None
 
     def _value(self, name):
         # copies that are not complete have no axes yet
@@ -345,8 +332,9 @@ class FitResults(FitRows):
         if name in self.parameters:
             return self.median(name)
         parameter, _, suffix = name.rpartition("_")
-        if parameter in self.parameters and suffix in _STATISTICS:
-            return getattr(self, _STATISTICS[suffix])(parameter)
+        statistic = self._statistic(parameter, suffix)
+        if statistic is not None:
+            return statistic
         if parameter in self.parameters and suffix in TEXTS["parameter"]:
             # a column of the table, such as redshift_p16
             column = self.to_table()[name]
