@@ -175,18 +175,13 @@ def at_epoch(sky, epoch, argument):
             "stay where they are"
         )
         warn(msg, CatalogWarning)
-    ra = floats(positions.ra.rad)
-    dec = floats(positions.dec.rad)
-    zero = np.zeros_like(ra)
-    vector = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    to_east = np.stack([-np.sin(ra), np.cos(ra), zero])
-    to_north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     years = (epoch - sky.obstime).to_value(u.yr)
-    moved = vector + years * (to_east * east + to_north * north)
-    new_ra = np.arctan2(moved[1], moved[0])
-    new_dec = np.arctan2(moved[2], np.hypot(moved[0], moved[1]))
-    still = ~moving
-    return SkyCoord(np.where(still, ra, new_ra), np.where(still, dec, new_dec), unit="rad")
+    # the length of the motion is that of the tangent
+    distance = np.arctan(np.where(moving, years * np.hypot(east, north), 0.0)) * u.rad
+    moved = positions.directional_offset_by(np.arctan2(east, north) * u.rad, distance)
+    ra = np.where(moving, floats(moved.ra.deg), floats(positions.ra.deg))
+    dec = np.where(moving, floats(moved.dec.deg), floats(positions.dec.deg))
+    return SkyCoord(ra, dec, unit="deg")
 
 
 def as_positions(table, argument, wcs=None, *, missing=False, epoch=None, motions=False):
