@@ -23,6 +23,7 @@ from miricigale.plotting.comparison import plot_redshifts
 from miricigale.utils.arrays import finite_values, thinning_step
 from miricigale.utils.named_values import convert_values, without
 from miricigale.utils.package_tables import declared
+from miricigale.utils.tables import row_dicts
 
 #: Largest number of examples on the page.
 _N_EXAMPLES = 6
@@ -247,18 +248,14 @@ def _calibration(page, calibration):
         page.section("calibration", "bands_only", name=calibration.name)
     else:
         page.section("calibration", "text", name=calibration.name)
-        page.table("scores", _rows(calibration.scores))
-    rows = _rows(calibration.bands)
+        page.table("scores", row_dicts(calibration.scores))
+    rows = row_dicts(calibration.bands)
     for row in rows:
         if row["zero_point_err"] == 0:
             row["zero_point_err"] = np.nan
         if row["n"] == 0:
             row |= {"n": "prior", "zero_point_err": np.nan, "wrong": np.nan}
     page.table("bands", rows)
-
-
-def _rows(table):
-    return [dict(zip(table.colnames, row, strict=True)) for row in table.iterrows()]
 
 
 def _step(n):

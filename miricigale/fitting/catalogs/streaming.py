@@ -29,13 +29,13 @@ from miricigale.fitting.results.io import (
     FORMAT,
     FitFolder,
     open_results,
-    part_chi2,
-    part_flags,
+    part_columns,
     part_ids,
     part_name,
     write_part,
 )
 from miricigale.fitting.results.pulls import warn_of_pulls
+from miricigale.fitting.results.result_tables import reduced_chi2
 from miricigale.fitting.results.sample_flags import chi2_limit, chi2_step, warn_of_unconverged
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import (
@@ -210,18 +210,22 @@ def fit_file(
     return open_results(path_out, model=fitter.model, curves=fitter.curves)
 
 
+def _columns_of_parts(folder, n_parts, *names):
+    """Read columns of all parts together: an array for each name."""
+    parts = [part_columns(folder.path(part_name(i)), *names) for i in range(n_parts)]
+    return map(np.concatenate, zip(*parts, strict=True))
+
+
 def _chi2_limit(folder, n_parts):
     """Compute the reduced chi2 above which a fit is poor, from all parts."""
-    parts = [part_chi2(folder.path(part_name(i))) for i in range(n_parts)]
-    step = chi2_step(sum(map(len, parts)))
-    return chi2_limit(np.concatenate(parts)[::step])
+    chi2 = reduced_chi2(*_columns_of_parts(folder, n_parts, "chi2", "n_bands"))
+    return chi2_limit(chi2[:: chi2_step(len(chi2))])
 
 
 def _warn_of_unconverged(fitter, folder, n_parts):
     """Warn of fits that are not converged, of all parts together."""
-    parts = [part_flags(folder.path(part_name(i))) for i in range(n_parts)]
-    flags, fitted = map(np.concatenate, zip(*parts, strict=True))
-    warn_of_unconverged(flags, fitted, fitter.settings().get("interpolate"))
+    flags, chi2 = _columns_of_parts(folder, n_parts, "flags", "chi2")
+    warn_of_unconverged(flags, np.isfinite(chi2), fitter.settings().get("interpolate"))
 
 
 @contextlib.contextmanager

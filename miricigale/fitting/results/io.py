@@ -9,7 +9,6 @@ import numpy as np
 from astropy.table import Table, vstack
 
 from miricigale.fitting.posterior.priors import GridAxis
-from miricigale.fitting.results.result_tables import reduced_chi2
 from miricigale.fitting.results.results import FitResults
 from miricigale.fitting.results.sample_flags import with_high_chi2
 from miricigale.fitting.results.samples import Samples
@@ -229,26 +228,16 @@ def part_name(i):
     return f"part-{i:05d}.fits"
 
 
+def part_columns(path, *names):
+    """Read columns of plain numbers or text of a part by name, without the rest: list of arrays."""
+    with open_fits(path, wanted="fit results", memmap=True) as hdus:
+        data = hdus["RESULTS"].data
+        return [native(np.array(data[name])) for name in names]
+
+
 def part_ids(path):
     """Read the ids of a part, without the rest."""
-    with open_fits(path, wanted="fit results", memmap=True) as hdus:
-        return native(np.array(hdus["RESULTS"].data["ids"]))
-
-
-def part_flags(path):
-    """Read the flags of the objects of a part and which were fitted, without the rest."""
-    with open_fits(path, wanted="fit results", memmap=True) as hdus:
-        data = hdus["RESULTS"].data
-        return native(np.array(data["flags"])), np.isfinite(native(np.array(data["chi2"])))
-
-
-def part_chi2(path):
-    """Read the reduced chi2 of the objects of a part, without the rest; NaN of a single band."""
-    with open_fits(path, wanted="fit results", memmap=True) as hdus:
-        data = hdus["RESULTS"].data
-        chi2 = native(np.array(data["chi2"]))
-        n_bands = native(np.array(data["n_bands"]))
-    return reduced_chi2(chi2, n_bands)
+    return part_columns(path, "ids")[0]
 
 
 def open_results(path, *, partial=False, model=None, curves=()):
