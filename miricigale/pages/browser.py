@@ -4,7 +4,6 @@ import functools
 import json
 import zlib
 from importlib import resources
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -74,6 +73,36 @@ def source_pages(save, folder, names, title, facts, order, shown, entry, sheet=N
         script=Markup(script.read_text("utf-8")),
     )
     _save_text(save, f"{folder}/{names[0]}.html", page)
+
+
+def pages_beside(report, name, title, facts, order, shown, entry, sheet=None):
+    """
+    Write the page of sources beside another page, to which it links back, and the files that it loads.
+
+    Parameters
+    ----------
+    report : `pathlib.Path`
+        The other page.
+    name : str
+        Of the page without its ending, and of the folder of its files.
+    title, facts, order, shown, entry, sheet
+        As for `source_pages`.
+
+    Returns
+    -------
+    name : str
+        Of the file.
+    """
+
+    def save(file_name, write):
+        place = report.parent / file_name
+        make_folder(place.parent)
+        with replacing(place) as partial:
+            write(partial)
+
+    facts = facts | {"report": report.name}
+    source_pages(save, ".", (name, name), title, facts, order, shown, entry, sheet)
+    return f"{name}.html"
 
 
 def list_column(key, label, title, *, group="", **options):
@@ -170,18 +199,6 @@ def image_note(layout, about):
         f"{layout['lowest']:g} times the noise and the brightest pixel of the model, or 10 times the noise if "
         "that is more."
     )
-
-
-def saver(folder):
-    """Return a function for `source_pages` that writes files into a folder, each whole or not at all."""
-
-    def save(name, write):
-        place = Path(folder) / name
-        make_folder(place.parent)
-        with replacing(place) as partial:
-            write(partial)
-
-    return save
 
 
 def _save_text(save, name, text):

@@ -9,10 +9,9 @@ from miricigale.filters.band_names import band_label
 from miricigale.pages.browser import (
     band_entries,
     list_column,
+    pages_beside,
     parameter_entries,
     rounded,
-    saver,
-    source_pages,
 )
 from miricigale.plotting.axes import MEASURED, SECOND
 from miricigale.utils.missing_values import floats
@@ -61,7 +60,6 @@ def write_browser(path, title, planner, plans):
         sets.append({"name": plan.name, "label": plan.name, "color": color})
     waves = [pivots[band] for band in bands]
     facts = _list(planner, sources, plans) | {
-        "report": path.name,
         "heading": [["redshift", "true z", 3], ["frac_agn", "true fracAGN", 2]],
         "flags": {},
         "flag_columns": [],
@@ -91,9 +89,7 @@ def write_browser(path, title, planner, plans):
 
     order = np.arange(len(sources))
     no_pictures = np.zeros(len(sources), bool)
-    names = (name, name)
-    source_pages(saver(path.parent), ".", names, title, facts, order, no_pictures, details)
-    return f"{name}.html"
+    return pages_beside(path, name, title, facts, order, no_pictures, details)
 
 
 def _list(planner, sources, plans):

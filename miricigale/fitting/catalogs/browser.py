@@ -11,11 +11,10 @@ from miricigale.pages.browser import (
     cell_weights,
     list_column,
     moments_of,
+    pages_beside,
     parameter_entries,
     rounded,
-    saver,
     shown_unit,
-    source_pages,
     spectrum_edges,
     thousandths_of_log,
 )
@@ -58,17 +57,12 @@ def write_browser(path, title, results, numbers, curves, *, step=1):
     name : str
         Of the file.
     """
-    path = Path(path)
     chosen = np.arange(0, len(numbers), browser_step(len(numbers)))
     objects = _Objects(results[step * chosen], numbers[chosen], curves)
-    facts = objects.describe() | {"report": path.name}
-
-    names = ("sources", "sources")
-    shown = np.zeros(len(chosen), bool)
-    source_pages(
-        saver(path.parent), ".", names, title, facts, np.arange(len(chosen)), shown, objects.entry
-    )
-    return "sources.html"
+    order = np.arange(len(chosen))
+    no_pictures = np.zeros(len(chosen), bool)
+    facts = objects.describe()
+    return pages_beside(Path(path), "sources", title, facts, order, no_pictures, objects.entry)
 
 
 def browser_step(n):

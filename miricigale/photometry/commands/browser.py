@@ -11,9 +11,8 @@ from miricigale.pages.browser import (
     band_entries,
     image_note,
     list_column,
+    pages_beside,
     rounded,
-    saver,
-    source_pages,
 )
 from miricigale.photometry.images.flags import ForcedFlags
 from miricigale.plotting.cutouts import Cutouts
@@ -43,19 +42,16 @@ def write_browser(path, title, bands, highres, confidence, detected):
     """
     name = _browser_name(path)
     sources = _Sources(bands, highres, confidence, detected)
-    facts = sources.describe() | {"report": path.name}
-    source_pages(
-        saver(path.parent),
-        ".",
-        (name, name),
+    return pages_beside(
+        path,
+        name,
         title,
-        facts,
+        sources.describe(),
         sources.order,
         sources.shown,
         sources.entry,
         sources.sheet,
     )
-    return f"{name}.html"
 
 
 class _Sources:
