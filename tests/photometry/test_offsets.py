@@ -194,12 +194,12 @@ def test_steps_and_errors_of_a_gaussian():
         inverse_sigma=np.full(x.shape, np.float32(1 / sigma)),
     )
     change, model = flux * (light(*moved) - light()), flux * light() + sky
-    step, _, others = source_offsets(fit, change, model, np.array([0]))
+    step, _, others = source_offsets(fit, fit.flux, change, model, np.array([0]))
     # differences of neighbors are smaller than derivatives
     smaller = 1 - 1 / (4 * width**2)
     assert_allclose(smaller * step[0], moved, rtol=0.01)
     assert_allclose(others, sky * 4 * np.pi * width**2 / flux, rtol=0.01)
-    step, error, _ = source_offsets(fit, noise, model, np.array([0]))
+    step, error, _ = source_offsets(fit, fit.flux, noise, model, np.array([0]))
     snr = flux / (2 * np.sqrt(np.pi) * width) / sigma
     assert_allclose(smaller * error, np.sqrt(2) * width / snr, rtol=0.05)
     assert (np.abs(step) < 4 * error).all()

@@ -220,6 +220,11 @@ class ExposureFit:
             self.flux[self.rows] = self.fit.flux
 
     @property
+    def psf_width(self):
+        """Rms width in pixels of the plane of a Gaussian as peaked as the mean PSF."""
+        return gaussian_width(self.settings.mean_kernel) / self.scale
+
+    @property
     def common(self):
         """The common parameters, shape (g,); zero where nothing was fitted."""
         if self.fit is None:

@@ -11,9 +11,20 @@ from miricigale.photometry.detection.residual_sources import chosen_peaks
 from miricigale.photometry.fit.exposure_fit import ExposureFit, ExposurePart
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels
 from miricigale.photometry.fit.exposure_result import joint_result, plane_peaks
-from miricigale.photometry.fit.offsets import excess_variance, row_snr, source_offsets
+from miricigale.photometry.fit.offsets import (
+    BRIGHT_SNR,
+    COMMON_OFFSET,
+    MAX_NEIGHBOR_LIGHT,
+    MAX_OFFSET,
+    MIN_SOURCES,
+    OFFSET_FLOOR,
+    OFFSET_PASSES,
+    OFFSETS_DONE,
+    row_snr,
+    shrunk_offsets,
+    source_offsets,
+)
 from miricigale.photometry.fit.result_table import CatalogRows, warn_of_none
-from miricigale.photometry.fit.template_fit import gaussian_width
 from miricigale.photometry.images.arrays import (
     fit_arrays,
     lengths,
@@ -35,19 +46,6 @@ from miricigale.utils.units import ANGLE
 #: Change of an exposure's shift (pixels) at which it is done, and how often it is looked for.
 _SHIFT_DONE = 1e-3
 _MAX_SHIFT_STEPS = 8
-
-#: Bright sources go by their own offsets: least signal-to-noise, most light of others below the template,
-#: error (pixels) that is added to all, and largest offset in rms widths of the PSF.
-_BRIGHT_SNR = 20.0
-_ISOLATED = 0.2
-_OFFSET_FLOOR = 0.01
-_LARGEST_OFFSET = 0.3
-
-#: Fewest sources from which offsets are taken, how often, and offset that all have in common
-#: (in full widths at half maximum) from which it is ``max_shift`` that is wanted.
-_FEWEST_SOURCES = 4
-_OFFSET_PASSES = 3
-_COMMON_OFFSET = 0.05
 
 #: How often positions of new sources are refined.
 _REFINED = 2
@@ -163,16 +161,6 @@ def _plane(arrays):
         sized.append(wcs)
     wcs = mosaic_wcs(sized, scale * ANGLE)
     return Plane.over(wcs, grids)
-
-
-@dataclasses.dataclass(eq=False)
-class _ExposureView:
-    """What `source_offsets` needs of an exposure."""
-
-    bank: object
-    psf_width: float
-    inverse_sigma: np.ndarray
-    flux: np.ndarray  # Of the rows of its bank.
 
 
 class _Joint:
@@ -329,7 +317,7 @@ class _Joint:
         for _ in range(_REFINED):
             step, error, _ = self._offsets(fit)
             rows = np.arange(self._n, self._n + len(new_xy))
-            width = gaussian_width(self._settings.mean_kernel) / self._scale
+            width = fit.psf_width
             good = error[rows] < 0.25 * width
             new_xy = new_xy.copy()
             new_xy[good] += np.clip(step[rows][good], -width, width)
@@ -371,9 +359,8 @@ class _Joint:
             model = fit.model(k)
             residual = fit.residual(k, model)
             flux = fit.flux[part.row_source]
-            view = _ExposureView(part.bank, part.psf_width, part.inverse_sigma, flux)
             rows = np.arange(len(part.source))
-            step, error, neighbor_light = source_offsets(view, residual, model, rows)
+            step, error, neighbor_light = source_offsets(part, flux, residual, model, rows)
             good = np.isfinite(error) & np.isfinite(step).all(axis=1) & (error > 0)
             source = part.row_source[good]
             # steps in the pixels of the plane, weighted by their errors
@@ -405,34 +392,33 @@ class _Joint:
         """
         if not len(fit.rows):
             return fit
-        width = gaussian_width(self._settings.mean_kernel) / self._scale
+        width = fit.psf_width
         offsets = np.zeros((len(fit.xy), 2))
         first_parts = self._parts
-        for _ in range(_OFFSET_PASSES):
+        for _ in range(OFFSET_PASSES):
             step, error, neighbors = self._offsets(fit)
             # bright isolated sources with a small error
             good = (
-                (row_snr(fit) > _BRIGHT_SNR)
-                & (neighbors < _ISOLATED)
+                (row_snr(fit) > BRIGHT_SNR)
+                & (neighbors < MAX_NEIGHBOR_LIGHT)
                 & ~fit.noisy
                 & np.isfinite(error)
             )
-            good &= (fit.light > 0.9).all(axis=1) & (error < width / _BRIGHT_SNR * 2)
+            good &= (fit.light > 0.9).all(axis=1) & (error < width / BRIGHT_SNR * 2)
             # their offsets, those already applied included
             measured = offsets + np.where(good[:, None], step, 0.0)
-            good &= lengths(measured) < _LARGEST_OFFSET * width
-            if np.count_nonzero(good) < _FEWEST_SOURCES:
+            good &= lengths(measured) < MAX_OFFSET * width
+            if np.count_nonzero(good) <= MIN_SOURCES:
                 break
-            error = np.hypot(error, _OFFSET_FLOOR)
+            error = np.hypot(error, OFFSET_FLOOR)
             common = np.median(measured[good], axis=0)
-            if np.hypot(common[0], common[1]) > _COMMON_OFFSET * gaussian_sigma_to_fwhm * width:
+            if np.hypot(common[0], common[1]) > COMMON_OFFSET * gaussian_sigma_to_fwhm * width:
                 break
-            scatter = excess_variance(lengths(measured[good]), error[good])
-            if scatter <= _OFFSET_FLOOR**2:
+            shrunk = shrunk_offsets(measured[good], error[good])
+            if shrunk is None:
                 break
             new = np.zeros_like(offsets)
-            # offsets shrunk by the part of their scatter that is noise
-            new[good] = measured[good] * (scatter / (scatter + error[good] ** 2))[:, None]
+            new[good] = shrunk
             change = np.abs(new - offsets).max()
             offsets = new
             moved = []
@@ -442,6 +428,6 @@ class _Joint:
                 steps = np.einsum("kij,kj->ki", inverse, offsets[part.source])
                 moved.append(part.moved(steps, like))
             fit = self._fit(moved)
-            if change < _OFFSET_FLOOR / 2:
+            if change < OFFSETS_DONE:
                 break
         return fit

@@ -143,8 +143,7 @@ def _peaks(fit, plane, xy, means, sign=1.0):
     """Find peaks of the mean residual in the plane, or of its negative; ``means`` are `_plane_means`."""
     model, residual, weight = means
     area = pixel_area_map(plane.wcs, plane.shape) * _MICRO
-    width = gaussian_width(fit.settings.mean_kernel) / fit.scale
-    view = _PlaneFit(np.sqrt(weight) / area, width, fit.parts[0].bank)
+    view = _PlaneFit(np.sqrt(weight) / area, fit.psf_width, fit.parts[0].bank)
     return residual_peaks(view, sign * residual * area, model * area, xy)
 
 

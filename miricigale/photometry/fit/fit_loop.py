@@ -215,7 +215,8 @@ class _AddedPoints:
             fit = self.fit(double, new_xy, search=False)
             rows = fit.rows[fit.bank.order[fit.rows] >= first_new]
             model = fit.model()
-            step, error, _ = source_offsets(fit, fit.residual(model), model, rows)
+            residual = fit.residual(model)
+            step, error, _ = source_offsets(fit, fit.flux, residual, model, rows)
             good = error < 0.25 * fit.psf_width
             step = np.clip(step[good], -fit.psf_width, fit.psf_width)
             new_xy[fit.bank.order[rows[good]] - first_new] += step

@@ -17,28 +17,28 @@ from miricigale.utils.units import ANGLE
 from miricigale.utils.values import value_class
 
 #: Least signal-to-noise of sources whose offsets are measured.
-_BRIGHT = 20.0
+BRIGHT_SNR = 20.0
 
 #: Largest light of neighbors relative to a source's own, both below its template.
-_ISOLATED = 0.2
+MAX_NEIGHBOR_LIGHT = 0.2
 
 #: Least number of sources for each term of the map.
-_SOURCES = 3
+MIN_SOURCES = 3
 
 #: Least error (pixels) of a measured offset.
-_FLOOR = 0.01
+OFFSET_FLOOR = 0.01
 
 #: Distance from the map, in errors, beyond which a source does not count.
 _CLIP = 4.0
 
-#: Change of the map (pixels) at which it is done.
-_DONE = 5e-3
+#: Change of offsets (pixels) at which they are done.
+OFFSETS_DONE = 5e-3
 
 #: How often sources are moved by their own offsets, and how far at most in rms widths of the PSF; offset of all,
 #: in full widths at half maximum, of which there is a warning.
-_SETTLED = 3
-_OWN = 0.3
-_NOTICED = 0.05
+OFFSET_PASSES = 3
+MAX_OFFSET = 0.3
+COMMON_OFFSET = 0.05
 
 
 @value_class
@@ -121,14 +121,16 @@ class OffsetMap:
         return plot_offsets(xy, offset, self.field, used=np.asarray(table["used"]), ax=ax, **kwargs)
 
 
-def source_offsets(fit, residual, model, rows):
+def source_offsets(fit, flux, residual, model, rows):
     """
     Measure the offsets of sources from their templates.
 
     Parameters
     ----------
-    fit : `~miricigale.photometry.fit.template_fit.TemplateFit`
-        The fit.
+    fit : `TemplateFit` or `~miricigale.photometry.fit.exposure_fit.ExposurePart`
+        The fit, or an exposure of one.
+    flux : `~numpy.ndarray`, shape (n,)
+        Fluxes of the rows of its bank, uJy.
     residual, model : `~numpy.ndarray`, shape (ny, nx)
         What it left, and the model of all sources.
     rows : int `~numpy.ndarray`, shape (k,), sorted
@@ -161,7 +163,7 @@ def source_offsets(fit, residual, model, rows):
                 block.values,
                 block.box[block_rows],
                 block.start[block_rows],
-                fit.flux[rows[part]],
+                flux[rows[part]],
             )
             offset_sums(*light, at[part], half, model, residual, fit.inverse_sigma, out[part])
 
@@ -200,7 +202,7 @@ def fit_offsets(arrays, bank, settings, catalog):
         rows, offset, error = _bright_offsets(fit, catalog, moved)
         good = lengths(offset) < limit
         order = settings.offset_order
-        while order >= 0 and np.count_nonzero(good) < _SOURCES * n_terms(order):
+        while order >= 0 and np.count_nonzero(good) < MIN_SOURCES * n_terms(order):
             order -= 1
         if order < 0:
             _too_few(0, good, "one shift is fitted to all sources instead")
@@ -209,7 +211,7 @@ def fit_offsets(arrays, bank, settings, catalog):
         field, is_used = _robust_field(xy[member], offset, error, good, arrays.flux.shape, order)
         x, y = xy.T
         change = field(x, y) - moved
-        if np.abs(change).max(initial=0.0) < _DONE:
+        if np.abs(change).max(initial=0.0) < OFFSETS_DONE:
             break
         moved = moved + change
         fit.bank.forget()
@@ -230,7 +232,7 @@ def fit_offsets(arrays, bank, settings, catalog):
 
 def _too_few(order, good, instead):
     """Warn of an offset map with fewer sources than it needs."""
-    needed = f"needs {_SOURCES * n_terms(order)} bright isolated sources within 'max_shift'"
+    needed = f"needs {MIN_SOURCES * n_terms(order)} bright isolated sources within 'max_shift'"
     msg = f"an offset map of order {order} {needed}, got {np.count_nonzero(good)}: {instead}"
     warn(msg, PhotometryWarning)
 
@@ -260,31 +262,30 @@ def settled(fit, bank, catalog):
     common = np.array(fit.displacement(xy))
     source_shifts = np.zeros_like(common)
     first = fit
-    for _ in range(_SETTLED):
+    for _ in range(OFFSET_PASSES):
         rows, offset, error = _bright_offsets(fit, catalog, common + source_shifts)
         deviation = offset - common[fit.bank.order[rows]]
         # what is farther off is another source
-        good = lengths(deviation) < _OWN * fit.psf_width
+        good = lengths(deviation) < MAX_OFFSET * fit.psf_width
         member = fit.bank.order[rows][good]
         deviation = deviation[good]
         error = error[good]
-        if len(member) <= _SOURCES:
+        if len(member) <= MIN_SOURCES:
             break
         # the largest order, up to 3, that the sources allow
         order = 0
-        while order < 3 and len(member) > _SOURCES**2 * n_terms(order + 1):
+        while order < 3 and len(member) > MIN_SOURCES**2 * n_terms(order + 1):
             order += 1
         smooth, _ = _robust_field(xy[member], deviation, error, good[good], shape, order)
         x, y = xy[member].T
         smooth = smooth(x, y)
-        if np.abs(smooth).max() > _NOTICED * gaussian_sigma_to_fwhm * fit.psf_width:
+        if np.abs(smooth).max() > COMMON_OFFSET * gaussian_sigma_to_fwhm * fit.psf_width:
             break
-        scatter = excess_variance(lengths(deviation), error)
-        if scatter <= _FLOOR**2:
+        shrunk = shrunk_offsets(deviation, error)
+        if shrunk is None:
             break
         new = np.zeros_like(source_shifts)
-        # offsets shrunk by the part of their scatter that is noise
-        new[member] = deviation * (scatter / (scatter + error**2))[:, None]
+        new[member] = shrunk
         change = np.abs(new - source_shifts).max()
         source_shifts = new
         fit = TemplateFit(
@@ -298,11 +299,19 @@ def settled(fit, bank, catalog):
         fit.shift = first.shift
         fit.offset_map = first.offset_map
         fit.source_shifts = source_shifts
-        if change < _DONE:
+        if change < OFFSETS_DONE:
             break
     if fit is not first and first.shift is not None:
         fit.include_shift(first.shift)
     return fit
+
+
+def shrunk_offsets(offsets, error):
+    """Shrink offsets, (k, 2), by the part of their scatter that is noise; None if they scatter by no more."""
+    scatter = excess_variance(lengths(offsets), error)
+    if scatter <= OFFSET_FLOOR**2:
+        return None
+    return offsets * (scatter / (scatter + error**2))[:, None]
 
 
 def excess_variance(distance, error):
@@ -321,13 +330,17 @@ def _bright_offsets(fit, catalog, moved):
     source = catalog.near_rows[fit.bank.order]
     bad = int(ForcedFlags.SHARED_SEGMENT | ForcedFlags.NOISY_SEGMENT)
     is_whole = (fit.light > 0.9).all(axis=1) & (catalog.flags[source] & bad == 0)
-    rows = np.flatnonzero(is_whole & ~fit.noisy & (row_snr(fit) > _BRIGHT))
-    step, error, neighbors = source_offsets(fit, residual, model, rows)
+    rows = np.flatnonzero(is_whole & ~fit.noisy & (row_snr(fit) > BRIGHT_SNR))
+    step, error, neighbors = source_offsets(fit, fit.flux, residual, model, rows)
     # where residuals are larger than the stated noise the latter overstates the significance
-    keep = np.isfinite(error) & (neighbors < _ISOLATED) & (error < fit.psf_width / _BRIGHT * 2)
+    keep = (
+        np.isfinite(error)
+        & (neighbors < MAX_NEIGHBOR_LIGHT)
+        & (error < fit.psf_width / BRIGHT_SNR * 2)
+    )
     rows = rows[keep]
     offset = moved[fit.bank.order[rows]] + step[keep]
-    return rows, offset, np.hypot(error[keep], _FLOOR)
+    return rows, offset, np.hypot(error[keep], OFFSET_FLOOR)
 
 
 def _robust_field(xy, offset, error, good, shape, order):
