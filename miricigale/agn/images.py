@@ -26,11 +26,10 @@ from miricigale.utils.options import check_that
 from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column, match_sky
 from miricigale.utils.units import ANGLE, FNU, to_array
+from miricigale.workflow.recorded_inputs import PATHS
 
 log = logging.getLogger(__name__)
 
-#: Fields of a `~miricigale.photometry.MosaicFile` that name files.
-_PATHS = ("path", "error", "variance", "inverse_variance", "weight", "psf")
 #: Column of the number of images on which the light of an AGN was measured.
 N_IMAGES = "n_images"
 
@@ -88,7 +87,7 @@ class AGNImages:
         for file in (*inputs.images, inputs.highres):
             for name in field_names(MosaicFile):
                 value = getattr(file, name)
-                parts.append((name, _content(value) if name in _PATHS else repr(value)))
+                parts.append((name, _content(value) if name in PATHS else repr(value)))
         parts += [inputs.confidence, inputs.psf_stars, inputs.seed]
         parts += sorted((name, repr(value)) for name, value in inputs.options.items())
         return content_sha256(parts)
@@ -118,13 +117,12 @@ class AGNImages:
         measurement = self._measure(None, None)
         psfs = {}
         fwhm = []
+        correlation = {}
         for band, result in measurement.results.items():
             psfs[band], prior_psf = field_psfs(
                 self._photometers[band], self.inputs.highres.header, result
             )
             fwhm.append(result.psf_fwhm.to_value(ANGLE))
-        correlation = {}
-        for band, result in measurement.results.items():
             correlation[band] = result.noise_correlation
         return _Base(measurement.table, psfs, prior_psf, max(fwhm) * ANGLE, correlation)
 

@@ -258,7 +258,7 @@ class CigaleSetup:
         fitter : `~miricigale.fitting.BayesFitter`
         """
         require_columns(photometry, ["id"], "photometry")
-        have = columns_among(photometry, self.bands, "photometry")
+        have = columns_among(photometry, self.bands)
         grid = self.grid(have + list(self.predicted), _column(photometry, "redshift"))
         options = {"model_error": self.additional_error} | options
         return BayesFitter(grid, have, compat=compat, **options)

@@ -413,7 +413,7 @@ def make_psf(data, pixel_scale, *, frame="sky", oversampling=1, enclosed=None, *
     0.424 arcsec, 0.95
     """
     data = np.array(floats(data))
-    check_light(data, "data")
+    check_light(data)
     total = float(data.sum())
     factor = 1.0
     if enclosed is not None:

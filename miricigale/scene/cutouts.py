@@ -72,7 +72,7 @@ class Cutout(Frozen):
 
     def __post_init__(self):
         data = frozen_array(floats(self.data))
-        check_light(data, "data")
+        check_light(data)
         scale = positive(self.pixel_scale, ANGLE, "pixel_scale") * ANGLE
         angle = frozen_quantity(self.angle, u.deg, "angle", ndim=0, finite=True)
         center = self.center

@@ -36,10 +36,10 @@ def is_inside(x, y, shape):
     return (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
 
 
-def check_light(data, argument):
-    """Refuse what is no image with light (a `ValueError`)."""
+def check_light(data):
+    """Refuse ``data`` that is no image with light (a `ValueError`)."""
     good = data.ndim == 2 and np.all(np.isfinite(data)) and data.sum() > 0
-    check_that(good, argument, "a finite 2D array with a positive sum", data.shape)
+    check_that(good, "data", "a finite 2D array with a positive sum", data.shape)
 
 
 def quiet_division():

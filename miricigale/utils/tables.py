@@ -266,11 +266,11 @@ def require_columns(table, names, argument, *, units=None):
             raise units_error(argument, f"convertible to {unit}", have, column=name)
 
 
-def columns_among(table, names, argument):
-    """Return those of some names that are columns of a table, in their order; refuse none (a `ValueError`)."""
-    columns = [name for name in names if name in table.colnames]
+def columns_among(photometry, names):
+    """Return those of some names that are columns of photometry, in their order; refuse none (a `ValueError`)."""
+    columns = [name for name in names if name in photometry.colnames]
     wanted = f"a table with at least one of the columns {list(names)}"
-    check_that(columns, argument, wanted, f"columns {table.colnames}")
+    check_that(columns, "photometry", wanted, f"columns {photometry.colnames}")
     return columns
 
 

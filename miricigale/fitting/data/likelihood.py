@@ -280,7 +280,7 @@ class PhotometryReader:
         require_columns(table, [], "photometry")
         if self.filters is not None:
             return self.filters
-        return tuple(columns_among(table, self.bands, "photometry"))
+        return tuple(columns_among(table, self.bands))
 
     def read(self, table, repeated=None):
         """

@@ -11,7 +11,7 @@ from miricigale.utils.arrays import nans
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.ids import id_column
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.tables import (
     columns_among,
     described_columns,
@@ -193,7 +193,7 @@ def flux_table(photometry, filters, model_bands):
         photometry = as_photometry(photometry, names)
     require_columns(photometry, [], "photometry")
     if filters is None:
-        filters = columns_among(photometry, model_bands, "photometry")
+        filters = columns_among(photometry, model_bands)
     check_that(filters, "filters", "at least one band", "none")
     require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
     table = quantity_table(photometry, copy=True)
@@ -219,7 +219,7 @@ def curves_to_table(curves, meta):
         "fraction": fraction * u.dimensionless_unscaled,
         "photon": photon * FNU,
     }
-    texts = declared("miricigale.photometry", "columns.toml")["curves"]
+    texts = column_texts("miricigale.photometry", "curves")
     return described_columns(columns, texts, dict(meta))
 
 
