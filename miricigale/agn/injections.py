@@ -32,7 +32,7 @@ from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.meta import package_version
 from miricigale.utils.named_values import places, without
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_columns
 from miricigale.utils.units import FNU, LUMINOSITY
@@ -134,7 +134,7 @@ class Injections:
         if n_lost:
             text = "injected AGN are left out: the best models of their galaxies have no dust, or are too old"
             warn(f"{n_lost} of {n_drawn.sum()} {text}", FitWarning)
-        texts = declared("miricigale.agn", "columns.toml")["injected"]
+        texts = column_texts("miricigale.agn", "injected")
         if not batches:
             return described_columns({name: np.zeros(0) for name in texts}, texts)
         injected = vstack(batches, metadata_conflicts="silent")
@@ -153,7 +153,7 @@ class Injections:
         photometry, truth, usable = self._photometry(number, first.sum(), rows, log_luminosity)
         cell = cell[usable]
         if not len(photometry):
-            texts = declared("miricigale.agn", "columns.toml")["injected"]
+            texts = column_texts("miricigale.agn", "injected")
             empty = {name: np.zeros(0) for name in texts} | {"selected": np.zeros(0, bool)}
             return cell, QTable(empty)
         refits = self._fits(number, photometry)

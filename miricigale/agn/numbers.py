@@ -7,7 +7,7 @@ from miricigale.evaluation import Estimate
 from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.arrays import nans
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows
 from miricigale.utils.values import value_class
@@ -24,7 +24,7 @@ MIN_ABOVE = 0.5
 
 
 def _texts(name):
-    return declared("miricigale.agn", "columns.toml")[name]
+    return column_texts("miricigale.agn", name)
 
 
 def _summary(draws, name):

@@ -17,7 +17,7 @@ from miricigale.utils.arrays import nans
 from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_columns
 from miricigale.utils.units import check_count, is_number, positive
@@ -316,7 +316,7 @@ def _table_of_sources(sample, probability):
         columns[name] = nans(len(sample))
         columns[name][sample.used] = values
     columns |= {"redshift": sample.redshift, "log_luminosity": sample.log_luminosity}
-    return described_columns(columns, declared("miricigale.agn", "columns.toml")["sources"])
+    return described_columns(columns, column_texts("miricigale.agn", "sources"))
 
 
 def _agn_probability(probability, first):

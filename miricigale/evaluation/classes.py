@@ -8,7 +8,7 @@ from miricigale.evaluation.estimates import Estimate, weighted_share
 from miricigale.evaluation.metrics import one_by_one
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.tables import described_columns
 
 #: Names in order of rising fracAGN, and the limits between them.
@@ -85,7 +85,7 @@ def confusion(true, found):
     for name in CLASS_NAMES + ("unknown",):
         columns[name] = np.sum(is_class & (found == name), axis=1)
     columns |= quality_columns(selection_quality(true == n, found == n) for n in CLASS_NAMES)
-    texts = declared("miricigale.evaluation", "columns.toml")["confusion"]
+    texts = column_texts("miricigale.evaluation", "confusion")
     return described_columns(columns, texts)
 
 

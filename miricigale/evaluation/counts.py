@@ -7,7 +7,7 @@ from miricigale.sed import COSMOLOGY
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_names, check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts, declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, require_columns, unique_ids
 from miricigale.utils.units import (
@@ -297,7 +297,7 @@ def _dust_table(ids, quiescent, dust, excess):
         "dust_luminosity": dust * excess * LUMINOSITY,
         "dust_excess": excess,
     }
-    return described_columns(columns, declared("miricigale.evaluation", "columns.toml")["dust"])
+    return described_columns(columns, column_texts("miricigale.evaluation", "dust"))
 
 
 def number_counts(flux, area, edges):

@@ -8,7 +8,7 @@ from miricigale.utils.arrays import finite_values, quiet_division
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
 
@@ -164,4 +164,4 @@ def coverage_table(ranks, *, levels=(0.68, 0.95)):
                     "p_uniform": p_uniform,
                 }
             )
-    return described_rows(rows, declared("miricigale.evaluation", "columns.toml")["coverage"])
+    return described_rows(rows, column_texts("miricigale.evaluation", "coverage"))

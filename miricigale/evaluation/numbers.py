@@ -11,7 +11,7 @@ from miricigale.evaluation.classes import (
 )
 from miricigale.evaluation.quantities import OF_FITS, REDSHIFT_BINS, measure
 from miricigale.utils.missing_values import floats
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, described_rows
 
@@ -84,7 +84,7 @@ def study_numbers(study, *, seed, n_draws=500):
                     row = {"truth": sky.name, "band_set": band_set, "quantity": quantity}
                     row |= {"z_low": z_low, "z_high": z_high}
                     rows.append(row | estimate.columns())
-    return described_rows(rows, declared("miricigale.evaluation", "columns.toml")["numbers"])
+    return described_rows(rows, column_texts("miricigale.evaluation", "numbers"))
 
 
 def study_confusion(study, band_set="all"):
@@ -189,6 +189,4 @@ def selection_table(sky, *, limits=CLASS_LIMITS):
     columns["n_wanted"] = [quality.completeness.n for quality in qualities]
     columns["n_selected"] = [quality.purity.n for quality in qualities]
     columns |= quality_columns(qualities)
-    return described_columns(
-        columns, declared("miricigale.evaluation", "columns.toml")["selection"]
-    )
+    return described_columns(columns, column_texts("miricigale.evaluation", "selection"))

@@ -9,7 +9,7 @@ from scipy.special import ndtr
 from miricigale.sed import stern2015_6um
 from miricigale.utils.arrays import middles, nans, quiet_division
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts, declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_columns, require_columns, unique_ids
 from miricigale.utils.units import LUMINOSITY, MASS, positive, to_array
@@ -345,7 +345,7 @@ class AGNPopulation:
             "obscured": has_agn & (drawn[:, 1] < hidden),
             "compton_thick": has_agn & (drawn[:, 1] < thick),
         }
-        return described_columns(columns, declared("miricigale.evaluation", "columns.toml")["agn"])
+        return described_columns(columns, column_texts("miricigale.evaluation", "agn"))
 
 
 def _log_luminosity(l_x):

@@ -12,7 +12,7 @@ from miricigale.sed.xray import stern2015, xray_flux
 from miricigale.utils.arrays import finite_values
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts, declared
 from miricigale.utils.tables import described_columns
 from miricigale.utils.units import is_ascending, to_array
 
@@ -177,9 +177,7 @@ def completeness(values, found, edges):
         "share_low": shares[:, 1],
         "share_high": shares[:, 2],
     }
-    return described_columns(
-        columns, declared("miricigale.evaluation", "columns.toml")["completeness"]
-    )
+    return described_columns(columns, column_texts("miricigale.evaluation", "completeness"))
 
 
 def half_complete(values, found):

@@ -12,7 +12,7 @@ from miricigale.injection.completeness import CompletenessCurve
 from miricigale.injection.trials import PLACES
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_choice
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.units import FNU
 from miricigale.utils.values import value_class
 
@@ -389,7 +389,7 @@ def _errors(sources):
 
 def _described(rows, kind):
     """Return a table of rows (dicts), whose columns say what they are."""
-    texts = declared("miricigale.injection", "columns.toml")[kind]
+    texts = column_texts("miricigale.injection", kind)
     counts = ("n", "n_measured", "n_positive", "n_negative")
     table = QTable()
     for name, text in texts.items():

@@ -30,7 +30,7 @@ from miricigale.utils.files import is_path
 from miricigale.utils.meta import provenance
 from miricigale.utils.named_values import field_values
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import as_table
 from miricigale.utils.units import ab_magnitude
@@ -256,7 +256,7 @@ def trial_stage(context, unit):
         rows, table = run_trial(field, task.injection, base, sources, image)
     if len(rows):
         rows.add_column(np.full(len(rows), number), name="trial", index=0)
-        texts = declared("miricigale.injection", "columns.toml")["sources"]
+        texts = column_texts("miricigale.injection", "sources")
         for name in rows.colnames:
             rows[name].info.description = texts[name]
     else:

@@ -28,7 +28,7 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import plain_floats
 from miricigale.utils.options import check_kind, check_that, check_type
 from miricigale.utils.other_keywords import takes_other_keywords
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.positions import middle_pixel
 from miricigale.utils.tables import Flags, described_columns
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, own_unit, positive, to_array
@@ -357,9 +357,7 @@ class Scene(WithTable):
             "flux_in_image": in_image * FNU,
             "flags": flags,
         }
-        texts = declared("miricigale.scene", "columns.toml")["truth"] | {
-            "flags": SceneFlags.describe()
-        }
+        texts = column_texts("miricigale.scene", "truth") | {"flags": SceneFlags.describe()}
         return image, described_columns(columns, texts, provenance(filter=self._filter))
 
     def _paint(self, rows, x, y, sersic):

@@ -24,3 +24,22 @@ def declared(package, file="page.toml"):
         As they stand in the file; not to be changed.
     """
     return tomllib.loads((resources.files(package) / file).read_text("utf-8"))
+
+
+def column_texts(package, table):
+    """
+    Read what the columns of a table are, for their descriptions.
+
+    Parameters
+    ----------
+    package : str
+        Package whose ``columns.toml`` has them.
+    table : str
+        Name of the table there.
+
+    Returns
+    -------
+    texts : dict of str to str
+        By column; not to be changed.
+    """
+    return declared(package, "columns.toml")[table]

@@ -9,13 +9,13 @@ from miricigale.utils.arrays import nans, quiet_division
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import first_value, places
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import are_not_negative
 
 #: Names of the percentiles of a class, and what the columns of a redshift are.
 _PERCENTILES = ("p16", "p50", "p84")
-_MEANINGS = declared("miricigale.fitting", "columns.toml")["parameter"]
+_MEANINGS = column_texts("miricigale.fitting", "parameter")
 #: Columns of a fit that go with its redshift, with their descriptions.
 _OF_FIT = {
     "flags": f"of the fit of the class; {FitFlags.describe()}",

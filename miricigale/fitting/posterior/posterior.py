@@ -12,7 +12,7 @@ from miricigale.utils.interactive import WithTable
 from miricigale.utils.missing_values import floats
 from miricigale.utils.object_rows import ObjectRows
 from miricigale.utils.options import check_names, check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts, declared
 
 #: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before AGN model.
 _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}
@@ -297,7 +297,7 @@ def other_name(name, known):
     if name in known or not isinstance(name, str):
         return name
     bare_name = name.removeprefix("bayes.").removeprefix("best.")
-    usual = declared("miricigale.fitting", "columns.toml")["other_names"]
+    usual = column_texts("miricigale.fitting", "other_names")
     if usual.get(bare_name) in known:
         return usual[bare_name]
     tables = declared("miricigale.cigale", "names.toml")

@@ -21,11 +21,11 @@ from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import places
 from miricigale.utils.options import check_names, check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.tables import described_columns, require_columns
 from miricigale.utils.units import FNU, WAVE, is_ascending, to_array
 
-_COLUMNS = declared("miricigale.fitting", "columns.toml")["zero_points"]
+_COLUMNS = column_texts("miricigale.fitting", "zero_points")
 #: Fluxes of lower S/N say more of their noise than of the models.
 _MIN_SIGNAL = 5.0
 #: Smallest number of such fluxes for what is measured by band.

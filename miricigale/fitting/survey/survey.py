@@ -26,7 +26,7 @@ from miricigale.utils.exceptions import DataError, FitWarning, warn
 from miricigale.utils.files import replacing
 from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_names, check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
 from miricigale.utils.values import value_class
@@ -40,8 +40,8 @@ _FIRST_MODEL_ERROR = 0.1
 #: Smallest number of sources of a half.
 _MIN_SOURCES = 50
 _NAME = "miricigale survey calibration"
-_COLUMNS = declared("miricigale.fitting", "columns.toml")["bands"]
-_SCORES = declared("miricigale.fitting", "columns.toml")["scores"]
+_COLUMNS = column_texts("miricigale.fitting", "bands")
+_SCORES = column_texts("miricigale.fitting", "scores")
 
 
 @value_class

@@ -18,7 +18,7 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without_none
 from miricigale.utils.options import check_names, check_positive, check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
 from miricigale.utils.tables import Flags, described_columns
@@ -305,7 +305,7 @@ def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
     # of all detections from each edge on
     n_positive_above = np.cumsum(n_positive[::-1])[::-1]
     n_negative_above = np.cumsum(n_negative[::-1])[::-1]
-    texts = declared("miricigale.photometry", "columns.toml")["purity"]
+    texts = column_texts("miricigale.photometry", "purity")
     meta = provenance(n_positive=len(positive), n_negative=len(negative))
     columns = {
         "snr_low": edges[:-1],
@@ -461,5 +461,5 @@ def _catalog(objects, detected, labels, arrays, meta):
         "snr": snr,
         "flags": flags,
     }
-    texts = declared("miricigale.photometry", "columns.toml")["detections"]
+    texts = column_texts("miricigale.photometry", "detections")
     return described_columns(columns, texts | {"flags": DetectionFlags.describe()}, meta)

@@ -12,7 +12,7 @@ from miricigale.utils.arrays import quiet_division
 from miricigale.utils.file_formats import read_write
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.tables import described_rows, require_columns
 from miricigale.utils.units import FNU
 from miricigale.utils.values import value_class
@@ -107,7 +107,7 @@ class ErrorCalibration:
         pull = (flux[good] - true[good]) / error[good]
         with quiet_division():
             ratio = flux[good] / true[good] - 1.0
-        texts = declared("miricigale.photometry", "columns.toml")["calibration"]
+        texts = column_texts("miricigale.photometry", "calibration")
         rows = (_row(snr, pull, ratio, member) for member in _members(snr))
         return cls(sources, described_rows(rows, texts), provenance(source="injection", **meta))
 

@@ -19,7 +19,7 @@ from miricigale.psf import psf_image
 from miricigale.utils.arrays import nans
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_positive
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_columns
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
@@ -209,7 +209,7 @@ def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.
     over = float(np.sqrt(correlation[m, m]))
     facts = {k: image.meta[k] for k in ("filter", "source", "noise") if k in image.meta}
     meta = provenance(n_sigma=n_sigma, noise_over_stated=round(over, 4), **facts)
-    texts = declared("miricigale.photometry", "columns.toml")["errors"]
+    texts = column_texts("miricigale.photometry", "errors")
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     table = described_columns(columns, texts, meta)
     # errors scaled to the measured noise, as surface brightness

@@ -31,7 +31,7 @@ from miricigale.utils.interactive import Tabular
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import field_names
 from miricigale.utils.options import check_that
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import check_seed
 from miricigale.utils.region_files import circles, write_circles
 from miricigale.utils.tables import described_table
@@ -461,7 +461,7 @@ class ForcedPhotometryResult(Tabular):
         table : `~astropy.table.QTable`
             With units, descriptions, and provenance in ``meta``.
         """
-        texts = declared("miricigale.photometry", "columns.toml")["forced"]
+        texts = column_texts("miricigale.photometry", "forced")
         columns = {}
         facts = {"flags": ForcedFlags.describe(), "confidence": confidence}
         for key, text in texts.items():
