@@ -133,10 +133,16 @@ def catalog_messages(lost, pieces):
         if counts:
             codes = ", ".join(f"{value:g}" for value in sorted(counts)[:3])
             parts.append(f"{name} {counts.total()} of {sizes[name]} ({codes})")
-    if len(parts) > _FEW:
-        parts = parts[:_FEW] + [f"and {len(parts) - _FEW} more bands"]
     if parts:
-        yield f"taken as missing, by the number that stands there: {'; '.join(parts)}"
+        listed = "; ".join(_first_few(parts))
+        yield f"taken as missing, by the number that stands there: {listed}"
+
+
+def _first_few(parts):
+    """Return what is said of bands, of the first few and how many more there are."""
+    if len(parts) <= _FEW:
+        return parts
+    return parts[:_FEW] + [f"and {len(parts) - _FEW} more bands"]
 
 
 def _fluxes_and_errors(table, bands):
@@ -213,9 +219,7 @@ def negative_error_message(counts):
     """Say what becomes of negative errors, and how to read them as limits; an empty text if there is none."""
     if not counts:
         return ""
-    parts = [f"{name} {n}" for name, n in counts.items()]
-    if len(parts) > _FEW:
-        parts = parts[:_FEW] + [f"and {len(parts) - _FEW} more bands"]
+    parts = _first_few([f"{name} {n}" for name, n in counts.items()])
     return (
         f"fluxes with a negative error are not fitted: {', '.join(parts)}; where it marks an upper "
         "limit, as in CIGALE, read_catalog_photometry(path, limits=True), or limits = true in the "

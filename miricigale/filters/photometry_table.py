@@ -353,13 +353,12 @@ def _matched(names, colnames, bands, argument):
 
 def _band_of(name, bands):
     """Our name of a column of flux or error; None of others. A unit at the end of a name is no part of it."""
-    if _find(name, bands):
-        return _find(name, bands)
-    name, _ = name_and_unit(name)
-    if _find(name, bands):
-        return _find(name, bands)
+    bare_name, _ = name_and_unit(name)
+    band = _find(name, bands) or _find(bare_name, bands)
+    if band is not None:
+        return band
     for pattern, called in ((_ERROR, error_column), (_FLUX, str)):
-        match = pattern.fullmatch(name)
+        match = pattern.fullmatch(bare_name)
         part = match and (match["a"] or match["b"])
         # errors of what is called flux_F770W
         inner = part and _FLUX.fullmatch(part)
