@@ -13,7 +13,7 @@ from miricigale.agn.shares import draw_shares
 from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.fitting import AGNBins
 from miricigale.fitting.catalogs.classes import fit_classes
-from miricigale.utils.arrays import nans
+from miricigale.utils.arrays import spread_over
 from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
@@ -313,8 +313,7 @@ def _table_of_sources(sample, probability):
     """Make the table of sources with their probabilities, NaN of those that were not used."""
     columns = {"id": sample.ids, "used": sample.used, "selected": sample.selected}
     for name, values in probability.items():
-        columns[name] = nans(len(sample))
-        columns[name][sample.used] = values
+        columns[name] = spread_over(values, sample.used, len(sample))
     columns |= {"redshift": sample.redshift, "log_luminosity": sample.log_luminosity}
     return described_columns(columns, column_texts("miricigale.agn", "sources"))
 

@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.utils.arrays import nans
+from miricigale.utils.arrays import nans, spread_over
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_shape, check_that
@@ -143,9 +143,7 @@ class TruthResults:
 
     def of_catalog(self, values):
         """Return the values of the sample at the rows of the catalog, NaN elsewhere."""
-        out = nans(len(self.truth))
-        out[self.sample] = values
-        return out
+        return spread_over(values, self.sample, len(self.truth))
 
 
 @value_class(repr=False)

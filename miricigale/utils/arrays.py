@@ -10,6 +10,13 @@ def nans(shape):
     return np.full(shape, np.nan)
 
 
+def spread_over(values, places, n):
+    """Return an array of ``n`` rows with values at their places, row numbers or a mask, and NaN elsewhere."""
+    spread = nans(n)
+    spread[places] = values
+    return spread
+
+
 def finite_values(values):
     """Return those values of an array that are finite, shape (m,)."""
     return values[np.isfinite(values)]

@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
-from miricigale.utils.missing_values import own_mask
+from miricigale.utils.missing_values import between_missing, own_mask
 from miricigale.utils.options import check_that
 
 #: Names of columns of ids, in lower case and without what stands between words; the first is preferred.
@@ -216,9 +216,7 @@ def _of_objects(ids, missing, argument):
     if values.dtype.kind == "O" and kinds == ["int"]:
         # beyond 64 bits
         values = values.astype(str)
-    out = np.zeros(ids.size, dtype=values.dtype)
-    out[~missing] = values
-    return out
+    return between_missing(values, missing)
 
 
 def _decoded(ids, argument):

@@ -162,8 +162,7 @@ def _numbers_among_words(table, id_names):
             numbers = texts[~missing].astype(float)
         except ValueError:
             continue
-        values = np.zeros(len(texts))
-        values[~missing] = numbers
+        values = between_missing(numbers, missing)
         table[name] = MaskedColumn(values, mask=missing, unit=column.unit)
 
 

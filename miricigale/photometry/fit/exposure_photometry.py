@@ -36,7 +36,7 @@ from miricigale.photometry.images.arrays import (
 from miricigale.photometry.images.coadd import Plane
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.templates.placement import Placement
-from miricigale.utils.arrays import nans, quiet_division
+from miricigale.utils.arrays import nans, quiet_division, spread_over
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import single_threaded, threads
@@ -302,8 +302,7 @@ class _Joint:
 
         As for one image, the negative of the residual and Gaussian noise say how many are false.
         """
-        flux = nans(len(self._catalog.id))
-        flux[self._catalog.near_rows] = fit.flux
+        flux = spread_over(fit.flux, self._catalog.near_rows, len(self._catalog.id))
         xy = self._catalog.xy
         # peaks of the residual, and of its negative, which are false
         peaks, negative, usable = plane_peaks(fit, self._plane, xy)

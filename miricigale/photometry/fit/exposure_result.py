@@ -22,12 +22,11 @@ from miricigale.photometry.fit.result_table import (
     flux_columns,
     joint_errors,
     result_of_columns,
-    spread_over,
 )
 from miricigale.photometry.fit.template_fit import gaussian_width, psf_covariance, row_covariances
 from miricigale.photometry.images.arrays import lengths
 from miricigale.photometry.images.flags import POOR_CHI2, POOR_STRAIN
-from miricigale.utils.arrays import nans, quiet_division
+from miricigale.utils.arrays import nans, quiet_division, spread_over
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS
@@ -179,9 +178,8 @@ def joint_result(fit, plane, images, catalog, new_xy, evidence, offsets, meta):
     terms, common, blending = _covariances(fit)
     joint = scipy.sparse.csr_array((n_all, n_all))
     flux_err = nans((4, n_all))
-    flux = nans(n_all)
     measured = place[fit.rows]
-    flux[measured] = fit.flux[fit.rows]
+    flux = spread_over(fit.flux[fit.rows], measured, n_all)
     if len(fit.rows):
         gather = selection(measured, n_all)
         spread = [(gather @ term @ gather.T).tocsr() for term in terms]

@@ -8,7 +8,7 @@ from miricigale.photometry.fit.diagnostics import diagnose
 from miricigale.photometry.fit.offsets import fit_offsets, settled, source_offsets
 from miricigale.photometry.fit.template_fit import TemplateFit
 from miricigale.photometry.images.arrays import local_maps
-from miricigale.utils.arrays import nans
+from miricigale.utils.arrays import spread_over
 from miricigale.utils.units import ANGLE
 
 #: How often positions of new sources are refined.
@@ -95,8 +95,7 @@ def _new_positions(fit, catalog):
     Where the evidence decides (``second_pass`` is None) there are none unless they are few.
     """
     xy = catalog.xy + fit.displacement(catalog.xy)
-    flux = nans(len(xy))
-    flux[catalog.near_rows[fit.bank.order]] = fit.total
+    flux = spread_over(fit.total, catalog.near_rows[fit.bank.order], len(xy))
     usable = fit.arrays.usable
     second_pass = fit.settings.second_pass
     model = fit.model()

@@ -18,7 +18,7 @@ from miricigale.photometry.fit.template_fit import fit_covariances
 from miricigale.photometry.images.arrays import pixels_to_sky
 from miricigale.photometry.images.fields import SmoothField
 from miricigale.photometry.images.flags import ForcedFlags
-from miricigale.utils.arrays import nans
+from miricigale.utils.arrays import nans, spread_over
 from miricigale.utils.exceptions import PhotometryWarning, warn
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import chunks
@@ -190,13 +190,6 @@ def package(fit, diagnostics, new_xy, catalog, meta):
         **_common(fit, common),
         **_images(fit, diagnostics, image_meta),
     )
-
-
-def spread_over(values, place, n):
-    """Spread values over their places among ``n`` sources; NaN elsewhere."""
-    spread = nans(n)
-    spread[place] = values
-    return spread
 
 
 def joint_errors(terms, rows, n):

@@ -23,7 +23,7 @@ from miricigale.pages.browser import (
 )
 from miricigale.plotting.cutouts import Cutouts
 from miricigale.sed.cells import cell_means
-from miricigale.utils.arrays import nans, quotient
+from miricigale.utils.arrays import quotient, spread_over
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import first_value
 from miricigale.utils.tables import error_column
@@ -167,9 +167,7 @@ class _Sources(StudyTables):
 
     def of_sources(self, values):
         """Return values of the rows of the fits as values of the sources, NaN without a fit."""
-        out = nans(len(self.truth))
-        out[self.sampled] = values
-        return out
+        return spread_over(values, self.sampled, len(self.truth))
 
     def first_of(self, rows, n):
         """Tell which of some rows (bool) are shown if at most ``n`` can be: fitted ones, then the brightest."""
