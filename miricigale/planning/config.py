@@ -191,60 +191,49 @@ class SurveySection(Section):
     )
 
 
+def _seconds(default, text):
+    """Make an option of a time in s."""
+    return option(default, text, low=0.0, high=1e5)
+
+
 class OverheadSection(Section):
     """What the observatory charges besides the exposures, in s: approximations to APT."""
 
     # JDox is the JWST user documentation; its "JWST Instrument Overheads" are of APT 2023.3.4
-    slew: float = option(
+    slew: float = _seconds(
         1800.0,
         "Slew to the first pointing (as in reports of APT's Smart Accounting).",
-        low=0.0,
-        high=1e5,
     )
-    next_slew: float = option(
+    next_slew: float = _seconds(
         150.0,
         "Slew to a neighboring pointing; of our own: such reports have 51 s to the "
         "next visit of a target, and 169 s with another roll.",
-        low=0.0,
-        high=1e5,
     )
-    guide_star: float = option(
+    guide_star: float = _seconds(
         284.0,
         "Acquisition of the guide star of each pointing (JDox, Visit Timing).",
-        low=0.0,
-        high=1e5,
     )
-    visit: float = option(
+    visit: float = _seconds(
         90.0,
         "Scripts and cleanup of each pointing (JDox, JWST Instrument Overheads).",
-        low=0.0,
-        high=1e5,
     )
-    filter: float = option(
+    filter: float = _seconds(
         50.0,
         "Move of the filter wheel, each band (JDox, JWST Instrument Overheads).",
-        low=0.0,
-        high=1e5,
     )
-    script: float = option(
+    script: float = _seconds(
         22.0,
         "Compilation of scripts, each band (JDox, JWST Instrument Overheads).",
-        low=0.0,
-        high=1e5,
     )
-    exposure: float = option(
+    exposure: float = _seconds(
         44.0,
         "Set-up and cleanup of each exposure (JDox, JWST Instrument Overheads: of the "
         "first of several dithers; APT charges less for the others).",
-        low=0.0,
-        high=1e5,
     )
-    dither: float = option(
+    dither: float = _seconds(
         60.0,
         "Small angle maneuver between dithers; of our own: APT takes it from the "
         "distance (JDox, JWST Slew Times and Overheads).",
-        low=0.0,
-        high=1e5,
     )
     observatory: float = option(
         0.16, "Part added to all of it (JDox, JWST Observing Overheads Summary).", low=0.0, high=1.0
