@@ -303,21 +303,17 @@ class MosaicFile:
             As `read` does.
         """
         header = self.header
-        # a unit given by the caller holds for the maps too
-        stated_unit = header.unit
-        if self.unit is not None:
-            stated_unit = ""
         with open_image(self.path, "an image") as (hdus, _):
             factor = self._factor()[0]
             variance = None
             hdu = companion(hdus, header.index, "VAR_POISSON")
             if hdu is not None and plane_shape(hdu) == plane_shape(hdus[header.index]):
-                values = self._in_unit(hdu, "variance", stated_unit, self.path)
+                values = self._in_unit(hdu, "variance", self.path)
                 variance = values * np.square(factor)
             own_errors = False
             if all(getattr(self, kind) is None for kind in NOISE_MAPS):
                 usable = np.isfinite(plane_data(hdus[header.index], self.section))
-                own_kind = self._own_noise_map(hdus, header, usable, stated_unit)[0]
+                own_kind = self._own_noise_map(hdus, header, usable)[0]
                 own_errors = own_kind in ("error", "variance")
             own = hdus[header.index].header
             keywords = {"EXPTIME": header.keywords["EXPTIME"], "GAIN": None}
@@ -477,8 +473,6 @@ class MosaicFile:
 
     def _noise_map(self, hdus, header, usable):
         """Read the map of the noise: its kind, values and place; the kind is None if there is none."""
-        # a unit given by the caller holds for the map too
-        stated_unit = "" if self.unit is not None else header.unit
         for kind, names in NOISE_MAPS.items():
             path = getattr(self, kind)
             if path is None:
@@ -499,10 +493,10 @@ class MosaicFile:
                     said = hdu.header.get("UTYPE", hdu.name)
                     got = f"{path}, whose extension is {said}: give it as '{own_kind}'"
                     raise argument_error(kind, wanted, got)
-                return kind, self._in_unit(hdu, kind, stated_unit, path), str(path)
-        return self._own_noise_map(hdus, header, usable, stated_unit)
+                return kind, self._in_unit(hdu, kind, path), str(path)
+        return self._own_noise_map(hdus, header, usable)
 
-    def _own_noise_map(self, hdus, header, usable, stated_unit):
+    def _own_noise_map(self, hdus, header, usable):
         """Read the map of the noise as `_noise_map`, of the image's own file."""
         shape = plane_shape(hdus[header.index])
         # maps of the file, the first that holds noise
@@ -512,7 +506,7 @@ class MosaicFile:
                 empty.append(f"{hdu.name} (no data)")
                 continue
             check_plane(hdu, shape, self.path, f"a map of the {kind.replace('_', ' ')}")
-            values = self._in_unit(hdu, kind, stated_unit, f"{self.path}[{hdu.name}]")
+            values = self._in_unit(hdu, kind, f"{self.path}[{hdu.name}]")
             if not self._has_noise(values, usable, hdu):
                 empty.append(f"{hdu.name} (nowhere finite and above 0)")
                 continue
@@ -526,7 +520,7 @@ class MosaicFile:
         for name in VARIANCE_PARTS:
             hdu = companion(hdus, header.index, name)
             if hdu is not None and plane_shape(hdu) == shape:
-                plane = self._in_unit(hdu, "variance", stated_unit, self.path)
+                plane = self._in_unit(hdu, "variance", self.path)
                 names.append(hdu.name)
                 planes.append(np.where(np.isfinite(plane), plane, 0))
         if planes:
@@ -551,9 +545,11 @@ class MosaicFile:
         plane = plane_data(hdu)
         return bool(np.any(np.isfinite(plane) & (plane != 0)))
 
-    def _in_unit(self, hdu, kind, unit, path):
+    def _in_unit(self, hdu, kind, path):
         """Read a map of the noise in the unit that the image states, as far as both do."""
         values = _native(plane_data(hdu, self.section))
+        # a unit given by the caller holds for the map too
+        unit = "" if self.unit is not None else self.header.unit
         text = unit_of(hdu.header)
         power = _POWERS.get(kind)
         have = parsed_unit(text)
