@@ -4,7 +4,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior.posterior import check_levels
-from miricigale.fitting.results.percentile_columns import LEVELS, suffix
+from miricigale.fitting.results.percentile_columns import LEVELS, quantile_columns
 from miricigale.sed.parameter import default_values
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import described_table
@@ -60,8 +60,7 @@ def sfh_band(samples, key, levels=LEVELS):
     ]
     drawn = np.array(rates)[row_of_draw.reshape(-1)] * mass[:, None]
     table = {"lookback": (lookback * u.Gyr, "time before the light left the galaxy")}
-    for level, row in zip(levels, np.quantile(drawn, levels, axis=0), strict=True):
-        table[suffix(level)] = (row * _RATE, f"quantile {level:g} of the star-formation rate")
+    table |= quantile_columns(drawn * _RATE, levels, "the star-formation rate")
     return described_table(table, dict(samples.meta) | {"id": str(key)})
 
 

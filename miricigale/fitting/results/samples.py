@@ -14,7 +14,7 @@ from miricigale.fitting.results import histories, inference_data
 from miricigale.fitting.results.corner_panels import draw_panel, marked_values
 from miricigale.fitting.results.drawing import CORNER, labeled
 from miricigale.fitting.results.listed_models import fluxes_between_nodes, models_of_draws
-from miricigale.fitting.results.percentile_columns import LEVELS, suffix
+from miricigale.fitting.results.percentile_columns import LEVELS, quantile_columns
 from miricigale.sed import grid_spectra
 from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
@@ -418,13 +418,13 @@ model : `~miricigale.sed.SEDModel`, optional
         rows = self._several()
         out = nans(rows.scale.shape + (len(names),))
         fitted = rows.fitted
-        if not self.on_nodes:
+        if self.on_nodes:
+            out[fitted] = grid_spectra.draw_fluxes(
+                self.grid, rows.index[fitted], rows.scale[fitted], names, extra, model
+            )
+        else:
             for i in np.flatnonzero(fitted):
                 out[i] = fluxes_between_nodes(rows[int(i)], names, extra, model)
-            return out.reshape(self.scale.shape + (len(names),)) * FNU
-        out[fitted] = grid_spectra.draw_fluxes(
-            self.grid, rows.index[fitted], rows.scale[fitted], names, extra, model
-        )
         return out.reshape(self.scale.shape + (len(names),)) * FNU
 
     def _model(self):
@@ -459,9 +459,7 @@ model : `~miricigale.sed.SEDModel`, optional
         for name, flux in zip(names, np.moveaxis(rows.fluxes(filters), -1, 0), strict=True):
             columns[name] = (flux.mean(axis=1), "posterior mean of the model flux")
             columns[error_column(name)] = (flux.std(axis=1), "its standard deviation")
-            for level, values in zip(levels, np.quantile(flux, levels, axis=1), strict=True):
-                text = f"quantile {level:g} of the model flux"
-                columns[f"{name}_{suffix(level)}"] = (values, text)
+            columns |= quantile_columns(flux.T, levels, "the model flux", f"{name}_")
         return described_table(columns, dict(self.meta))
 
     def spectra(self, key, *, rest=True):
@@ -520,9 +518,7 @@ model : `~miricigale.sed.SEDModel`, optional
             frame = "rest"
             quantity = "L_nu"
         columns = {"wave": (wave, f"{frame} wavelength")}
-        for level, row in zip(levels, np.quantile(values.value, levels, axis=0), strict=True):
-            text = f"quantile {level:g} of {quantity}"
-            columns[suffix(level)] = (row * values.unit, text)
+        columns |= quantile_columns(values, levels, quantity)
         return described_table(columns, dict(self.meta) | {"id": str(key), "rest": bool(rest)})
 
     def plot_sed_band(self, key, ax=None, *, levels=LEVELS, rest=True, **kwargs):
