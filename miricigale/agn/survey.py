@@ -14,11 +14,12 @@ from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.fitting import AGNBins
 from miricigale.fitting.catalogs.classes import fit_classes
 from miricigale.utils.arrays import spread_over
-from miricigale.utils.files import make_folder, replacing
+from miricigale.utils.files import make_folder
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
 from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import check_seed
+from miricigale.utils.table_files import write_table
 from miricigale.utils.tables import described_columns
 from miricigale.utils.units import check_count, is_number, positive
 from miricigale.utils.values import value_class
@@ -92,8 +93,7 @@ class AGNResult(Interactive):
         """
         tables = (self.numbers, self.totals, self.prior, self.sources, self.injected)
         for name, table in zip(FILES, tables, strict=True):
-            with replacing(Path(folder) / name, overwrite=overwrite) as partial:
-                table.write(partial, format="ascii.ecsv")
+            write_table(table, Path(folder) / name, overwrite=overwrite)
 
 
 class AGNSurvey:

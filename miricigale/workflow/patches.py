@@ -26,7 +26,7 @@ from miricigale.photometry.detection.prior_catalog import read_catalog
 from miricigale.photometry.images.arrays import pixel_scale
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import cached_by_file, make_folder, replacing
+from miricigale.utils.files import cached_by_file, make_folder
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_least, check_that
 from miricigale.utils.outputs import check_output
@@ -345,8 +345,7 @@ def measure_patches(
     table = read_table(runner.run().path("table.fits"), wanted="the table")
     if output is not None:
         make_folder(Path(output).parent)
-        with replacing(output, overwrite=overwrite) as partial:
-            write_table(table, partial)
+        write_table(table, output, overwrite=overwrite)
     return table
 
 

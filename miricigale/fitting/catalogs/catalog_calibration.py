@@ -29,7 +29,7 @@ from miricigale.fitting.survey.survey import (
 from miricigale.utils.arrays import nans
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import OtherResultsError
-from miricigale.utils.files import make_folder, replacing
+from miricigale.utils.files import make_folder
 from miricigale.utils.named_values import places, rows_of
 from miricigale.utils.options import check_that
 from miricigale.utils.random import check_seed, stream
@@ -353,8 +353,7 @@ def calibrate_file(fitter, rows, output, *, column=None, options):
         else:
             calibration = _redshifts_of_file(fitter, rows, column, name, options)
         make_folder(output)
-        with replacing(path) as partial:
-            calibration.write(partial, overwrite=True)
+        calibration.write(path, overwrite=True)
     if column is None:
         return with_errors_of(fitter, calibration)
     return with_calibration(fitter, calibration)

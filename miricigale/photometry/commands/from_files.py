@@ -7,7 +7,7 @@ from miricigale.photometry.commands.exposure_files import with_exposures
 from miricigale.photometry.commands.file_inputs import Inputs
 from miricigale.photometry.commands.point_files import PointInputs
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import make_folder, replacing
+from miricigale.utils.files import make_folder
 from miricigale.utils.named_values import without_none
 from miricigale.utils.outputs import check_output, check_outputs
 from miricigale.utils.parallel import check_memory
@@ -153,12 +153,10 @@ def measure_files(
         for path in written:
             make_folder(path.parent)
         if output is not None:
-            with replacing(output, overwrite=overwrite) as partial:
-                write_table(table, partial)
+            write_table(table, output, overwrite=overwrite)
         for kind in {"model", "residual"} & kinds.keys():
             for k, image in enumerate(measured.products(kind)):
-                with replacing(results[kind, k]) as partial:
-                    write_image(image, partial)
+                write_image(image, results[kind, k], overwrite=True)
         if page is not None:
             measured.write_page(page)
         bar.update()
