@@ -8,7 +8,7 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.instrument.asdf_extension import asdf_wcs, read_gwcs
-from miricigale.instrument.keywords import keyword_text
+from miricigale.instrument.keywords import header_text, keyword_text
 from miricigale.utils.exceptions import PhotometryWarning, data_error, warn
 from miricigale.utils.options import check_that
 
@@ -59,7 +59,7 @@ def header_wcs(header, hdus=None, *, where):
     """
     from astropy.wcs import WCS, FITSFixedWarning, WcsError
 
-    kinds = [str(header.get(f"CTYPE{axis}", "")).strip() for axis in (1, 2)]
+    kinds = [header_text(header, f"CTYPE{axis}") for axis in (1, 2)]
     stray = [key for key in header if _SIP.fullmatch(key)]
     if stray and not any(kind.endswith("-SIP") for kind in kinds):
         header = header.copy()

@@ -10,6 +10,7 @@ from miricigale.instrument import DQ, dq_planes, read_dq, with_own_bits
 from miricigale.instrument.header_wcs import header_wcs
 from miricigale.instrument.image import Image
 from miricigale.instrument.image_planes import standard_deviation
+from miricigale.instrument.keywords import header_text
 from miricigale.instrument.product_files import jwst_product, write_product
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits, replacing, write_fits
@@ -124,7 +125,7 @@ def write_planes(image, path, *, planes, rounded, overwrite=False):
 
 def _unit(header, path):
     """Return the unit of the pixels, as a header states it."""
-    text = str(header.get("BUNIT", "")).strip()
+    text = header_text(header, "BUNIT")
     try:
         if text:
             return with_adu(u.Unit(text))

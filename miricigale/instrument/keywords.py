@@ -112,6 +112,11 @@ def joined_header(hdus, name="SCI"):
     return header
 
 
+def header_text(header, key):
+    """Return a keyword of a header as text without blanks around it; empty where it is not there."""
+    return str(header.get(key, "")).strip()
+
+
 def check_imager(path, header, *, kinds=None, own=None):
     """
     Refuse files of other instruments, detectors and kinds of exposures, or that contradict their own record.
@@ -140,7 +145,7 @@ def check_imager(path, header, *, kinds=None, own=None):
     """
     if kinds is None:
         kinds = IMAGE_KINDS
-    kind = str(header.get("EXP_TYPE", "")).strip()
+    kind = header_text(header, "EXP_TYPE")
     detector = header.get("DETECTOR", "MIRIMAGE")
     instrument = header.get("INSTRUME", "MIRI" if own is not None or "DETECTOR" in header else None)
     if (instrument, detector) != ("MIRI", "MIRIMAGE") or kind not in kinds:
@@ -149,10 +154,10 @@ def check_imager(path, header, *, kinds=None, own=None):
             f"must be an exposure of the MIRI imager (INSTRUME MIRI, DETECTOR MIRIMAGE, {types})"
         )
         raise data_error(path, f"{wanted}, got {instrument} {detector} {kind}".rstrip())
-    if str(header.get("FILTER", "")).strip() in _DISPERSERS:
+    filter_name = header_text(header, "FILTER")
+    if filter_name in _DISPERSERS:
         wanted = "must be an exposure of the MIRI imager through a filter"
-        raise data_error(path, f"{wanted}, got the prism {header['FILTER']}")
-    filter_name = str(header.get("FILTER", "")).strip()
+        raise data_error(path, f"{wanted}, got the prism {filter_name}")
     recorded = (own or {}).get("filter")
     bands = {band_label(name) for name in (filter_name, recorded) if name}
     problem = f"FILTER is {filter_name} in the header and {recorded} in the package's record"
@@ -185,9 +190,9 @@ def exposure_keywords(header):
     >>> exposure_keywords(header)
     ('miri.f770w', 'FASTR1', 'FULL', 1)
     """
-    name = str(header.get("FILTER", "")).strip()
-    pattern = str(header.get("READPATT", "")).strip()
-    part = str(header.get("SUBARRAY", "")).strip()
+    name = header_text(header, "FILTER")
+    pattern = header_text(header, "READPATT")
+    part = header_text(header, "SUBARRAY")
     return (
         None if name in _NO_FILTER else f"miri.{name.lower()}",
         READOUT_NAMES.get(pattern, pattern) or None,

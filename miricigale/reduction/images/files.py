@@ -28,7 +28,7 @@ from miricigale.instrument import (
 from miricigale.instrument.data_models import is_data_model, read_data_model
 from miricigale.instrument.header_wcs import header_wcs, image_wcs
 from miricigale.instrument.image_planes import noise_kind, plane_data, plane_shape
-from miricigale.instrument.keywords import keyword_text
+from miricigale.instrument.keywords import header_text, keyword_text
 from miricigale.instrument.product_files import PLANES
 from miricigale.reduction.images.images import flagged_image, sigma
 from miricigale.utils.arrays import quiet_division
@@ -305,7 +305,7 @@ def shared_meta(entry):
 
 def _unit(header, path):
     """Return the unit of an image; DN is what astropy's CCDData and this package call adu."""
-    text = str(header.get("BUNIT", "")).strip()
+    text = header_text(header, "BUNIT")
     try:
         unit = None
         if text:

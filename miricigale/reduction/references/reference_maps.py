@@ -7,7 +7,7 @@ import numpy as np
 from miricigale.filters.band_names import band_label
 from miricigale.instrument import DQ, READOUT_NAMES, aperture, frame_pattern, joined_header
 from miricigale.instrument.history import TYPES
-from miricigale.instrument.keywords import keyword_text
+from miricigale.instrument.keywords import header_text, keyword_text
 from miricigale.utils.exceptions import data_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.options import check_data
@@ -83,7 +83,7 @@ def _cut(path, name, array, header, exposure):
         origin = (int(header["SUBSTRT1"]) - 1, int(header["SUBSTRT2"]) - 1)
     elif array.shape[-2:] == full.shape:
         origin = (0, 0)
-    elif array.shape[-2:] == part.shape and str(header.get("SUBARRAY", "")).strip() == part.name:
+    elif array.shape[-2:] == part.shape and header_text(header, "SUBARRAY") == part.name:
         origin = part.origin
     else:
         got = f"{array.shape[-2:]} pixels without SUBSTRT1 and SUBSTRT2"
