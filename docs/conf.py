@@ -44,6 +44,8 @@ exclude_patterns = [*exclude_patterns, "changes/*", "examples/*"]
 html_static_path = ["_static"]
 html_css_files = ["miricigale.css"]
 html_search_scorer = str(Path(__file__).parent / "_static" / "scorer.js")
+# a straight quotation mark is the sign of arcsec on these pages: only dashes and dots are replaced
+smartquotes_action = "De"
 html_favicon = "_static/logo.svg"
 
 # the scripts of ``examples`` become pages with their figures, notebooks and scripts to download
