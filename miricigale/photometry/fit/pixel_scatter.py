@@ -45,15 +45,15 @@ def pixel_scatter(fit, residual, model):
 
     Notes
     -----
-    A telescope passes no light above the cutoff of its PSF, and no template has any there. What residuals of
-    bright sources have, beyond those of empty sky, comes from the resampling and the detector. As pixels deviate
-    independently of each other by the part e of their light m, the mean power of a residual over the noise sigma,
-    under a window w, is larger by e^2 sum (w m / sigma)^2 at all frequencies. The median of the sources counts, so
-    that a single one cannot hide that its template is wrong. It is not measured on undersampled images, which have
-    light at all frequencies.
+    A telescope passes no light above the cutoff of its PSF, and templates have no power there. The power of the
+    residuals of bright sources, beyond that of empty sky, is due to the resampling and the detector. As pixels
+    deviate independently of each other by the part e of their light m, the mean power of a residual over the noise
+    sigma, under a window w, is larger by e^2 sum (w m / sigma)^2 at all frequencies. The median of the sources is
+    taken, so that a single source with a wrong template does not matter. The scatter is not measured on
+    undersampled images, which have light at all frequencies.
 
-    Drizzled pixels are means of detector pixels about them, the centers of which are not theirs. What this adds to
-    one pixel its neighbors lack: fluxes keep their errors (`Fruchter & Hook 2002
+    A drizzled pixel is a mean of detector pixels whose centers differ from its center. Neighbors compensate the
+    light that this adds to a pixel, so that errors of fluxes are unchanged (`Fruchter & Hook 2002
     <https://doi.org/10.1086/338393>`__, sec. 5).
     """
     if not len(fit.rows):
