@@ -130,7 +130,7 @@ EXCESS = np.array([13.54, 10.80, 8.49, 6.76, 5.30, 3.49, 1.67, 1.00])
 
 
 def test_smc_laws_fit_prevot():
-    """With the Milky Way's R_V; with 2.72 (Bouchet et al. 1985) it would be 1 to 13 % high."""
+    """With the Milky Way's R_V; with 2.72 (Bouchet et al. 1985) it would be 1 to 9 % high (13 % at 0.31 um)."""
     assert_allclose(curve(PREVOT, SMC()), EXCESS + 3.1, rtol=0.06)
     assert_allclose(curve(PREVOT, SMC(law="pei1992")), EXCESS + 2.93, rtol=0.03)
 

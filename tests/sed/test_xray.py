@@ -83,7 +83,7 @@ def test_flux_limit_of_yang_2021():
     """
     MIRI is 50 % complete near 1e-16 erg/s/cm2, L_X 10^42.5 at z = 2 (Gamma 1.8, flux halved).
 
-    0.90e-16 by the closed form: 10^42.5 / (4 pi d^2) x 1.387 x 3^0.2 / 2.
+    0.91e-16 by the closed form: 10^42.5 / (4 pi d^2) x 1.387 x 3^0.2 / 2.
     """
     flux = xray_flux(10**42.5 * ERG, 2.0, transmission=0.5)
     assert np.log10(flux.to_value(CGS)) == pytest.approx(-16.0, abs=0.1)

@@ -24,8 +24,8 @@ class ParametricTorus(AGN):
 
     Dust at radii rho = 1 ... R has T = 1500 K rho^-b and weight rho^c, shines through a layer
     and is dimmed by the torus in front of it. Fifteen constants (``torus.parametric``) were
-    fitted to the 50 SKIRTOR SEDs with p = 1, q = 0, opening angle 40 deg and R = 20: 0.057 dex
-    rms in 2-40 um over shape, worst 0.14 (tau 11, seen edge on).
+    fitted to the 50 SKIRTOR SEDs with p = 1, q = 0, opening angle 40 deg and R = 20: 0.056 dex
+    rms in 2-40 um over shape, worst 0.14 (tau 5, inclination 80 deg).
 
     The disk has the SKIRTOR form of 2020 and shines as cos i (1 + 2 cos i). The energy that the
     torus takes from it, over all directions, is what the dust sends out; its dependence
