@@ -30,7 +30,7 @@ photometer = ForcedPhotometer(
 )
 result = photometer.measure("f770w.fits", "f160w.fits")
 
-table = result.to_table()["id", "sky", "flux", "flux_err", "snr", "flags"]
+table = result.to_table()["id", "flux", "flux_err", "snr", "flags"]
 for name, form in {"flux": ".3f", "flux_err": ".3f", "snr": ".1f"}.items():
     table[name].info.format = form
 table[:6]
