@@ -85,7 +85,8 @@ plt.show()
 dithers, scenes = {}, {}
 for name in miri:
     dithers[name] = exposure.replace(filter=name).dithered("ceers", 2)
-    scenes[name] = [Scene(truth, one, background="low") for one in dithers[name]]
+    views = dithers[name]
+    scenes[name] = [Scene(truth, view, background="low") for view in views]
 scenes["miri.f770w"][0].plot(ax=plt.subplots(figsize=(6, 5))[1])
 plt.show()
 
@@ -93,8 +94,7 @@ plt.show()
 # 5. Ramps
 # --------
 # The detector applies its effects in a fixed order, and turns a scene into counts, group by group. The figure
-# shows the counts of one pixel in both integrations. ``Ramp.write`` makes a JWST level 1b file, which the official
-# pipeline reads.
+# shows the counts of one pixel in both integrations. ``Ramp.write`` writes level 1b files for the JWST pipeline.
 
 detector = Detector.miri_imager()
 ramps = {k: [detector.expose(scene, seed=1) for scene in scenes[k]] for k in miri}
@@ -129,8 +129,8 @@ plt.show()
 # ----------
 # The dithers are drizzled onto one grid with north up, here with the pixel size of the detector.
 
-both = [one for name in miri for one in dithers[name]]
-grid = mosaic_wcs(both, 0.11 * u.arcsec)
+all_dithers = [*dithers["miri.f770w"], *dithers["miri.f1500w"]]
+grid = mosaic_wcs(all_dithers, 0.11 * u.arcsec)
 mosaics = {name: reducer.mosaic(images[name], grid) for name in miri}
 mosaics["miri.f1500w"].plot()
 plt.show()
@@ -142,12 +142,12 @@ plt.show()
 # A kernel turns the sharp PSF into that of the mosaic: the two encircled energies should then agree.
 
 sharp = hst_psf("wfc3.f160w", pixel_scale=0.06 * u.arcsec)
-fine = mosaic_wcs(both, 0.06 * u.arcsec)
+fine = mosaic_wcs(all_dithers, 0.06 * u.arcsec)
 prior = highres_image(truth, filter="wfc3.f160w", wcs=fine, psf=sharp, seed=1)
 segmentation, detected = detect_sources(prior)
 kernels = {}
 for name in miri:
-    angles = u.Quantity([one.pa_aper for one in dithers[name]])
+    angles = u.Quantity([dither.pa_aper for dither in dithers[name]])
     target = psf_mosaic(miri_psf(name), 0.11 * u.arcsec, angles)
     kernels[name] = MatchingKernel.from_psfs(sharp, target)
 kernels["miri.f1500w"].plot(ax=plt.subplots(layout="constrained")[1])

@@ -65,14 +65,14 @@ fig, panels = plt.subplots(
     2, 2, figsize=(10, 6.5), width_ratios=[2, 1], sharex="col", layout="constrained"
 )
 for (left, right), name in zip(panels, truth["id"], strict=True):
-    one = with_agn[name]
-    one.plot_sed(left, title=f"simulated {name}")
+    galaxy = with_agn[name]
+    galaxy.plot_sed(left, title=f"simulated {name}")
     sed = without[name].best_sed()
     wave, flux = sed.wave.to("um"), sed.fnu.to("uJy")
     left.plot(wave, flux, "tab:green", label="best without AGN")
     left.set(xlim=(0.4, 40), ylim=(0.05, 500))
     left.legend(loc="upper left")
-    one.plot_pdf("frac_agn", right, color="tab:red")
+    galaxy.plot_pdf("frac_agn", right, color="tab:red")
     right.set(xlabel="AGN fraction", xlim=(0, 1))
 plt.show()
 

@@ -97,8 +97,8 @@ table[["id", *columns]]
 # The results are also `~miricigale.fitting.FitResults`, with percentiles, evidences, and plots.
 
 fig, panels = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
-for ax, one in zip(panels, results, strict=True):
-    one.plot_sed(ax)
+for ax, result in zip(panels, results, strict=True):
+    result.plot_sed(ax)
     ax.set(xlim=(0.3, 60), ylim=(1, 1000))
 plt.show()
 

@@ -38,11 +38,11 @@ fig, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained"
 segments, sources = detect_sources(image, preset="default", threshold=0.5)
 plot_segmentation(image.data, segments.data, ax=left, pixel_scale=0.06)
 left.set_title(f"threshold 0.5: {len(sources)} detections")
-for t, one in tables.items():
-    n = one.meta["n_positive"]
+for t, purity in tables.items():
+    n = purity.meta["n_positive"]
     right.plot(
-        one["snr_low"],
-        one["purity_above"],
+        purity["snr_low"],
+        purity["purity_above"],
         "o-",
         label=f"threshold {t}, {n} detections",
     )

@@ -54,7 +54,7 @@ table["id", *bands, "miri.f1500w_err"][:5]
 
 good = np.all([table[f"{name}_snr"] > 5 for name in bands], axis=0)
 mag = {name: table[name][good].to_value(u.ABmag) for name in bands}
-fig, axes = plt.subplots(1, 4, figsize=(12.4, 3.3), layout="constrained")
+fig, axes = plt.subplots(1, 4, figsize=(10.4, 3.0), layout="constrained")
 for ax, name in zip(axes, bands, strict=False):
     style = {"origin": "lower", "cmap": "gray_r", "vmin": -0.05, "vmax": 0.4}
     ax.imshow(images[name].data, **style)

@@ -56,8 +56,8 @@ table["fwhm", "r80", "enclosed", "eef_0.3", "eef_0.5", "eef_1", "eef_2"]
 
 radii = np.linspace(0.05, 2.5, 60) * u.arcsec
 fig, ax = plt.subplots(figsize=(6, 4), layout="constrained")
-for label, one in {"own": psf, "model": model}.items():
-    ax.plot(radii.value, encircled_energy(one, radii), label=label)
+for label, shown in {"own": psf, "model": model}.items():
+    ax.plot(radii.value, encircled_energy(shown, radii), label=label)
 ax.set(xlabel="radius (arcsec)", ylabel="encircled energy", ylim=(0, 1))
 ax.legend()
 plt.show()

@@ -45,12 +45,12 @@ for name in fluxes.colnames:
 table
 
 # %%
-# The fraction has two definitions. The other one is the AGN's share of the light at 3-1000 um, and both come with
+# The fraction has two definitions. The second is the AGN's share of the light at 3-1000 um, and both come with
 # every model. Other wavelengths work too, such as ``"5-20um"``.
 
 other = SEDModel.yang2021(libraries="bundled", frac_agn_definition="5-20um")
-for name, one in (("dust", model), ("5-20um", other)):
-    derived = one.derived(**galaxy, frac_agn=0.3)
+for name, sed_model in (("dust", model), ("5-20um", other)):
+    derived = sed_model.derived(**galaxy, frac_agn=0.3)
     power = derived["accretion_power"].to(u.erg / u.s)
     print(f"definition {name:6s}: accretion power {power:.2e}")
 

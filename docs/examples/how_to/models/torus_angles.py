@@ -53,7 +53,7 @@ rest = np.array([0.5, 2.0, 6.0, 9.7, 20.0])
 table = Table({"inclination": [0, 30, 49, 60, 90]})
 for um in rest:
     seen = [light(inclination=float(angle)) for angle in table["inclination"]]
-    table[f"{um:g} um"] = [np.interp(um, wave, one) for one in seen]
+    table[f"{um:g} um"] = [np.interp(um, wave, spectrum) for spectrum in seen]
 table.round(3)
 table
 

@@ -52,7 +52,7 @@ strong = galaxies["frac_agn"] > 0.4
 has = np.asarray(agn["has_agn"])
 rows = {"all": has, "detected in both bands": has & detected}
 rows["detected, fraction above 0.4"] = has & detected & strong
-numbers = [round(float(np.sum(one) / fields), 1) for one in rows.values()]
+numbers = [round(float(np.sum(selected) / fields), 1) for selected in rows.values()]
 QTable({"AGN": list(rows), "in one field": numbers})
 
 # %%
@@ -60,8 +60,8 @@ QTable({"AGN": list(rows), "in one field": numbers})
 
 edges = np.arange(0, 5.5, 0.5)
 ax = plt.subplots(layout="constrained")[1]
-for label, one in rows.items():
-    z = galaxies["redshift"][one]
+for label, selected in rows.items():
+    z = galaxies["redshift"][selected]
     weights = np.full(len(z), 1 / fields)
     ax.hist(z, edges, weights=weights, alpha=0.6, label=label)
 ax.set(xlabel="redshift", ylabel="AGN in one field")

@@ -21,7 +21,7 @@ groups = [5, 10, 20, 40, 80]
 ax = plt.subplots(layout="constrained")[1]
 for subarray in ("FULL", "BRIGHTSKY", "SUB256", "SUB64"):
     exposures = [Exposure("F770W", n_groups=n, subarray=subarray) for n in groups]
-    limits = [saturation_flux(one).to_value(u.ABmag) for one in exposures]
+    limits = [saturation_flux(exposure).to_value(u.ABmag) for exposure in exposures]
     ax.semilogx(groups, limits, "o-", label=subarray)
 ax.set(xlabel="groups", ylabel="F770W saturates at (AB)")
 ax.legend()

@@ -38,11 +38,11 @@ offsets = np.meshgrid(x, x) * u.arcsec
 sky = center.spherical_offsets_by(*offsets)
 positions = np.column_stack([sky.ra.deg.ravel(), sky.dec.deg.ravel()])
 time = {}
-for one in exposures:
-    footprint = Path(one.wcs.calc_footprint())
+for exposure in exposures:
+    footprint = Path(exposure.wcs.calc_footprint())
     seen = footprint.contains_points(positions).reshape(sky.shape)
-    seconds = seen * one.exposure_time.to_value(u.s)
-    time[one.filter] = time.get(one.filter, 0) + seconds
+    seconds = seen * exposure.exposure_time.to_value(u.s)
+    time[exposure.filter] = time.get(exposure.filter, 0) + seconds
 
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
 for ax, (name, image) in zip(axes, time.items(), strict=True):

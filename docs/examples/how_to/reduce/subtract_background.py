@@ -62,8 +62,8 @@ plt.show()
 truth = tilted.image(exposure.wcs, exposure.shape)
 plain = Reducer(background=BackgroundSettings("sep", box=32))
 rows = []
-for name, one in (("masked", reducer), ("sep", plain)):
-    level = one.subtract_background(cal)[1].level
+for name, tested in (("masked", reducer), ("sep", plain)):
+    level = tested.subtract_background(cal)[1].level
     error = level - truth
     rows.append((name, np.median(error).round(4), np.std(error).round(4)))
 Table(rows=rows, names=["method", "median error (MJy/sr)", "scatter (MJy/sr)"])
