@@ -219,7 +219,7 @@ def plot_model_residual(
     if ax is None:
         import matplotlib.pyplot as plt
 
-        _, ax = plt.subplots(1, 3, figsize=(12.6, 3.9), layout="constrained")
+        _, ax = plt.subplots(1, 3, figsize=(10.0, 2.6), layout="constrained")
     ax = np.ravel(np.asarray(ax, dtype=object))
     check_that(len(ax) == 3, "ax", "three axes", len(ax))
     image = np.asarray(image, float)
