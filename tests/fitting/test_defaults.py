@@ -331,3 +331,17 @@ def test_curves_of_ones_own_stand_among_names():
     assert results.best_sed("a", redshift=1.0).redshift == 1.0
     for name, band in ((box, "box"), ("F160W", "wfc3.f160w")):
         assert leave_out(fitter, photometry, [name]).bands == (band,)
+
+
+@pytest.mark.parametrize(
+    ("names", "survey"),
+    [
+        (("f115w_tot_1", "f115w_etot_1", "f770w_tot_1", "f770w_etot_1"), "dja"),
+        (("F115W_KRON", "F115W_KRON_e", "F770W_KRON", "F770W_KRON_e"), "jades"),
+    ],
+)
+def test_columns_of_a_survey_are_recognized(names, survey):
+    """Columns as DJA (Valentino et al. 2023) and JADES (Rieke et al. 2023) call them."""
+    table = QTable({name: [1.0, 2.0] for name in names})
+    with pytest.raises(ValueError, match=rf"or --map {survey} \(read_catalog_photometry"):
+        BayesFitter(SEDModel.survey()).fit(table)

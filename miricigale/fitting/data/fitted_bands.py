@@ -1,10 +1,14 @@
 """Bands of a catalog that can be fitted."""
 
 from miricigale.filters.photometry_table import our_names
+from miricigale.filters.surveys import SURVEYS, flux_bands
 from miricigale.fitting.data.likelihood import is_filter, unused_bands
-from miricigale.utils.exceptions import FitWarning, warn
+from miricigale.utils.exceptions import DataError, FitWarning, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table, error_column
+
+#: Bands of a table that a survey's names must match to be meant.
+_MIN_BANDS = 2
 
 
 def bands_of(photometry):
@@ -44,5 +48,26 @@ def bands_with_errors(names, argument):
     """Select, from our names of columns, the bands that have an error: list of str, at least one."""
     bands = [name for name in names if is_filter(name) and error_column(name) in names]
     wanted = "a table with columns <filter> and <filter>_err ('miricigale filters' lists the names)"
+    if not bands:
+        wanted += _maps_for(names)
     check_that(bands, argument, wanted, f"columns {list(names)}")
     return bands
+
+
+def _maps_for(names):
+    """Say which maps of surveys have some columns; empty if none has two bands of them."""
+    fitting = []
+    for survey, columns in SURVEYS.items():
+        try:
+            ours, _ = columns.columns(names)
+        except DataError:
+            # two columns of a band, of which the map says more
+            fitting.append(survey)
+            continue
+        if len(flux_bands(ours)) >= _MIN_BANDS:
+            fitting.append(survey)
+    if not fitting:
+        return ", or names by --map (read_catalog_photometry in Python)"
+    options = " or ".join(f"--map {survey}" for survey in fitting)
+    calls = " or ".join(f"read_catalog_photometry(path, {survey!r})" for survey in fitting)
+    return f", or {options} ({calls} in Python), whose columns these are"
