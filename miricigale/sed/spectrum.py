@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters import FilterSet, as_filter
+from miricigale.filters.band_names import find_filter
 from miricigale.filters.spectra import spectrum_arrays
 from miricigale.sed.cosmology import COSMOLOGY, distance
 from miricigale.sed.flux_units import flux_density_unit
@@ -209,13 +210,44 @@ class SED(Frozen, WithTable):
         """
         Return the part between two observed wavelengths, ``sed[5 * u.um:10 * u.um]``, or where a mask is True.
 
-        A whole number gives the flux density at that point, as of ``sed.fnu``.
+        A whole number gives the flux density at that point, as of ``sed.fnu``, a name the component.
         """
+        if isinstance(key, str):
+            return self._component(key)
         if isinstance(key, numbers.Integral) and not isinstance(key, (bool, np.bool_)):
             return self.fnu[key]
         inside = points_of(key, self.wave.value)
         parts = {name: part[inside] for name, part in self.components.items()}
         return self.replace(wave=self.wave[inside], fnu=self.fnu[inside], components=parts)
+
+    def _component(self, name):
+        """Return a part by its name; refuse names of bands and of attributes with what gives their values."""
+        try:
+            return self.components[name]
+        except KeyError as err:
+            say = ""
+            if name in dir(self):
+                say = f"; sed.{name} is an attribute"
+            elif find_filter(name) is not None:
+                say = f"; sed.synthetic_flux({name!r}) is the flux in a band"
+            if not self.components:
+                msg = f"no component {name!r}, for the spectrum has no parts{say}"
+            else:
+                msg = f"{err.args[0]}{say}"
+            raise KeyError(msg) from None
+
+    def _ipython_key_completions_(self):
+        """Return what a session offers in brackets: names of the parts."""
+        return self.components.names
+
+    def _hint_of(self, name):
+        """Return the sentence for a part that is asked for as an attribute."""
+        # half-made copies have no parts yet
+        parts = vars(self).get("components", Parts())
+        for part in (name, f"agn_{name}"):
+            if part in parts.names:
+                return f"components[{part!r}] is the spectrum of this part"
+        return ""
 
     def replace(self, **changes):
         """Copy with other values of the constructor's arguments."""

@@ -18,15 +18,24 @@ class Parts(dict):
     """
 
     def __missing__(self, name):
+        groups = self._groups()
+        if name not in groups:
+            raise unknown_name("component", name, self.names)
+        return functools.reduce(operator.add, groups[name])
+
+    @property
+    def names(self):
+        """Names of the parts and of their sums."""
+        return [*self, *self._groups()]
+
+    def _groups(self):
+        """Return lists of the parts in each sum."""
         groups = {"agn": [], "galaxy": []}
         for key, part in self.items():
             # light before attenuation is no part of the whole
             if not key.endswith("_intrinsic"):
                 groups["agn" if key.startswith("agn_") else "galaxy"].append(part)
-        groups = {group: parts for group, parts in groups.items() if parts}
-        if name not in groups:
-            raise unknown_name("component", name, [*self, *groups])
-        return functools.reduce(operator.add, groups[name])
+        return {group: parts for group, parts in groups.items() if parts}
 
 
 def points_of(key, wave):
@@ -52,7 +61,7 @@ def points_of(key, wave):
     if not isinstance(key, slice):
         inside = np.asarray(key)
         is_mask = inside.dtype == bool and inside.shape == wave.shape
-        wanted = "two wavelengths (sed[5 * u.um:10 * u.um]) or a mask of the points; sed.fnu has all values"
+        wanted = "two wavelengths (sed[5 * u.um:10 * u.um]), a mask of the points or the name of a component"
         check_that(is_mask, "key", wanted, repr(key))
         return inside
     check_that(key.step is None, "key", "two wavelengths without a step", key)

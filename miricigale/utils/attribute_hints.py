@@ -40,6 +40,9 @@ class UnknownAttributeError(HintedAttributeError):
         cls = self._owner
         if not isinstance(cls, type):
             cls = type(cls)
+            hint = self._owner._hint_of(self.name)
+            if hint:
+                return hint
         return attribute_hint(cls, self.name, dir(self._owner))
 
 

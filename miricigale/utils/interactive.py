@@ -80,6 +80,10 @@ class Interactive(metaclass=_Hinted):
         """Return the names that `_value` knows."""
         return ()
 
+    def _hint_of(self, name):
+        """Return what to write in place of an attribute, where that depends on the object; empty otherwise."""
+        return ""
+
     def _facts(self):
         """What a notebook shows: dict of label to value."""
         return {type(self).__name__: repr(self)}
