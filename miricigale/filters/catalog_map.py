@@ -355,7 +355,7 @@ class CatalogMap:
         error = error_column(name)
         unit = self._unit_of_column(name, table[name], True, argument)
         if unit is None or unit == u.mag or not (_is_ab(unit) or unit.is_equivalent(FNU)):
-            say = "give one, such as units={'flux': 'uJy'}"
+            say = "give one, such as units={'flux': 'uJy'} (or 'ABmag', 'mJy')"
             if unit == u.mag:
                 say = "AB magnitudes are units={'flux': 'ABmag'}"
             elif unit is not None:

@@ -1,5 +1,7 @@
 """The catalog of sources: its columns, what is refused and what is flagged."""
 
+from collections.abc import Mapping
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
@@ -18,13 +20,15 @@ from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import as_positions
 from miricigale.utils.tables import (
     Flags,
+    as_table,
     ascii_ids,
+    check_units,
     error_column,
     read_ids,
     require_columns,
     unique_ids,
 )
-from miricigale.utils.units import FNU, own_unit
+from miricigale.utils.units import FNU, flux_unit, own_unit
 
 _DECLARED = declared("miricigale.scene", "columns.toml")
 #: Columns that every catalog has, with their unit (None: dimensionless or not a number).
@@ -87,7 +91,13 @@ def _plain_column(table, name, unit, argument):
     return values.value
 
 
-def as_sources(data, filter, argument="catalog"):
+def _flux_units(table, filters):
+    """Return the unit of fluxes by name, for filters that are asked for and those that are columns."""
+    names = [*filters, *(name for name in table.colnames if is_band(name))]
+    return dict.fromkeys(names, FNU)
+
+
+def as_sources(data, filter, argument="catalog", *, units=None, takes_units=False):
     """
     Return the table of sources with our names of columns, of any table.
 
@@ -99,11 +109,22 @@ def as_sources(data, filter, argument="catalog"):
         The band of the fluxes that are meant.
     argument : str, optional
         What the table is called in messages.
+    units : dict of str to unit-like, or unit-like, optional
+        Units of columns that have none, by their names in ``data``; or that of the flux alone.
+    takes_units : bool, optional
+        Whether the function that the user calls has an argument ``units``, for messages.
 
     Returns
     -------
     table : `~astropy.table.QTable`
         A copy.
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`
+        If radii, angles or fluxes have no unit, or a wrong one; the message names all that have none.
+    ValueError
+        If ``units`` names a column that is not there.
 
     Examples
     --------
@@ -114,12 +135,35 @@ def as_sources(data, filter, argument="catalog"):
     >>> as_sources(table, "miri.f770w").colnames
     ['id', 'miri.f770w', 'half_light_radius']
     """
-    table = QTable(as_photometry(data, [filter], argument), copy=True)
+    user_table = as_table(data, argument)
+    unit_of_flux = units
+    if isinstance(units, Mapping):
+        user_table = _with_units(user_table, units)
+        unit_of_flux = None
+    photometry = as_photometry(user_table, [filter], argument, units=unit_of_flux)
+    table = QTable(photometry, copy=True)
+    # columns keep their order; ids that are counted come last
+    user_names = dict(zip(table.colnames, user_table.colnames, strict=False))
     for ours, aliases in _DECLARED["other_names"].items():
         theirs = [name for name in table.colnames if name.lower() in aliases]
         if ours not in table.colnames and theirs:
             table.rename_column(theirs[0], ours)
+            user_names[ours] = user_names.pop(theirs[0])
+    expected = without_none(CATALOG_COLUMNS) | _flux_units(table, [filter])
+    check_units(table, expected, argument, user_names=user_names, takes_units=takes_units)
     return table
+
+
+def _with_units(table, units):
+    """Return a table with the units that a user says of columns without one."""
+    absent = [name for name in units if name not in table.colnames]
+    wanted = f"a dict with keys among {table.colnames}"
+    check_that(not absent, "units", wanted, absent)
+    stated = {name: unit for name, unit in units.items() if own_unit(table[name]) is None}
+    for name, unit in stated.items():
+        # usual words such as maggies
+        stated[name] = flux_unit(unit) or u.Unit(unit)
+    return QTable(table, units=stated)
 
 
 def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
@@ -185,9 +229,8 @@ def check_catalog(table, *, filters=(), wcs=None, argument="catalog"):
     catalog["sky"] = as_positions(catalog, argument, wcs)
     points = list(_fill_columns(catalog, argument))
     units = without_none(CATALOG_COLUMNS)
-    require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
-    fluxes = [*filters, *(name for name in catalog.colnames if is_band(name))]
-    require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
+    units |= _flux_units(catalog, filters)
+    require_columns(catalog, [*CATALOG_COLUMNS, *filters], argument, units=units)
     catalog["id"] = _checked_ids(catalog, argument)
     catalog["profile"] = _checked_profiles(catalog["profile"], argument)
     numbers = without(CATALOG_COLUMNS, ("id", "sky", "profile"))

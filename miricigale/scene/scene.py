@@ -97,9 +97,14 @@ class Scene(WithTable):
         Column of the catalog that gives a source a point source at its center besides its
         profile: a flux comes on top of the column ``filter``; a number without unit, 0 to 1,
         is the share of the column ``filter`` that is in the point. NaN means none.
+    units : dict of str to unit-like, or unit-like, optional
+        Units of columns of the catalog that have none, such as those of a `pandas.DataFrame`, by their names
+        (``{"F770W": "uJy", "re": "arcsec"}``); or that of the fluxes alone, such as ``"ABmag"``.
 
     Raises
     ------
+    `~astropy.units.UnitsError`
+        If fluxes, radii or angles have no unit, or a wrong one.
     ValueError
         If the WCS has no shape, the PSF belongs to other pixels or another filter, a cutout
         is missing or has no source, or a value of ``agn`` is out of its range.
@@ -149,11 +154,12 @@ class Scene(WithTable):
         n_threads=None,
         cutouts=None,
         agn=None,
+        units=None,
     ):
         self._arguments = {
             "catalog": catalog, "exposure": exposure, "filter": filter, "wcs": wcs, "psf": psf,
             "background": background, "enclosed": enclosed, "max_radius": max_radius,
-            "n_threads": n_threads, "cutouts": cutouts, "agn": agn,
+            "n_threads": n_threads, "cutouts": cutouts, "agn": agn, "units": units,
         }  # fmt: skip
         if exposure is not None:
             check_kind(exposure, "exposure", Exposure)
@@ -175,7 +181,7 @@ class Scene(WithTable):
         self.exposure = exposure
         if isinstance(catalog, str) and catalog in resources():
             catalog = read_catalog(catalog)
-        sources = as_sources(catalog, self._filter)
+        sources = as_sources(catalog, self._filter, units=units, takes_units=True)
         catalog = check_catalog(sources, filters=[self._filter], wcs=wcs)
         self._catalog = BandTable(catalog, copy=False)
         if psf is None and (exposure is None or wcs is not exposure.wcs):

@@ -13,7 +13,7 @@ from miricigale.utils.files import is_path
 from miricigale.utils.frames import as_column, frame_columns, is_frame
 from miricigale.utils.ids import id_column, ids_and_missing
 from miricigale.utils.options import check_least, check_that, check_type
-from miricigale.utils.units import ANGLE, flux_unit, own_unit, to_array
+from miricigale.utils.units import ANGLE, FNU, flux_unit, own_unit, to_array
 
 
 class Flags(enum.IntFlag):
@@ -247,23 +247,70 @@ def require_columns(table, names, argument, *, units=None):
     ValueError
         If it is no table, or a column is missing; the message lists what is there.
     `~astropy.units.UnitsError`
-        If a column has no unit or a wrong one (magnitudes are no fluxes).
+        As of `check_units`.
     """
     check_type(table, argument, Table, "a table")
     missing = [name for name in names if name not in table.colnames]
     wanted = f"a table with the columns {missing}"
     check_that(not missing, argument, wanted, f"columns {table.colnames}")
-    for name, unit in (units or {}).items():
+    check_units(table, units or {}, argument)
+
+
+def check_units(table, units, argument, *, user_names=None, takes_units=False):
+    """
+    Check that columns of a table convert to given units.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The table to check.
+    units : dict
+        Column name to the unit that it must convert to; columns that are not there are skipped.
+    argument : str
+        The argument's name, for the message.
+    user_names : dict, optional
+        What the user calls columns, by the names of the table.
+    takes_units : bool, optional
+        Whether the function that the user calls has an argument ``units``.
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`
+        If columns have no unit (the message names all of them), or one has a wrong unit (magnitudes are no
+        fluxes).
+    """
+    user_names = user_names or {}
+    without_unit = {}
+    for name, unit in units.items():
         if name not in table.colnames:
             continue
+        user_name = user_names.get(name, name)
         have = own_unit(table[name])
-        if have is not None:
-            have = flux_unit(have) or u.Unit(have)
+        if have is None:
+            without_unit[user_name] = u.Unit(unit)
+            continue
+        have = flux_unit(have) or u.Unit(have)
         # magnitudes are no units of flux
         if not (isinstance(have, u.UnitBase) and have.is_equivalent(unit)):
-            if have is None:
-                have = "no unit"
-            raise units_error(argument, f"convertible to {unit}", have, column=name)
+            raise units_error(argument, f"convertible to {unit}", have, column=user_name)
+    if without_unit:
+        raise u.UnitsError(_lacking_units(without_unit, argument, takes_units))
+
+
+def _lacking_units(units, argument, takes_units):
+    """Return what to say of columns without a unit, by the units that they should convert to."""
+    names = ", ".join(map(repr, units))
+    wanted = ", ".join(map(str, units.values()))
+    columns = "column"
+    if len(units) > 1:
+        columns = "columns"
+    stated = {name: str(unit) for name, unit in units.items()}
+    remedy = f"QTable(table, units={stated}) gives it"
+    if takes_units:
+        remedy = f"give units={stated}"
+    if FNU in units.values():
+        remedy += ", or 'ABmag', 'mJy' and so on for fluxes"
+    return f"'{argument}' {columns} {names} must be convertible to {wanted}, got no unit; {remedy}"
 
 
 def columns_among(photometry, names):

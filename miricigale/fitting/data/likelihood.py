@@ -312,7 +312,10 @@ class PhotometryReader:
         require_columns(table, ["id"] + list(columns), "photometry")
         for name in columns:
             if own_unit(table[name]) is None:
-                got = "no unit: give one, as unit='uJy' in Python or --flux-unit uJy on the command line"
+                got = (
+                    "no unit: give one, as unit='uJy' (or 'ABmag', 'mJy') in Python or "
+                    "--flux-unit uJy on the command line"
+                )
                 raise units_error("photometry", f"convertible to {FNU}", got, column=name)
         require_columns(table, [], "photometry", units=dict.fromkeys(columns, FNU))
         n = len(table)
