@@ -170,6 +170,9 @@ class AGNSurvey:
         self.n_draws = check_count(n_draws, "n_draws")
         self.seed = check_seed(seed)
 
+    def __repr__(self):
+        return f"<AGNSurvey of {self.area:.4g} deg2: frac_agn from {self.limit:g}>"
+
     def run(self, path, output, *, images=None, **options):
         """
         Fit a catalog, and the same with AGN added to it, and count AGN.

@@ -16,7 +16,7 @@ from miricigale.planning.exposures import band_plans, wall_clock
 from miricigale.planning.sample import make_sample
 from miricigale.utils.exceptions import config_error
 from miricigale.utils.named_values import places, subset
-from miricigale.utils.options import check_names, check_that
+from miricigale.utils.options import check_names, check_that, check_type
 from miricigale.utils.progress import progress
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.values import value_class
@@ -124,7 +124,7 @@ class Planner:
     Raises
     ------
     ValueError
-        If ``sources`` lacks a column.
+        If ``config`` is none, or ``sources`` lacks a column.
 
     Examples
     --------
@@ -136,15 +136,21 @@ class Planner:
     """
 
     def __init__(self, config=None, *, sources=None, executor=None):
-        self.config = config
         if config is None:
-            self.config = PlanConfig()
+            config = PlanConfig()
+        wanted = "a PlanConfig (load_plan(path) or load_plan(overrides={'exposures': {'bands': ['miri.f1500w']}}))"
+        check_type(config, "config", PlanConfig, wanted)
+        self.config = config
         self.executor = executor
         #: Sources of the caller, if there are any.
         self._caller_sources = sources
         if sources is not None:
             wanted = ("id", "redshift", "frac_agn") + self.bands
             require_columns(sources, wanted, "sources", units=dict.fromkeys(self.bands, u.uJy))
+
+    def __repr__(self):
+        bands = ", ".join(name.removeprefix("miri.") for name in self.config.exposures.bands)
+        return f"<Planner {bands}: {len(self.config.exposures.sets)} sets of bands>"
 
     @property
     def bands(self):

@@ -138,6 +138,9 @@ class Registry:
         self.kind = kind
         self._loaders = {}
 
+    def __repr__(self):
+        return f"<Registry of {len(self._loaders)} names, each a {self.kind}>"
+
     def register(self, name, loader, *, replace=False, **metadata):
         """Register ``loader(name)``; a name that is there is an error unless ``replace``."""
         if name in self._loaders and not replace:

@@ -16,7 +16,14 @@ from helpers.errors import refuses
 from miricigale.depth import saturation_flux
 from miricigale.instrument import psf_fwhm
 from miricigale.photometry import ErrorModel
-from miricigale.planning import Planner, area_table, comparison_table, load_plan, wall_clock
+from miricigale.planning import (
+    Planner,
+    area_table,
+    comparison_table,
+    depth_table,
+    load_plan,
+    wall_clock,
+)
 from miricigale.planning.accuracy import accuracy
 from miricigale.planning.planner import EXISTING
 from miricigale.utils.exceptions import ConfigError, FitWarning
@@ -368,3 +375,10 @@ def test_a_budget_in_hours_is_what_is_charged():
     refuses(
         "hours must be left out with depths", load_plan, overrides=with_depths, error=ConfigError
     )
+
+
+def test_planners_say_what_they_take_and_plan():
+    refuses("'config' must be a PlanConfig .load_plan.path.*, got str", Planner, "F1500W")
+    refuses("'config' must be a PlanConfig", depth_table, "F1500W")
+    config = load_plan(overrides={"exposures": {"bands": ["miri.f770w", "miri.f1500w"]}})
+    assert repr(Planner(config)) == "<Planner f770w, f1500w: 1 sets of bands>"

@@ -117,6 +117,9 @@ class StudyRunner:
                 msg = f"nothing of 'again', {again!r}, is among what 'until', {until!r}, needs"
                 raise ConfigError(msg)
 
+    def __repr__(self):
+        return f"<StudyRunner of {len(self.stages)} stages in {self.folder}>"
+
     def _list_units(self):
         """List the units of all stages, and those that each of them reads."""
         self.units = {}
