@@ -85,8 +85,10 @@ def psf_pair(
         if normalize and max(missing.values()) > 0.01:
             text = ", ".join(f"{value:.3f} of '{name}'" for name, value in missing.items())
             text = f"light beyond the PSFs' grids, by their own sums and wings: {text}. The kernel "
-            text += "is normalized to 1: fluxes lack what lies beyond. Give the PSFs' 'enclosed' (make_psf, "
-            text += "read_psf), the 'filter' of ForcedPhotometer (checked_psf) or 'normalize'"
+            text += "is normalized to 1: fluxes lack what lies beyond. Give the light that a grid holds, "
+            text += "enclosed=0.95 of make_psf or read_psf; or the filter, whose model says it, "
+            text += "filter='F770W' of ForcedPhotometer or checked_psf; or normalize=True of "
+            text += "MatchingKernel.from_psfs, if fluxes should lack it"
             warn(text, PSFWarning)
     energy = 1.0
     if not normalize:
