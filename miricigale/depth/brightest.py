@@ -6,8 +6,10 @@ from miricigale.depth.noise import ExposureNoise
 from miricigale.instrument import Exposure
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 
 
+@takes_other_keywords
 def saturation_flux(exposure, *, background=None, psf=None, detector=None):
     """
     Return the flux of the point source whose brightest pixel is full at the end of an integration.

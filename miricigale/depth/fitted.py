@@ -12,6 +12,7 @@ from miricigale.instrument import frame_time as read_time
 from miricigale.psf import MIRI_PIXEL_SCALE, instrument_psf, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE, check_count, positive, scalar
 
 #: Factors on the noise of the sky by name: what surveys in flight lose against an ideal fit, and nothing.
@@ -45,6 +46,7 @@ def extraction_map(share, boxes):
     return weight * _SAMPLES**2 / np.sum(weight * share)
 
 
+@takes_other_keywords
 def fitted_noise(
     filter,
     time,

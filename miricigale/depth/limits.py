@@ -15,6 +15,7 @@ from miricigale.instrument import Exposure, frame_time, frames_per_group, imager
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, scalar, to_array
 
 # positions of the source's center within the pixel, per axis, over which is averaged
@@ -73,6 +74,7 @@ def _extraction(radius, annulus, psf, correlation, filter):
     return np.mean(values, axis=0)
 
 
+@takes_other_keywords
 def aperture_noise(
     filter,
     time=1e4 * u.s,
@@ -225,6 +227,7 @@ def _check_well(noise):
     check_that(filled < noise.detector.full_well, "n_groups", wanted, noise.n_groups)
 
 
+@takes_other_keywords(options_of=(aperture_noise, fitted_noise))
 def sensitivity(
     filter,
     time=None,
@@ -383,6 +386,7 @@ def _ramps(filter, time, n_dithers, *, n_groups=None, readout="FASTR1", subarray
 _COLUMNS = {"noise": "white", "residual": "residual", "limit_white": "flux_white", "limit": "flux"}
 
 
+@takes_other_keywords(options_of=(aperture_noise,))
 def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=5.0, **options):
     """
     Return the limits of several filters in apertures, compared with those of the exposure time calculator.

@@ -11,6 +11,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.tables import require_columns
 from miricigale.utils.values import value_class
 
@@ -141,6 +142,7 @@ class SaturationForecast:
         return f"<SaturationForecast {self.describe()}>"
 
 
+@takes_other_keywords
 def saturation_forecast(exposure, *, background=None, detector=None):
     """
     Tell how full the sky and the dark current make the wells by the end of an integration.

@@ -13,6 +13,7 @@ from miricigale.refdata import locate
 from miricigale.utils.caching import cached
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import SURFACE_BRIGHTNESS, scalar
 
@@ -102,6 +103,7 @@ def zodiacal_factor(filter, level="medium", *, position=None, date=None):
     return float(np.interp(abs(ecliptic.lat.deg), latitude[is_known], rows[name][is_known]))
 
 
+@takes_other_keywords
 def sky_background(filter, level="low", *, position=None, date=None):
     """
     Return the background of sky and telescope by level, position or day.

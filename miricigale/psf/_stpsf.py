@@ -12,6 +12,7 @@ from miricigale.psf.model import InstrumentPSF, PSFGrid
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE, to_array
 
 
@@ -30,6 +31,7 @@ def _instrument(filter_name):
     return instrument
 
 
+@takes_other_keywords
 def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE, position=None):
     """
     Return the PSFs of the MIRI imager over the field, from stpsf.
@@ -95,6 +97,7 @@ def stpsf_grid(filter, *, n_psfs=1, oversampling=4, fov=10.0 * ANGLE, position=N
     return PSFGrid(psfs, grid.grid_xypos)
 
 
+@takes_other_keywords(options_of=(stpsf_grid,))
 def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
     """
     Return the PSF of the MIRI imager at one position of the detector, from stpsf.

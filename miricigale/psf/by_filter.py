@@ -15,6 +15,7 @@ from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
 from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
 from miricigale.utils.exceptions import PSFWarning, warn
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE
 
 _log = logging.getLogger(__name__)
@@ -38,6 +39,7 @@ _BETTER = 0.3
 _SIGNIFICANT = 5.0
 
 
+@takes_other_keywords
 def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampling="drizzle"):
     """
     Return the model PSF of an image in a filter: MIRI, NIRCam's wide filters, WFC3/IR.
@@ -96,6 +98,7 @@ def exposure_psf(filter, scale=None):
     return nircam_psf(filter)
 
 
+@takes_other_keywords
 def checked_psf(
     psf, filter, *, pixel_scale=None, pa=None, resampling="drizzle", smoothed=False, argument="psf"
 ):

@@ -10,6 +10,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import middle_pixel
 
 
@@ -62,6 +63,7 @@ def psf_grid(psfs, positions):
     return PSFGrid(psfs, positions)
 
 
+@takes_other_keywords(options_of=(miri_psf,))
 def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", **options):
     """
     Return the PSFs of the MIRI imager over the field.

@@ -16,6 +16,7 @@ from miricigale.utils.exceptions import PSFWarning, argument_error, data_error, 
 from miricigale.utils.file_formats import register
 from miricigale.utils.files import file_place, open_fits, split_extension
 from miricigale.utils.options import check_data, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import ANGLE, scalar
 
@@ -384,6 +385,7 @@ def states_pixel(path):
     return PSFFile.open(path).cell is not None
 
 
+@takes_other_keywords(options_of=(make_psf,))
 def read_psf(
     path,
     *,
@@ -400,8 +402,9 @@ def read_psf(
 
     Parameters
     ----------
-    path : path-like
-        The file; ``file.fits[EXTENSION]`` and ``file.fits[EXTENSION,PLANE]`` name an extension and a plane.
+    path : path-like, or tuple of it and `~astropy.units.Quantity`
+        The file; ``file.fits[EXTENSION]`` and ``file.fits[EXTENSION,PLANE]`` name an extension and a plane. Or a
+        pair of the file and its pixel, ``("file.fits", 0.11 * u.arcsec)``, as functions take it for a PSF.
     frame, oversampling : optional
         As for `make_psf`; by default those of STPSF's files (the detector's frame, OVERSAMP), else the sky and 1.
     ext : int or str, optional
@@ -440,6 +443,10 @@ def read_psf(
     >>> from miricigale.psf import read_psf
     >>> psf = read_psf("f770w_psf.fits", ext=1, enclosed=0.95)  # doctest: +SKIP
     """
+    if isinstance(path, tuple) and len(path) == 2:
+        path, stated_scale = path
+        check_that(pixel_scale is None, "pixel_scale", "left out of a pair", pixel_scale)
+        pixel_scale = stated_scale
     if split_extension(path)[1] is None and is_written(path):
         arguments = {"frame": frame, "ext": ext, "plane": plane, "pixel_scale": pixel_scale}
         arguments |= {"oversampling": oversampling, "angle": angle, **options}
@@ -452,7 +459,10 @@ def read_psf(
     if oversampling is None:
         oversampling = _stated_oversampling(path, header)
     pixel_scale = psf_file.pixel_scale(pixel_scale, oversampling=oversampling)
-    wanted = f"given, such as ({str(path)!r}, 0.11 * u.arcsec), for the header does not state it"
+    wanted = (
+        f"given, for the header does not state it: read_psf({str(path)!r}, pixel_scale=0.11 * u.arcsec), or the "
+        f"pair ({str(path)!r}, 0.11 * u.arcsec) in place of a PSF"
+    )
     check_that(pixel_scale is not None, "pixel_scale", wanted, None)
     if frame is None:
         frame = "sky"

@@ -14,6 +14,7 @@ from miricigale.psf.optics import hst_pupil, polychromatic_psf
 from miricigale.psf.telescope import band_quantiles, checked_grid, odd_cells
 from miricigale.utils.caching import cached
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE, scalar
 
 WFC3_FILTERS = ("wfc3.f105w", "wfc3.f125w", "wfc3.f140w", "wfc3.f160w")
@@ -57,6 +58,7 @@ def _hst_blur(scale):
     return brentq(excess, 0.0, _WFC3_FWHM, xtol=1e-5)
 
 
+@takes_other_keywords
 def hst_psf(
     filter="wfc3.f160w", *, pixel_scale=0.06 * u.arcsec, oversampling=4, fov=None, angle=0.0 * u.deg
 ):

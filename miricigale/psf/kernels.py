@@ -19,6 +19,7 @@ from miricigale.utils.file_formats import read_write
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE, frozen_array, positive, scalar, to_array
 from miricigale.utils.values import value_class
 
@@ -106,6 +107,7 @@ class MatchingKernel(Interactive):
         )
 
     @classmethod
+    @takes_other_keywords
     def from_psfs(
         cls,
         hi,

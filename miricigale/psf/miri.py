@@ -21,6 +21,7 @@ from miricigale.psf.optics import jwst_constants
 from miricigale.psf.telescope import Telescope, checked_grid, odd_cells
 from miricigale.utils.caching import cached
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE
 
 #: Geometric mean of the imager's pixel, 0.110498 x 0.111336 arcsec (SIAF, MIRIM_FULL).
@@ -116,6 +117,7 @@ def _miri_data(telescope, oversampling, fov, includes, calibration, position=Non
     return data, scale
 
 
+@takes_other_keywords
 def miri_psf(
     filter,
     *,

@@ -16,6 +16,7 @@ from miricigale.utils.files import write_fits
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import attributes
 from miricigale.utils.options import check_that, check_type
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE, check_count, positive, scalar, to_array
 
 #: Where a PSF's axes may stand: on the detector (angle on the sky not yet known) or the sky.
@@ -366,6 +367,7 @@ def instrument_psf(psf, argument="psf"):
     return psf
 
 
+@takes_other_keywords(options_of=(InstrumentPSF,))
 def make_psf(data, pixel_scale, *, frame="sky", oversampling=1, enclosed=None, **facts):
     """
     Make a PSF of an array, normalized and checked.
@@ -506,6 +508,7 @@ def as_psf(psf, argument="psf"):
     return ImagePSF(data * (cells**2 / data.sum()), oversampling=cells)
 
 
+@takes_other_keywords(options_of=(make_psf,))
 def from_photutils(model, pixel_scale, *, x=None, y=None, **options):
     """
     Take over a PSF from photutils (or from stpsf, which writes the gridded form).

@@ -7,6 +7,7 @@ from miricigale.psf.effects import detector_response
 from miricigale.psf.model import make_psf
 from miricigale.psf.optics import jwst_constants
 from miricigale.psf.telescope import Telescope, checked_grid, odd_cells
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE
 
 #: Pixel in arcsec of the wide filters, of the short- and the long-wavelength channel.
@@ -15,6 +16,7 @@ _PIXELS |= dict.fromkeys((f"nircam.f{n}w" for n in (277, 356, 444)), 0.063)
 NIRCAM_FILTERS = tuple(_PIXELS)
 
 
+@takes_other_keywords
 def nircam_psf(filter, *, oversampling=4, fov=None, wavefront_error=75 * u.nm, seed=1):
     """
     Return the PSF of a wide filter of NIRCam, by the optics of `miri_psf`.

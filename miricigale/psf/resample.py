@@ -12,6 +12,7 @@ from miricigale.psf.model import instrument_psf
 from miricigale.utils.arrays import centered
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import middle_pixel
 from miricigale.utils.units import ANGLE, check_count, positive, scalar
 
@@ -52,6 +53,7 @@ def sampled(psf, x, y, turn=0.0, data=None):
     return _core.interpolate(data, u_ / psf.cell + psf.origin[0], v_ / psf.cell + psf.origin[1])
 
 
+@takes_other_keywords
 def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
     """
     Turn a PSF from the detector's axes to those of an image of the sky.
@@ -155,6 +157,7 @@ def alike(psfs, names):
     return psfs
 
 
+@takes_other_keywords
 def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     """
     Sample a PSF on another pixel grid of the same orientation.
@@ -205,6 +208,7 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     return sampled(psf, x, y) * (scale / psf.pixel_scale.value) ** 2
 
 
+@takes_other_keywords
 def psf_mosaic(
     psf,
     pixel_scale,

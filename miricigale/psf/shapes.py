@@ -6,9 +6,11 @@ import numpy as np
 
 from miricigale.psf.model import make_psf
 from miricigale.psf.telescope import odd_cells
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE, scalar
 
 
+@takes_other_keywords
 def gaussian_psf(fwhm, *, pixel_scale, oversampling=4, fov):
     """
     Return a round Gaussian.

@@ -10,9 +10,11 @@ from miricigale.instrument.image_planes import standard_deviation
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.star_fit import TERMS, Star, StarPSF
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE, positive
 
 
+@takes_other_keywords
 def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
     """
     Correct a model PSF by stars in one or several (dithered) images.

@@ -12,20 +12,25 @@ from miricigale.utils.package_tables import declared
 _CALL = "_"
 #: Key of the argument that a text is where the first argument is given by keyword.
 _TEXT = "_text"
+#: Key of the keywords of all calls that have the argument of ours.
+_COMMON = "common"
 
 
-def takes_other_keywords(target):
+def takes_other_keywords(target=None, *, options_of=()):
     """
     Let a function, a method or a class take keywords that are usual elsewhere.
 
     ``other_keywords.toml`` has them by the name of the class (for its constructor), ``Class.method`` or the
-    function. Keywords of a part of a dataclass, such as ``pixfrac`` of ``Reducer(mosaics=MosaicSettings())``,
-    are taken by the class too.
+    function, and those that all share. Keywords of a part of a dataclass, such as ``pixfrac`` of
+    ``Reducer(mosaics=MosaicSettings())``, are taken by the class too.
 
     Parameters
     ----------
     target : callable or type
         What is called. A class keeps its type; its ``__init__`` is replaced.
+    options_of : tuple of callable, optional
+        What further keywords of a function (its ``**options``) are handed to, and so may be. Without it those that
+        are not known go there unchecked.
 
     Returns
     -------
@@ -42,31 +47,39 @@ def takes_other_keywords(target):
     >>> Exposure("F770W", ngroups=10, nints=2)
     <Exposure miri.f770w: FASTR1, 2 x 10 groups, 55.5 s, FULL>
     """
+    if target is None:
+        return functools.partial(takes_other_keywords, options_of=options_of)
     if isinstance(target, type):
         settings = _settings_of(target)
         target.__init__ = _renaming(target.__init__, target.__name__, settings)
         return target
-    return _renaming(target, target.__qualname__.removesuffix(".__init__"), {})
+    return _renaming(target, target.__qualname__.removesuffix(".__init__"), {}, options_of)
 
 
-def _renaming(function, label, settings):
-    """Return the function, which takes the other keywords of a label and those of settings."""
+def _renaming(function, label, settings, options_of=()):
+    """Return the function, which takes the other keywords of a label, those of settings and of what it calls."""
     parameters = dict(inspect.signature(function).parameters)
     owner = next((name for name in ("self", "cls") if name in parameters), None)
     parameters.pop(owner, None)
-    names = list(parameters)
+    options = [name for name, value in parameters.items() if value.kind is value.VAR_KEYWORD]
+    names = [name for name in parameters if name not in options]
+    for callee in options_of:
+        names += [name for name in _keywords_of(callee) if name not in names]
+    is_open = bool(options) and not options_of
     kinds = [parameter.kind for parameter in parameters.values()]
     n_owners = 0 if owner is None else 1
     n_most = kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD)
     takes_any_number = inspect.Parameter.VAR_POSITIONAL in kinds
+
+    known = frozenset(names)
 
     @functools.wraps(function)
     def call(*args, **keywords):
         n_args = len(args) - n_owners
         if n_args > n_most and not takes_any_number:
             raise TypeError(_too_many(label, names[:n_most], n_args))
-        if not keywords.keys() <= parameters.keys():
-            keywords = _our_keywords(keywords, label, names, settings)
+        if not keywords.keys() <= known:
+            keywords = _our_keywords(keywords, label, names, settings, is_open=is_open)
         twice = sorted(keywords.keys() & set(names[:n_args]))
         if _is_text_alone(args[n_owners:], twice, names):
             # such as the name of a filter whose wavelengths are given by keyword
@@ -78,7 +91,17 @@ def _renaming(function, label, settings):
             raise TypeError(_given_twice(twice[0], label))
         return function(*args, **keywords)
 
+    call.keyword_names = tuple(names)
     return call
+
+
+def _keywords_of(target):
+    """Return the names of the arguments of a function or a class, and of what it hands options to."""
+    names = getattr(target, "keyword_names", None)
+    if names is None:
+        kinds = inspect.signature(target).parameters
+        names = tuple(name for name, value in kinds.items() if value.kind is not value.VAR_KEYWORD)
+    return names
 
 
 def _is_text_alone(values, twice, names):
@@ -96,9 +119,18 @@ def _names_of_values(label):
     return declared("miricigale.utils", "other_keywords.toml")["values"].get(label, {})
 
 
-def _our_keywords(keywords, label, names, settings):
-    """Keywords of a call by our names."""
-    other_names = _other_names(label)
+def _common_names(label, names):
+    """Our keywords among some names by those that are usual elsewhere, but those with a sentence of the label."""
+    sentences = _sentences(label)
+    common = declared("miricigale.utils", "other_keywords.toml")[_COMMON]
+    return {
+        other: ours for other, ours in common.items() if ours in names and other not in sentences
+    }
+
+
+def _our_keywords(keywords, label, names, settings, *, is_open=False):
+    """Keywords of a call by our names; an open one takes all others as they are."""
+    other_names = _common_names(label, names) | _other_names(label)
     ours = {}
     values = {}
     for keyword, value in keywords.items():
@@ -114,6 +146,8 @@ def _our_keywords(keywords, label, names, settings):
             ours[name] = value
         elif len(owners) == 1:
             values.setdefault(owners[0], {})[name] = value
+        elif is_open and keyword not in _sentences(label):
+            ours[keyword] = value
         else:
             raise TypeError(_unknown_keyword(keyword, label, names, settings))
     for part, fields in values.items():

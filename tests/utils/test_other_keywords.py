@@ -10,20 +10,35 @@ import pytest
 
 import miricigale
 from helpers.errors import refuses
-from miricigale import BayesFitter, Detector, Exposure, Filter, ForcedPhotometer, Reducer, Scene
+from miricigale import (
+    BayesFitter,
+    Detector,
+    Exposure,
+    Filter,
+    ForcedPhotometer,
+    Reducer,
+    Scene,
+    depth,
+    photometry,
+    psf,
+)
 from miricigale.reduction import MosaicSettings
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 
 DECLARED = declared("miricigale.utils", "other_keywords.toml")
 OTHER_KEYWORDS = {
-    label: names for label, names in DECLARED.items() if label not in ("hints", "values")
+    label: names for label, names in DECLARED.items() if label not in ("hints", "values", "common")
 }
 
 
 def called(label):
     """Return what a label of the table stands for: a class or one of its methods."""
-    return operator.attrgetter(label)(miricigale)
+    owner = miricigale
+    for module in (psf, depth, photometry):
+        if label in module.__all__:
+            owner = module
+    return operator.attrgetter(label)(owner)
 
 
 @pytest.mark.parametrize("label", OTHER_KEYWORDS)
@@ -71,6 +86,46 @@ def test_calls_with_other_keywords_are_those_with_ours():
     flat = {"frac_agn": np.ones_like}
     fitter = BayesFitter(bands=["F770W", "F1500W"], prior=flat)
     assert repr(fitter.priors) == repr(BayesFitter(["F770W"], priors=flat).priors)
+
+
+def test_functions_take_other_keywords_too():
+    model = psf.miri_psf("F1500W", oversampling=2, fov=2 * u.arcsec)
+    same = psf.miri_psf(band="F1500W", oversample=2, field_of_view=2 * u.arcsec)
+    np.testing.assert_array_equal(same.data, model.data)
+    hour = 1 * u.hour
+    limit = depth.sensitivity("F770W", hour, n_sigma=10)
+    assert depth.sensitivity("F770W", exptime=hour, snr=10) == limit
+    # options go through several functions
+    assert (
+        psf.miri_psf_grid("F1500W", n_psfs=4, oversample=2, fov=2 * u.arcsec).oversampling[0] == 2
+    )
+    stamp = np.outer(*[np.exp(-0.5 * np.linspace(-3, 3, 9) ** 2)] * 2)
+    refuses(r"make_psf\(\) has no argument 'normalize'; enclosed=0.95 says", psf.make_psf, stamp,
+            0.1 * u.arcsec, normalize=True, error=TypeError)  # fmt: skip
+    refuses(r"miri_psf\(\) has no argument 'fov_arcsec'; did you mean 'fov'", psf.miri_psf, "F770W",
+            fov_arcsec=3, error=TypeError)  # fmt: skip
+
+
+@takes_other_keywords
+def draw(filter, *, seed=0, **options):
+    """Return what a function with options of any name gets."""
+    return filter, seed, options
+
+
+def test_open_options_are_handed_on():
+    assert draw(band="F770W", rng=2, alpha=0.5) == ("F770W", 2, {"alpha": 0.5})
+
+
+@pytest.mark.parametrize("ours", sorted(set(DECLARED["common"].values())))
+def test_common_keywords_are_of_some_call(ours):
+    functions = [getattr(module, n) for module in (psf, depth, photometry) for n in module.__all__]
+    classes = [getattr(miricigale, name) for name in miricigale.__all__]
+    names = set()
+    for target in functions + classes:
+        if callable(target):
+            names |= set(inspect.signature(target).parameters)
+    names |= set(inspect.signature(BayesFitter.fit).parameters)
+    assert ours in names
 
 
 def test_settings_of_parts_are_keywords_of_the_whole():

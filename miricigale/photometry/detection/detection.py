@@ -18,6 +18,7 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without_none
 from miricigale.utils.options import check_names, check_positive, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import column_texts
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
@@ -112,6 +113,7 @@ DETECTION_PRESETS = {
 }
 
 
+@takes_other_keywords
 def detect_sources(
     image,
     *,

@@ -19,6 +19,7 @@ from miricigale.psf import psf_image
 from miricigale.utils.arrays import nans
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_positive
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import described_columns
@@ -104,6 +105,7 @@ class ImageErrors:
         write_image(self.noise, path, planes=planes, overwrite=overwrite)
 
 
+@takes_other_keywords
 def image_errors(image, *, diameters=(0.5, 1.0) * u.arcsec, psf=None, n_sigma=5.0, seed=None):
     """
     Measure the errors of fluxes on an image, with the correlation of its noise.

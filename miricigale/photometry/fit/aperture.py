@@ -13,6 +13,7 @@ from miricigale.photometry.detection.detection import detect_sources
 from miricigale.photometry.images.arrays import image_arrays, pixel_scale, sky_to_pixels
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, FNU, positive, scalar
@@ -35,6 +36,7 @@ _AUTO_FRACTION = 0.94
 _APERTURE_FRACTION = 0.8
 
 
+@takes_other_keywords
 def aperture_photometry(image, sky, diameter=None):
     """
     Sum light in circles, or in other apertures.
@@ -145,6 +147,7 @@ def aperture_sums(arrays, aperture):
     return flux, np.sqrt(noise), coverage
 
 
+@takes_other_keywords
 def source_extractor_photometry(
     image, *, preset="yang2021_miri", stated_on=0.06 * u.arcsec, weighted=True
 ):
