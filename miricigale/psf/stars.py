@@ -2,15 +2,17 @@
 
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.nddata import NDData
 from astropy.stats import mad_std
 from astropy.table import Table
 
 from miricigale.instrument.image_planes import standard_deviation
 from miricigale.psf.model import instrument_psf
 from miricigale.psf.star_fit import TERMS, Star, StarPSF
+from miricigale.utils.files import is_path, listed_images
 from miricigale.utils.options import check_that
 from miricigale.utils.other_keywords import takes_other_keywords
+from miricigale.utils.positions import as_positions
+from miricigale.utils.tables import as_table
 from miricigale.utils.units import ANGLE, positive
 
 
@@ -29,8 +31,8 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
         ``uncertainty`` the noise is measured.
     stars : `~astropy.table.Table`, `~astropy.coordinates.SkyCoord` or sequence of tables
         Positions on the sky for all images, which then need a WCS, or for each image a table with ``x`` and
-        ``y`` in 0-based pixels, good to half a pixel. Isolated and not saturated: no star is judged here. Those
-        whose stamps leave an image are left out.
+        ``y`` in 0-based pixels, good to half a pixel; or files of tables. Isolated and not saturated: no star is
+        judged here. Those whose stamps leave an image are left out.
     psf : `~photutils.psf.ImagePSF`
         The model on the images' pixels and axes, with its center in the middle.
     fov : `~astropy.units.Quantity`, optional
@@ -74,14 +76,13 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
     ny, nx = psf.data.shape
     middle = ny == nx and ny % 2 == 1 and np.allclose(psf.origin, (nx // 2, ny // 2))
     check_that(middle, "psf", "square and odd, with its center in the middle", psf.data.shape)
-    if isinstance(images, NDData):
-        images = [images]
-    else:
-        images = list(images)
+    images = listed_images(images, reader="miricigale.photometry.read_mosaic")
+    if is_path(stars):
+        stars = as_table(stars, "stars")
     if isinstance(stars, (Table, SkyCoord)):
         stars = [stars] * len(images)
     else:
-        stars = list(stars)
+        stars = [as_table(table, "stars") if is_path(table) else table for table in stars]
     wanted = f"positions on the sky, or a table for each of {len(images)} images"
     check_that(len(stars) == len(images), "stars", wanted, f"{len(stars)} tables")
     half = round(
@@ -128,12 +129,13 @@ def psf_from_stars(images, stars, psf, *, fov=5 * ANGLE):
 
 def _places(image, stars):
     """Return the pixels x, y of stars on an image."""
-    if not isinstance(stars, SkyCoord) and "sky" not in stars.colnames:
-        wanted = "tables with 'x' and 'y', or 'sky'"
-        check_that({"x", "y"} <= set(stars.colnames), "stars", wanted, stars.colnames)
-        return np.stack([np.asarray(stars[name], float) for name in "xy"], axis=1)
     sky = stars
     if not isinstance(stars, SkyCoord):
-        sky = stars["sky"]
+        if "sky" not in stars.colnames and {"x", "y"} <= set(stars.colnames):
+            return np.stack([np.asarray(stars[name], float) for name in "xy"], axis=1)
+        wanted = "tables with 'x' and 'y', 'sky', or 'ra' and 'dec'"
+        names = {name.lower() for name in stars.colnames}
+        check_that("sky" in names or {"ra", "dec"} <= names, "stars", wanted, stars.colnames)
+        sky = as_positions(stars, "stars")
     check_that(image.wcs is not None, "stars", "'x' and 'y' for images without a WCS", "the sky")
     return np.stack(np.atleast_1d(*image.wcs.world_to_pixel(sky)), axis=1)

@@ -148,6 +148,43 @@ def is_path(value):
     return isinstance(value, (str, os.PathLike))
 
 
+def listed_images(images, argument="images", reader="miricigale.reduction.open_exposure"):
+    """
+    Return a list of one image or several, which files are not.
+
+    Parameters
+    ----------
+    images : `~astropy.nddata.NDData` or iterable of them
+        One, or several.
+    argument : str, optional
+        The argument's name, for the message.
+    reader : str, optional
+        Function that reads a file, for the message.
+
+    Returns
+    -------
+    images : list of `~astropy.nddata.NDData`
+
+    Raises
+    ------
+    ValueError
+        If it is a path, or holds one.
+    """
+    # slow to import
+    from astropy.nddata import NDData
+
+    if isinstance(images, NDData):
+        return [images]
+    if not is_path(images):
+        images = list(images)
+        paths = [image for image in images if is_path(image)]
+        if not paths:
+            return images
+        images = paths[0]
+    msg = f"'{argument}' must be images, got a path: {reader}({str(images)!r}) reads one"
+    raise ValueError(msg)
+
+
 def make_folder(path):
     """Make a folder (`pathlib.Path`) and those that it is in, where they are not there yet."""
     path.mkdir(parents=True, exist_ok=True)

@@ -137,7 +137,7 @@ def test_refuses(truth, field):
     for given, match in (
         ((bare, sky), "'stars' must be 'x' and 'y' for images without a WCS"),
         ((images, tables[:2]), "'stars' must be positions on the sky, or a table for each"),
-        ((bare, Table({"a": [1]})), "'stars' must be tables with 'x' and 'y', or 'sky'"),
+        ((bare, Table({"a": [1]})), "'stars' must be tables with 'x' and 'y', 'sky', or"),
         ((bare, tables[0][:0]), "'stars' must be at least one with its stamp on an image"),
     ):
         refuses(match, psf_from_stars, *given, truth)

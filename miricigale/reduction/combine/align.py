@@ -15,6 +15,7 @@ from miricigale.reduction.images.images import plain_mask, with_data
 from miricigale.reduction.sky.background import estimate_background
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import listed_images
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import at_epoch
 from miricigale.utils.units import ANGLE, positive
@@ -180,7 +181,7 @@ def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
     >>> print(f"{solutions[0].north.to(u.arcsec):.1f}, {solutions[0].n_matched} stars")
     -0.2 arcsec, 4 stars
     """
-    images = list(images)
+    images = listed_images(images)
     check_that(images, "images", "at least one image", "none")
     reach = positive(radius, ANGLE, "radius")
     groups = list(range(len(images)) if groups is None else groups)

@@ -25,6 +25,7 @@ from miricigale.reduction.images.images import (
 from miricigale.utils import sep_tools
 from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import listed_images
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.values import value_class
@@ -330,7 +331,7 @@ def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, v
     >>> print(f"{np.nanmean(mosaic.image.data):.2f} MJy/sr")
     5.10 MJy/sr
     """
-    images = list(images)
+    images = listed_images(images)
     check_images(images, wcs)
     check_that(0 < pixfrac <= 1, "pixfrac", "above 0 and at most 1", pixfrac)
     shape = tuple(map(int, wcs.pixel_shape[::-1]))

@@ -15,6 +15,7 @@ from miricigale.reduction.images.images import (
 from miricigale.reduction.mosaic.extended_outliers import extended_outliers
 from miricigale.reduction.mosaic.mosaic import add_image, extent_of, pixel_maps_of, weight_map
 from miricigale.utils.arrays import box_shape
+from miricigale.utils.files import listed_images
 from miricigale.utils.options import check_positive
 from miricigale.utils.parallel import chunks
 from miricigale.utils.values import value_class
@@ -98,7 +99,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None
     >>> [image.meta["n_outliers"] for image in checked]
     [1, 0, 0]
     """
-    images = list(images)
+    images = listed_images(images)
     check_images(images, wcs)
     check_positive(threshold, "threshold")
     if len(images) < 3:

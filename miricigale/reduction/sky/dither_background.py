@@ -11,6 +11,7 @@ from miricigale.reduction.mosaic.mosaic import drizzle_images, pixel_maps_of
 from miricigale.reduction.mosaic.outliers import nan_median
 from miricigale.reduction.sky.background import estimate_background, warn_of
 from miricigale.reduction.sky.sky_mesh import sky_boxes
+from miricigale.utils.files import listed_images
 from miricigale.utils.options import check_that
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
@@ -86,7 +87,7 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None):
     >>> print(f"{backgrounds[0].level.mean():.1f} MJy/sr")
     4.9 MJy/sr
     """
-    images = list(images)
+    images = listed_images(images)
     check_that(len(images) >= 3, "images", "at least three dithers", len(images))
     shape = images[0].shape
     for im in images:

@@ -11,6 +11,7 @@ from miricigale.reduction.sky.background import estimate_background
 from miricigale.reduction.sky.dither_background import other_medians, restored
 from miricigale.reduction.sky.sky_mesh import sky_boxes
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import listed_images
 from miricigale.utils.options import check_that
 
 #: Pixels over which the flat is smoothed.
@@ -65,7 +66,7 @@ def sky_flats(images, *, window=None):
     >>> print(f"{np.median(flat.data):.2f} +- {np.median(flat.uncertainty.array):.3f}")
     1.00 +- 0.011
     """
-    images = list(images)
+    images = listed_images(images)
     if len({im.shape for im in images}) > 1:
         raise argument_error("images", f"of one shape {images[0].shape}", images[-1].shape)
     days = np.array([ExposureHistory.of(im).day for im in images], float)

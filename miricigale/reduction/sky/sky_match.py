@@ -5,6 +5,7 @@ import numpy as np
 from miricigale.reduction.images.images import check_images, plain_mask, with_data
 from miricigale.reduction.mosaic.mosaic import pixel_maps_of
 from miricigale.utils.arrays import is_inside
+from miricigale.utils.files import listed_images
 from miricigale.utils.named_values import without_none
 
 # pixels of the grid that are averaged before images are compared
@@ -71,7 +72,7 @@ def sky_offsets(images, wcs, *, pixel_maps=None):
     >>> sky_offsets(images, wcs).round(2)
     array([-0.1,  0.1,  0. ])
     """
-    images = list(images)
+    images = listed_images(images)
     check_images(images, wcs)
     if pixel_maps is None:
         pixel_maps = pixel_maps_of(images, wcs)
@@ -161,7 +162,7 @@ def match_levels(images, wcs, *, pixel_maps=None):
     >>> [round(float(image.data.mean()), 2) for image in match_levels(images, wcs)]
     [5.1, 5.1, 5.1]
     """
-    images = list(images)
+    images = listed_images(images)
     offsets = sky_offsets(images, wcs, pixel_maps=pixel_maps)
     out = []
     for im, offset in zip(images, offsets, strict=True):
