@@ -52,7 +52,7 @@ class BackgroundFlags(Flags):
         4,
         (
             "The level is open by more than a third of itself, and by more than three times the "
-            "noise of a pixel: `~miricigale.reduction.Reducer` leaves the sky in the image."
+            "noise of a pixel: Reducer leaves the sky in the image."
         ),
     )
 
