@@ -142,7 +142,7 @@ def test_what_is_no_image_or_kernel_is_named(images, psfs, sky):
     refuses(
         "'kernel' must be a MatchingKernel, a KernelField, a file", ForcedPhotometer, psfs["psf"]
     )
-    refuses("'angle' must be given to 'MatchingKernel.identity'", ForcedPhotometer, psf="F770W")
+    refuses("'psf' must be that of the image on the sky, psf_mosaic", ForcedPhotometer, psf="F770W")
     refuses("'psf' must be a PSF on pixels of known size", ForcedPhotometer, psf=3.0)
     bands = {"F770W": psfs["psf"], "F1000W": psfs["psf"]}
     refuses(
@@ -332,7 +332,7 @@ def test_a_psf_and_its_filter_have_the_fluxes_of_the_command(tmp_path, capsys):
     image = CCDData(data, unit="uJy", wcs=wcs, uncertainty=StdDevUncertainty(error))
     fits.writeto(tmp_path / "psf.fits", stamp / share)
     for psf in (stamp / share, (stamp / share, scale), tmp_path / "psf.fits"):
-        with pytest.warns(PSFWarning, match="fluxes lack what lies beyond.*the 'filter' of"):
+        with pytest.warns(PSFWarning, match="fluxes lack what lies beyond.*filter='F770W' of"):
             bare = ForcedPhotometer(psf=psf).measure(image, sky)
         with pytest.warns(PSFWarning, match="is taken to hold 0.8"):
             whole = ForcedPhotometer(psf=psf, filter="F770W").measure(image, sky)

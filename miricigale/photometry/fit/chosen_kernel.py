@@ -18,6 +18,7 @@ from miricigale.psf import (
     as_kernel,
     checked_psf,
     from_photutils,
+    instrument_psf,
     read_psf,
 )
 from miricigale.psf.files import states_pixel
@@ -139,13 +140,25 @@ def kernel_of_psfs(psf, highres_psf, filter, **place):
     if filter is not None:
         psf = checked_psf(named_psf(psf), filter)
     if highres_psf is None:
-        kernel = MatchingKernel.identity(psf)
+        kernel = MatchingKernel.identity(_on_sky(psf))
     else:
         kernel = MatchingKernel.from_psfs(highres_psf, psf, **place)
     # for a warning: the PSF was taken to hold all of the light
     if kernel.meta.get("energy") == 1.0:
         kernel.meta["total_assumed"] = True
     return kernel
+
+
+def _on_sky(psf):
+    """Return a PSF of its file, name or pair; refuse one in the detector's frame whose angle is not known."""
+    psf = instrument_psf(named_psf(psf))
+    if psf.frame == "detector" and psf.pa_aper is None:
+        wanted = (
+            "that of the image on the sky, psf_mosaic(miri_psf('F770W'), pixel_scale, exposure.pa_aper) of "
+            "miricigale.psf"
+        )
+        raise argument_error("psf", wanted, "one in the frame of the detector")
+    return psf
 
 
 def _as_kernels(kernel):

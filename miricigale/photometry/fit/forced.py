@@ -522,6 +522,11 @@ class ForcedPhotometer(Interactive):
         scale = self.mean_kernel.pixel_scale.to_value(ANGLE)
         have = pixel_scale(wcs)
         wanted = f"on the kernel's pixels of {scale:.4g} arcsec"
+        if self.mean_kernel.meta.get("identity"):
+            wanted = (
+                f"left out, or its PSF given, ForcedPhotometer(psf=psf, highres_psf=prior_psf): without it the "
+                f"prior is expected on the cells of 'psf', {scale:.4g} arcsec (its pixel over its oversampling)"
+            )
         check_that(not abs(have / scale - 1) > 0.01, name, wanted, f"{have:.4g} arcsec")
 
     def _check_grid(self, templates):
