@@ -182,6 +182,9 @@ class Filter(Frozen, WithTable):
             If there is no such filter; the message lists the nearest ones.
         """
         full_name = find_filter(str(name))
+        if full_name is None and Path(str(name)).expanduser().is_file():
+            msg = f"no filter {str(name)!r}, which is a file: Filter.read({str(name)!r}) reads it"
+            raise KeyError(msg)
         if full_name is None and not str(name).startswith("sedpy."):
             raise unknown_filter(str(name))
         return _from_name(full_name or str(name))
