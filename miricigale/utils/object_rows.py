@@ -196,6 +196,12 @@ class ObjectRows(Interactive):
         if hasattr(self, "to_table"):
             table = self.to_table()
         if name not in getattr(table, "colnames", ()):
+            # such as chi2, which the table has by another name
+            values = None
+            if not name.startswith("_"):
+                values = getattr(self, name, None)
+            if isinstance(values, np.ndarray) and values.shape[:1] == (len(self),):
+                return values
             available = [*getattr(table, "colnames", ()), *map(str, self._row_of_id)]
             raise unknown_name("column or id", name, available)
         return table[name]
