@@ -164,6 +164,8 @@ def test_rows_ids_and_columns(results, tmp_path):
     table = results.to_table()
     assert_quantity_allclose(results["mass_p50"], table["mass_p50"])
     assert_quantity_allclose(results["mass"], results.median("mass"))
+    # chi2_best of the table, by the name of the attribute
+    assert_allclose(results["chi2"], table["chi2_best"])
     assert_quantity_allclose(results.median("mass"), table["mass_p50"])
     summary = results.summary()
     assert summary.colnames[:3] == ["id", "flags", "chi2_best"]
