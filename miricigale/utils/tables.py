@@ -300,7 +300,8 @@ def check_units(table, units, argument, *, user_names=None, takes_units=False):
 def _lacking_units(units, argument, takes_units):
     """Return what to say of columns without a unit, by the units that they should convert to."""
     names = ", ".join(map(repr, units))
-    wanted = ", ".join(map(str, units.values()))
+    # each unit once
+    wanted = ", ".join(dict.fromkeys(map(str, units.values())))
     columns = "column"
     if len(units) > 1:
         columns = "columns"

@@ -143,5 +143,5 @@ def test_what_are_no_dithers_is_refused(listed, table, tmp_path):
     refuses(text, check_study, config_of(dithers=str(empty)), error=DataError)
     plain = tmp_path / "plain.ecsv"
     QTable({"x_offset": [1.0], "y_offset": [1.0]}).write(plain)
-    text = r"dithers: .*'plain\.ecsv' column 'x_offset' must be convertible to arcsec"
+    text = r"dithers: .*'plain\.ecsv' columns 'x_offset', 'y_offset' must be convertible to arcsec, got no"
     refused(text, dithers=str(plain))
