@@ -10,7 +10,7 @@ from miricigale.filters.band_names import known_filter
 from miricigale.psf import _core
 from miricigale.psf.hst import WFC3_FILTERS, hst_psf
 from miricigale.psf.miri import MIRI_FILTERS, miri_psf
-from miricigale.psf.model import instrument_psf
+from miricigale.psf.model import UNIT_SUM, instrument_psf
 from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
 from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
 from miricigale.utils.exceptions import PSFWarning, warn
@@ -28,10 +28,8 @@ MODEL_FILTERS = MIRI_FILTERS + NIRCAM_FILTERS + WFC3_FILTERS
 _OTHER_WIDTH = 1.5
 _NARROWER = 0.05
 _WIDER = 0.15
-#: How far a sum may be from the fraction of light that the model's grid holds to be taken for it, and
-#: the sum from which on a PSF counts as normalized on its own grid.
+#: How far a sum may be from the fraction of light that the model's grid holds to be taken for it.
 _NEAR_SUM = 0.05
-_UNIT_SUM = 0.995
 #: Least strength of the spikes in the detector's axes, in units of the model's, and by how much and how
 #: many standard deviations it must exceed that of spikes turned to the sky.
 _STRENGTH = 0.4
@@ -241,7 +239,7 @@ def _scaled(psf, expected, filter_, argument):
         return psf
     held = psf.enclosed
     enclosed = expected
-    if held < _UNIT_SUM and abs(held - expected) < _NEAR_SUM:
+    if held < UNIT_SUM and abs(held - expected) < _NEAR_SUM:
         enclosed = held
     width = 2 * psf.half_width
     msg = (

@@ -252,7 +252,6 @@ class MatchingKernel(Interactive):
                 "None",
             )
         source, target, mended = psf_pair(psf, psf, psf.cell, angles=(angle, angle))
-        mended["identity"] = True
         array = np.zeros_like(source)
         array[tuple(n // 2 for n in array.shape)] = mended["energy"]
         return cls(array, pixel_scale=psf.cell * ANGLE, source=source, target=target, meta=mended)

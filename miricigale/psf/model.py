@@ -26,9 +26,10 @@ FRAMES = ("detector", "sky")
 _FACTS = ("pixel_scale", "frame", "oversampling", "origin", "angle", "includes", "filter")
 _FACTS += ("total_known", "position", "subarray", "pa_aper")
 
-#: Sums of an array with one value a pixel that are the part of the light in it: below, an image in any unit is
-#: meant, and above, one that was normalized on its grid.
-_STATED_PART = (0.85, 0.995)
+#: Sum of a PSF from which on it was normalized on its grid, and says nothing of the light beyond.
+UNIT_SUM = 0.995
+#: Sum of an array below which it does not say the part of the light either, but is an image in any unit.
+_LEAST_PART = 0.85
 
 #: What the PSFs of a `PSFGrid` have in common.
 SHARED = ("frame", "angle", "includes", "filter", "total_known", "subarray")
@@ -569,7 +570,7 @@ def _stated_part(values):
     if isinstance(values, (ImagePSF, GriddedPSFModel)) or not isinstance(array, np.ndarray):
         return 1.0
     total = float(np.sum(floats(array)))
-    if _STATED_PART[0] <= total < _STATED_PART[1]:
+    if _LEAST_PART <= total < UNIT_SUM:
         return total
     return 1.0
 

@@ -70,7 +70,7 @@ def check_data(good, path, problem):
 
 def check_is_file(path):
     """
-    Refuse a path that is no file; a folder is told from what does not exist, with some of its files.
+    Refuse a path that is no file. The message says whether it is a folder, with some of its files.
 
     Parameters
     ----------

@@ -522,7 +522,8 @@ class ForcedPhotometer(Interactive):
         scale = self.mean_kernel.pixel_scale.to_value(ANGLE)
         have = pixel_scale(wcs)
         wanted = f"on the kernel's pixels of {scale:.4g} arcsec"
-        if self.mean_kernel.meta.get("identity"):
+        # the kernel of a PSF without one of the prior moves no light
+        if np.count_nonzero(self.mean_kernel.array) == 1:
             wanted = (
                 f"left out, or its PSF given, ForcedPhotometer(psf=psf, highres_psf=prior_psf): without it the "
                 f"prior is expected on the cells of 'psf', {scale:.4g} arcsec (its pixel over its oversampling)"
