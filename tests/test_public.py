@@ -15,7 +15,7 @@ from astropy.table import QTable
 
 import miricigale
 from miricigale.detector import Dark
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import declared, hint_sentences
 
 SUBPACKAGES = [
     item.name
@@ -67,7 +67,7 @@ def test_names_that_a_subpackage_lacks_end_in_what_to_write():
 def test_hints_of_subpackages_name_what_there_is():
     hints = declared("miricigale.utils", "module_hints.toml")
     assert set(SUBPACKAGES) - {"cli", "pages", "workflow"} <= set(hints["subpackages"])
-    for sentence in [*hints["sentences"].values(), *hints["subpackages"].values()]:
+    for sentence in [*hint_sentences(hints["sentences"]).values(), *hints["subpackages"].values()]:
         for path in re.findall(r"miricigale((?:\.\w+)+)", sentence):
             value = miricigale
             for part in path[1:].split("."):

@@ -4,7 +4,7 @@ import difflib
 
 from miricigale.utils.caching import cached
 from miricigale.utils.hinted_errors import HintedAttributeError
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import declared, hint_sentences
 
 #: Most names that a message suggests, and most that it lists if none is near.
 _MAX_NAMES = 4
@@ -74,7 +74,8 @@ def attribute_hint(cls, name, names):
     """
     sentences = {}
     for base in reversed(cls.__mro__):
-        sentences |= declared("miricigale.utils", "hints.toml").get(base.__name__, {})
+        hints = declared("miricigale.utils", "hints.toml").get(base.__name__, {})
+        sentences |= hint_sentences(hints)
     if name in sentences:
         return sentences[name]
     public = [candidate for candidate in names if not candidate.startswith("_")]

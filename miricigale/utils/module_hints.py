@@ -5,7 +5,7 @@ import importlib
 import types
 
 from miricigale.utils.attribute_hints import names_sharing_words
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import declared, hint_sentences
 
 _PACKAGE = "miricigale"
 #: Most names that a message suggests.
@@ -39,8 +39,9 @@ def module_hint(module, name):
     if name.startswith("_"):
         return ""
     hints = declared("miricigale.utils", "module_hints.toml")
-    if name in hints["sentences"]:
-        return hints["sentences"][name]
+    sentences = hint_sentences(hints["sentences"])
+    if name in sentences:
+        return sentences[name]
     public_names = importlib.import_module(module).__all__
     suggestions = difflib.get_close_matches(name, public_names, n=1, cutoff=0.82)
     if not suggestions:

@@ -6,7 +6,7 @@ import inspect
 
 from miricigale.utils.attribute_hints import near_names
 from miricigale.utils.named_values import field_names
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import declared, hint_sentences
 
 #: Key of the sentence that shows the usual call.
 _CALL = "_"
@@ -170,7 +170,8 @@ def _settings_of(cls):
 
 def _sentences(label):
     """Sentences for calls of a label, by keyword."""
-    return declared("miricigale.utils", "other_keywords.toml")["hints"].get(label, {})
+    hints = declared("miricigale.utils", "other_keywords.toml")["hints"]
+    return hint_sentences(hints.get(label, {}))
 
 
 def _with_call(message, label):

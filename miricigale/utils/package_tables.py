@@ -43,3 +43,25 @@ def column_texts(package, table):
         By column; not to be changed.
     """
     return declared(package, "columns.toml")[table]
+
+
+def hint_sentences(table):
+    """
+    Resolve hints that stand for one another.
+
+    Parameters
+    ----------
+    table : dict of str to str
+        Sentences by name; one that is another name of the table stands for the sentence of that.
+
+    Returns
+    -------
+    sentences : dict of str to str
+
+    Examples
+    --------
+    >>> from miricigale.utils.package_tables import hint_sentences
+    >>> hint_sentences({"band": "a filter is meant", "filt": "band"})
+    {'band': 'a filter is meant', 'filt': 'a filter is meant'}
+    """
+    return {name: table.get(sentence, sentence) for name, sentence in table.items()}

@@ -9,7 +9,7 @@ import miricigale
 from miricigale import Filter, SEDModel, fitting, photometry, reduction
 from miricigale.utils.attribute_hints import attribute_hint
 from miricigale.utils.interactive import Interactive
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import declared, hint_sentences
 
 HINTS = {k: v for k, v in declared("miricigale.utils", "hints.toml").items() if k != "words"}
 OTHER_NAMES = declared("miricigale.utils", "other_names.toml")
@@ -31,7 +31,7 @@ PUBLIC = set(miricigale.__all__)
 def test_sentences_name_what_there_is(name):
     cls = class_of(name)
     assert issubclass(cls, Interactive)
-    for wrong, sentence in HINTS[name].items():
+    for wrong, sentence in hint_sentences(HINTS[name]).items():
         assert wrong not in dir(cls), f"{name}.{wrong} is an attribute"
         assert wrong not in OTHER_NAMES.get(name, {}), f"{name}.{wrong} is an alias"
         words = set(re.findall(r"\w+", sentence))

@@ -24,7 +24,7 @@ from miricigale import (
 )
 from miricigale.reduction import MosaicSettings
 from miricigale.utils.other_keywords import takes_other_keywords
-from miricigale.utils.package_tables import declared
+from miricigale.utils.package_tables import declared, hint_sentences
 
 DECLARED = declared("miricigale.utils", "other_keywords.toml")
 OTHER_KEYWORDS = {
@@ -67,7 +67,7 @@ def test_keywords_of_dicts_are_of_arguments_too(label):
 @pytest.mark.parametrize("label", DECLARED["hints"])
 def test_sentences_are_of_keywords_that_there_are_not(label):
     parameters = inspect.signature(called(label)).parameters
-    for wrong, sentence in DECLARED["hints"][label].items():
+    for wrong, sentence in hint_sentences(DECLARED["hints"][label]).items():
         assert wrong not in parameters, wrong
         assert wrong not in OTHER_KEYWORDS.get(label, {}), wrong
         for path in re.findall(r"miricigale((?:\.\w+)+)", sentence):
