@@ -1,5 +1,6 @@
 from ._stpsf import stpsf_grid as stpsf_grid
 from ._stpsf import stpsf_psf as stpsf_psf
+from .any_psf import as_psf as as_psf
 from .by_filter import MODEL_FILTERS as MODEL_FILTERS
 from .by_filter import checked_psf as checked_psf
 from .by_filter import filter_psf as filter_psf
@@ -24,7 +25,6 @@ from .miri import MIRI_PIXEL_SCALE as MIRI_PIXEL_SCALE
 from .miri import miri_psf as miri_psf
 from .model import InstrumentPSF as InstrumentPSF
 from .model import PSFGrid as PSFGrid
-from .model import as_psf as as_psf
 from .model import from_photutils as from_photutils
 from .model import instrument_psf as instrument_psf
 from .model import make_psf as make_psf

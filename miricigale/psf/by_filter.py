@@ -8,9 +8,10 @@ import numpy as np
 
 from miricigale.filters.band_names import known_filter
 from miricigale.psf import _core
+from miricigale.psf.any_psf import UNIT_SUM
 from miricigale.psf.hst import WFC3_FILTERS, hst_psf
 from miricigale.psf.miri import MIRI_FILTERS, miri_psf
-from miricigale.psf.model import UNIT_SUM, instrument_psf
+from miricigale.psf.model import instrument_psf
 from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
 from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
 from miricigale.utils.exceptions import PSFWarning, warn

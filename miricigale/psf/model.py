@@ -9,6 +9,7 @@ from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
+from miricigale.psf.any_psf import as_psf, stated_part
 from miricigale.utils.arrays import centered, check_light
 from miricigale.utils.exceptions import PSFWarning, argument_error, warn
 from miricigale.utils.file_formats import read_write
@@ -25,11 +26,6 @@ FRAMES = ("detector", "sky")
 #: Parameters of an `InstrumentPSF` besides its data.
 _FACTS = ("pixel_scale", "frame", "oversampling", "origin", "angle", "includes", "filter")
 _FACTS += ("total_known", "position", "subarray", "pa_aper")
-
-#: Sum of a PSF from which on it was normalized on its grid, and says nothing of the light beyond.
-UNIT_SUM = 0.995
-#: Sum of an array below which it does not say the part of the light either, but is an image in any unit.
-_LEAST_PART = 0.85
 
 #: What the PSFs of a `PSFGrid` have in common.
 SHARED = ("frame", "angle", "includes", "filter", "total_known", "subarray")
@@ -448,67 +444,6 @@ def make_psf(data, pixel_scale, *, frame="sky", oversampling=1, enclosed=None, *
     return psf
 
 
-def as_psf(psf, argument="psf"):
-    """
-    Return the PSF of whatever a user has for one.
-
-    Parameters
-    ----------
-    psf : `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel`, model, kernel or array
-        PSFs are returned as they are. Of a functional model of photutils or astropy (with ``x_0``, ``y_0`` and
-        ``flux``) its values about the center are taken, four to a pixel; an array or an astropy kernel has one
-        value for each pixel of the image that it is for.
-    argument : str, optional
-        The argument's name for messages.
-
-    Returns
-    -------
-    psf : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
-        Of unit sum if it was made of something else.
-
-    Raises
-    ------
-    ValueError
-        If it is nothing of these, or holds no light.
-
-    Examples
-    --------
-    >>> from photutils.psf import GaussianPSF
-    >>> from miricigale.psf import as_psf
-    >>> psf = as_psf(GaussianPSF(x_fwhm=3, y_fwhm=3))
-    >>> psf.oversampling.tolist()
-    [4, 4]
-    """
-    if isinstance(psf, (ImagePSF, GriddedPSFModel)):
-        return psf
-    cells = 1
-    if {"x_0", "y_0", "flux"} <= set(getattr(psf, "param_names", ())):
-        # copies of the model: the parameters of a model of photutils are the user's
-        cells = 4
-        model = psf.copy()
-        model.x_0 = 0.0
-        model.y_0 = 0.0
-        model.flux = 1.0
-        reach = max(5.0, *np.abs(np.ravel(model.bounding_box.bounding_box())))
-        axis = np.arange(-np.ceil(reach * cells), np.ceil(reach * cells) + 1) / cells
-        data = model(*np.meshgrid(axis, axis))
-    else:
-        values = getattr(psf, "array", psf)
-        data = np.asarray(values)
-        if hasattr(values, "mask"):
-            # masked pixels are refused below
-            data = floats(values)
-    wanted = "a PSF or model of photutils, an astropy kernel or a 2D array"
-    check_that(data.ndim == 2 and data.dtype.kind in "iuf", argument, wanted, type(psf).__name__)
-    data = data.astype(float)
-    if not np.all(np.isfinite(data)) or not data.sum() > 0:
-        raise argument_error(argument, "finite, with a positive sum", f"a sum of {data.sum()}")
-    if min(data.shape) < 4:
-        # photutils interpolates between four values at least
-        data = np.pad(data, 2)
-    return ImagePSF(data * (cells**2 / data.sum()), oversampling=cells)
-
-
 @takes_other_keywords(options_of=(make_psf,))
 def from_photutils(model, pixel_scale, *, x=None, y=None, **options):
     """
@@ -544,7 +479,7 @@ def from_photutils(model, pixel_scale, *, x=None, y=None, **options):
     >>> print(f"{psf.fwhm:.3f}")
     0.300 arcsec
     """
-    part = _stated_part(model)
+    part = stated_part(model)
     model = as_psf(model, "model")
     oversampling = np.atleast_1d(model.oversampling)
     if np.any(oversampling != oversampling[0]):
@@ -558,21 +493,6 @@ def from_photutils(model, pixel_scale, *, x=None, y=None, **options):
         yy, xx = (centered(n) * (1.0 / cells) for n in model.data.shape[1:])
         data = model.evaluate(*np.meshgrid(xx + x, yy + y), 1.0, x, y)
     return make_psf(data, pixel_scale, oversampling=cells, **options)
-
-
-def _stated_part(values):
-    """
-    Return the part of the light that an array or kernel states by its sum; 1 if its sum states none.
-
-    The same as of a file, whose sum `make_psf` takes for it.
-    """
-    array = getattr(values, "array", values)
-    if isinstance(values, (ImagePSF, GriddedPSFModel)) or not isinstance(array, np.ndarray):
-        return 1.0
-    total = float(np.sum(floats(array)))
-    if _LEAST_PART <= total < UNIT_SUM:
-        return total
-    return 1.0
 
 
 def _half_width(data, origin):
