@@ -8,13 +8,12 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters import FilterSet, as_filter
-from miricigale.filters.band_names import find_filter
 from miricigale.filters.spectra import spectrum_arrays
 from miricigale.sed.cosmology import COSMOLOGY, distance
 from miricigale.sed.flux_units import flux_density_unit
 from miricigale.sed.frequency_integral import integral_at_rest
 from miricigale.sed.spectrum_conversions import specutils_spectrum, synphot_spectrum
-from miricigale.sed.spectrum_parts import Parts, points_of
+from miricigale.sed.spectrum_parts import BandFlux, Parts, component_of, points_of
 from miricigale.sed.spectrum_tables import spectrum_columns, spectrum_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import reading
@@ -35,20 +34,6 @@ from miricigale.utils.units import (
     to_array,
 )
 from miricigale.utils.values import value_class
-
-
-class _Flux(u.Quantity):
-    """The spectrum by the name ``flux``, whose call is the flux in a band."""
-
-    def __call__(self, band):
-        return self._sed.synthetic_flux(band)
-
-    @classmethod
-    def of(cls, sed):
-        """Return the flux densities of an SED."""
-        flux = sed.fnu.view(cls)
-        flux._sed = sed
-        return flux
 
 
 @value_class
@@ -102,7 +87,7 @@ class SED(Frozen, WithTable):
         if "meta" not in self.__dict__:
             return None
         if name == "flux":
-            return _Flux.of(self)
+            return BandFlux.of(self)
         return (self.derived | self.parameters).get(name)
 
     def _value_names(self):
@@ -213,28 +198,12 @@ class SED(Frozen, WithTable):
         A whole number gives the flux density at that point, as of ``sed.fnu``, a name the component.
         """
         if isinstance(key, str):
-            return self._component(key)
+            return component_of(self, key)
         if isinstance(key, numbers.Integral) and not isinstance(key, (bool, np.bool_)):
             return self.fnu[key]
         inside = points_of(key, self.wave.value)
         parts = {name: part[inside] for name, part in self.components.items()}
         return self.replace(wave=self.wave[inside], fnu=self.fnu[inside], components=parts)
-
-    def _component(self, name):
-        """Return a part by its name; refuse names of bands and of attributes with what gives their values."""
-        try:
-            return self.components[name]
-        except KeyError as err:
-            say = ""
-            if name in dir(self):
-                say = f"; sed.{name} is an attribute"
-            elif find_filter(name) is not None:
-                say = f"; sed.synthetic_flux({name!r}) is the flux in a band"
-            if not self.components:
-                msg = f"no component {name!r}, for the spectrum has no parts{say}"
-            else:
-                msg = f"{err.args[0]}{say}"
-            raise KeyError(msg) from None
 
     def _ipython_key_completions_(self):
         """Return what a session offers in brackets: names of the parts."""
@@ -243,11 +212,7 @@ class SED(Frozen, WithTable):
     def _hint_of(self, name):
         """Return the sentence for a part that is asked for as an attribute."""
         # half-made copies have no parts yet
-        parts = vars(self).get("components", Parts())
-        for part in (name, f"agn_{name}"):
-            if part in parts.names:
-                return f"components[{part!r}] is the spectrum of this part"
-        return ""
+        return vars(self).get("components", Parts()).hint(name)
 
     def replace(self, **changes):
         """Copy with other values of the constructor's arguments."""
