@@ -27,11 +27,11 @@ def fit(args):
         page_path = args.output / "page.html"
         page = fit_page(results, **filled(args, fit_page), browser=page_path)
         page = page.write(page_path, overwrite=True)
-        if args.plots:
+        if args.plots is not None:
             from miricigale.fitting.results.object_plots import write_plots
 
             ids = None
-            if args.plots != ["all"]:
+            if args.plots and args.plots != ["all"]:
                 ids = args.plots
             options = {"overwrite": True, "progress_bar": args.progress_bar}
             write_plots(results["galaxy"], args.output / "plots", ids, **options)
@@ -190,7 +190,11 @@ def _image_paths(args):
 
     The prior is None where a catalog is given with a single image, or with images by option.
     """
-    if args.positional and not (args.image or args.highres):
+    if args.positional and args.highres and not args.image:
+        # images without an option, the prior with its own
+        args.image = args.positional
+        args.positional = []
+    if args.positional and not args.image:
         from miricigale.photometry.detection.prior_catalog import is_catalog
 
         *paths, prior = args.positional

@@ -52,7 +52,8 @@ def _nearest_command(name, names):
     """Say which command, or choice, may be meant; empty if none is near."""
     # what is meant is more than what is spelled alike
     if "run" in names and name in _other_names("no_commands"):
-        return f"; {_other_names('no_commands')[name]}"
+        sentences = _other_names("no_commands")
+        return f"; {sentences.get(sentences[name], sentences[name])}"
     command = _other_names("commands").get(name)
     if command in names or command == "--help":
         return _meant(command)
@@ -60,6 +61,37 @@ def _nearest_command(name, names):
     if close:
         return _meant(close[0])
     return ""
+
+
+def in_our_names(argv, names):
+    """
+    Put options of ours in place of those of another name that take the same.
+
+    Parameters
+    ----------
+    argv : list of str
+        What was typed.
+    names : sequence of str
+        Flags and positional arguments of the command.
+
+    Returns
+    -------
+    argv : list of str
+    taken : dict of str to str
+        Options of ours by the names in place of which they stand.
+    """
+    others = _other_names("options")
+    words = []
+    taken = {}
+    for word in argv:
+        flag, equals, value = word.partition("=")
+        if flag.startswith("--") and flag not in names:
+            for name in others.get(flag[2:].replace("_", "-"), ()):
+                if name in names:
+                    taken[flag] = name
+                    break
+        words.append(taken.get(flag, flag) + equals + value)
+    return words, taken
 
 
 def _nearest_option(flag, names):
@@ -70,7 +102,7 @@ def _nearest_option(flag, names):
         return f"; {argument} has no option before it"
     flags = [name for name in names if name.startswith("-")]
     word = word_typed.replace("_", "-")
-    for name in _other_names("options").get(word, ()):
+    for name in _other_names("near_options").get(word, ()):
         if name in flags:
             return _meant(name)
     option, sentence = _other_names("sentences").get(word, (None, ""))

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 
-from miricigale.cli.options import in_options, make_parser
+from miricigale.cli.options import in_options, in_our_names, make_parser
 
 # shells add the number of the signal to this
 _STOPPED = 128
@@ -40,6 +40,9 @@ def main(argv=None):
         import argcomplete
 
         argcomplete.autocomplete(parser)
+    argv, taken = in_our_names(argv, parser.every_name)
+    for flag, name in taken.items():
+        print(f"miricigale {parser.typed}: {flag} is taken as {name}", file=sys.stderr)
     args = parser.parse_args(argv)
     verbose = getattr(args, "verbose", False)
     quiet = getattr(args, "quiet", False)

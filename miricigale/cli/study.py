@@ -184,7 +184,10 @@ def _plan_values(args, values):
 def _check_plan_options(args):
     """Refuse options of `plan` that contradict each other."""
     if args.quick:
-        msg = "--quick is of the table of the CEERS exposures, which has no other option"
+        msg = (
+            "--quick stands alone, for the table of the quick CEERS exposures; leave it out, or tell the "
+            "depths of bands with 'miricigale depth F770W F1500W --time 3600'"
+        )
         raise ValueError(msg)
     _refuse_with_depth(args, "--time", args.time)
     _refuse_with_depth(args, "--hours", args.hours)

@@ -205,6 +205,28 @@ def test_help_names_presets_and_surveys(capsys):
 
 
 @pytest.mark.parametrize(
+    ("arguments", "taken", "message"),
+    [
+        (["plan", "--filters", "F77W"], "plan: --filters is taken as --bands", "'F77W'"),
+        (["fit", "no.fits", "--ncores=4"], "fit: --ncores is taken as --threads", "no such file"),
+        (["fit", "no.fits", "--model", "survy"], "fit: --model is taken as --axes", "'survey'"),
+        (["fit", "no.fits", "--units", "Jy"], "--units is taken as --flux-unit", "no such file"),
+        (["photometry", "a", "--prior", "b", *SETTINGS], "--prior is taken as --highres", "a can"),
+    ],
+)
+def test_options_of_other_names_are_taken(capsys, tmp_path, monkeypatch, arguments, taken, message):
+    monkeypatch.chdir(tmp_path)
+    try:
+        status = main(arguments)
+    except SystemExit as err:
+        status = err.code
+    assert status == 2
+    first, second = capsys.readouterr().err.strip().splitlines()[:2]
+    assert taken in first
+    assert message in second
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["run", "cosmos"], "miricigale: no preset 'cosmos'; known: cosmosweb, goodss"),
@@ -221,12 +243,10 @@ def test_help_names_presets_and_surveys(capsys):
         (["help", "fit"], "did you mean '--help'?"),
         (["measure", "a"], "did you mean 'photometry'?"),
         (["simulate", "a"], "; Scene and Detector simulate exposures in Python, 'run' a whole"),
-        (["plan", "--filters", "F770W"], "--filters; did you mean '--bands'? (see"),
         (
             ["fit", "a.fits", "--zmax", "4"],
             "--zmax 4; the grid has the redshifts; BayesFitter(axes=",
         ),
-        (["fit", "a.fits", "--ncores", "4"], "did you mean '--threads'?"),
         (["fit", "a.fits", "--zzz", "4"], "--zzz 4 (see miricigale fit --help)"),
         (["photometry", "a.fits"], "give the images and, last, the high-resolution image"),
         (["sensitivity", "F770W"], "did you mean 'depth'?"),
@@ -236,7 +256,6 @@ def test_help_names_presets_and_surveys(capsys):
         ),
         (["depth", "F444W"], "no imaging filter 'F444W'"),
         (["depth", "F1500W", "3600"], "must be names of filters (a time is --time 3600, a magn"),
-        (["fit", "a.fits", "--model", "survey"], "--model survey; did you mean '--axes'?"),
         (["fit", "a.fits", "--interp", "9"], "--interp 9; did you mean '--interpolate'?"),
         (
             ["run", "goodss", "--quick", "--plan", "--until", "mosaic"],
@@ -249,6 +268,10 @@ def test_help_names_presets_and_surveys(capsys):
         (["show", "."], "has no files of products (.fits, "),
         (["reduce", ".", "-o", "x"], "is a folder, wanted is a file"),
         (["run", "."], "is a folder without a config.toml, wanted is a preset or a configuration"),
+        (["sed", "--redshift", "1"], "; SEDModel.yang2021().evaluate(redshift=1.5"),
+        (["compare", "a", "b"], "; miricigale.evaluation.photoz_metrics("),
+        (["agn-counts"], "did you mean 'agn'?"),
+        (["fit", "a.fits", "--columns", "z"], "did you mean '--map'?"),
         (["calibrate", "c.fits"], "'--calibrate COLUMN' with known redshifts"),
         (["convert", "a", "b"], "Table.read(FILE).write(OTHER) in Python"),
         (["-v", "-q", "filters"], "not allowed with argument"),
