@@ -72,7 +72,10 @@ def spectrum_arrays(sed, bands):
     flux = flux[order]
     unit = own_unit(flux)
     if unit is not None and (unit * u.sr).is_equivalent(FNU, u.spectral_density(1 * WAVE)):
-        raise units_error("sed", "a flux density; multiply by the solid angle", unit)
+        wanted = (
+            "a flux density; lambda wave: model(wave) * 1e-20 * u.sr multiplies by a solid angle"
+        )
+        raise units_error("sed", wanted, unit)
     spectral = []
     if unit != FNU:
         spectral = u.spectral_density(wave * WAVE)

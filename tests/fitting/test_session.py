@@ -176,6 +176,8 @@ def test_probabilities_are_those_of_percentiles(results, name):
         within = results[row].probability(name, low, high)
         assert within == pytest.approx(0.7, abs=0.01)
         assert results[row].probability(name, high=low) == pytest.approx(0.2, abs=0.01)
+        text = f"{name} > {u.Quantity(high).value:.17e}"
+        assert results[row].probability(text) == results[row].probability(name, low=high)
         assert results.probability(name, high)[row] == pytest.approx(0.1, abs=0.01)
     refuses("'high' must be at least 'low'", results.probability, name, 2.0, 1.0)
     refuses("'low' must be given", results.probability, name)

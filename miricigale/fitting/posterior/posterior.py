@@ -1,5 +1,6 @@
 """Numbers from posteriors on the nodes of axes: moments, percentiles, cells, joint posteriors."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -100,6 +101,34 @@ def cell_shares(values, pdf, low, high, bounds):
     ]
     with np.errstate(invalid="ignore"):
         return np.diff(np.reshape(ends, (-1, 2)), axis=1)[:, 0] / upto[:, -1]
+
+
+def limits_of(text):
+    """
+    Read a name with a limit, such as ``"frac_agn > 0.1"``.
+
+    Parameters
+    ----------
+    text : str
+        A name alone, or one before ``<`` or ``>`` and a number.
+
+    Returns
+    -------
+    name : str
+    low, high : float or None
+
+    Examples
+    --------
+    >>> limits_of("frac_agn > 0.1")
+    ('frac_agn', 0.1, None)
+    """
+    match = re.fullmatch(r"\s*(\w+)\s*([<>])=?\s*([-+.\de]+)\s*", text)
+    if not match:
+        return text, None, None
+    name, sign, number = match.groups()
+    if sign == ">":
+        return name, float(number), None
+    return name, None, float(number)
 
 
 def shares_between(values, levels, low, high):

@@ -13,6 +13,7 @@ from miricigale.fitting.posterior.posterior import (
     cell_percentiles,
     cell_shares,
     check_levels,
+    limits_of,
     moments,
     shares_between,
 )
@@ -444,7 +445,7 @@ class FitResults(FitRows):
         Parameters
         ----------
         name : str
-            As for `percentile`.
+            As for `percentile`, or a name with a limit, such as ``"frac_agn > 0.1"``, in place of the others.
         low, high : float or `~astropy.units.Quantity`, optional
             The limits; none on a side that is left out. A number is in the unit of the parameter.
 
@@ -462,8 +463,11 @@ class FitResults(FitRows):
         if not isinstance(name, str):
             msg = f"probability('redshift', 2) is that of redshifts above 2; got {type(name).__name__} as the name"
             raise TypeError(msg)
+        if low is None and high is None:
+            name, low, high = limits_of(name)
         unit = self.unit(name)
-        check_that(low is not None or high is not None, "low", "given, or 'high'", "None")
+        wanted = f"given, or 'high', such as probability({name!r}, low=1)"
+        check_that(low is not None or high is not None, "low", wanted, "None")
         wanted = f"at least 'low', {low}"
         got = f"{high}"
         if low is not None:
