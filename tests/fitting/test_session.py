@@ -8,10 +8,12 @@ import pytest
 from astropy.table import QTable
 from matplotlib import pyplot as plt
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import norm
 
 from helpers.errors import refuses
 from helpers.grids import node_fitter
 from miricigale.fitting.posterior.posterior import shares_between
+from miricigale.fitting.results.corner_panels import DrawPanel
 
 
 @pytest.fixture(scope="module")
@@ -200,6 +202,20 @@ def test_a_corner_plot_of_draws_has_any_quantity(fitter, photometry, results, fi
     inside = np.mean((draws >= low) & (draws <= high))
     assert inside >= 0.989
     refuses("no parameter 'mood'", samples.plot_corner, key, ["mood"], error=KeyError)
+
+
+def test_joint_panels_are_nearer_the_density_than_counts():
+    """Independent normal numbers have a known share in each cell."""
+    rng = np.random.default_rng(2)
+    edges = np.linspace(-2.5, 2.5, 21)
+    x, y = (DrawPanel(values, edges, False, True) for values in rng.normal(size=(2, 1000)))
+    shares = x.joint_shares(y)
+    inside = (np.abs([x.values, y.values]) < 2.5).all(axis=0).mean()
+    assert shares.sum() == pytest.approx(inside, rel=1e-9)
+    cells = x.joint_edges, y.joint_edges
+    exact = np.outer(*(np.diff(norm.cdf(edges)) for edges in cells))
+    counts = np.histogram2d(x.values, y.values, cells)[0] / 1000
+    assert np.abs(shares - exact).sum() < 0.4 * np.abs(counts - exact).sum()
 
 
 def test_brackets_are_completed(results):

@@ -577,7 +577,7 @@ model : `~miricigale.sed.SEDModel`, optional
         for row, later in enumerate(panels):
             for column, earlier in enumerate(panels[:row]):
                 shares = earlier.joint_shares(later)
-                joints[row, column] = earlier.edges, later.edges, shares
+                joints[row, column] = earlier.joint_edges, later.joint_edges, shares
         values = marked_values(self, names, truths)
         labels = []
         for i, name in enumerate(names):
