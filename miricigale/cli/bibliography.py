@@ -25,6 +25,7 @@ _ARTICLE = re.compile(
 _PREPRINT = re.compile(
     r"(?P<authors>[^,;(]+?),? \(?(?P<year>(?:19|20)\d\d)\)?,? arXiv:(?P<number>\d{4}\.\d{4,5})"
 )
+_PACKAGE = re.compile(r"miricigale (?P<version>\S+) ")
 _DATED = re.compile(r"(?P<authors>[^,;(]+?),? \(?(?P<year>(?:19|20)\d\d)\b")
 
 
@@ -93,7 +94,10 @@ def _entry(work):
         fields["url"] = f"https://arxiv.org/abs/{match['number']}"
         return "misc", fields
     fields = {}
-    if match := _DATED.match(paper):
+    if match := _PACKAGE.match(paper):
+        fields = {"author": "{The miricigale developers}", "title": "miricigale"}
+        fields["version"] = match["version"]
+    elif match := _DATED.match(paper):
         fields = _dated_fields(match)
     fields["note"] = re.sub(r"([&%#_$])", r"\\\1", work)
     return "misc", fields
@@ -132,6 +136,9 @@ def _ads_identifier(match, code):
 def _key(work, fields, n_keys):
     """Return the key of an entry, such as yang2021 and yang2021_2."""
     source = fields.get("author", work)
+    if "version" in fields:
+        # software by its name
+        source = fields["title"]
     word = re.match(r"\W*(\w+)", source)[1].lower() + fields.get("year", "")
     n_keys[word] += 1
     if n_keys[word] == 1:

@@ -52,6 +52,14 @@ def test_each_paper_is_there_once_whatever_is_said_besides():
     assert "note = {JWST user documentation (MIRI dithering)}" in text
 
 
+def test_the_package_has_author_title_and_version():
+    """What CITATION.cff says of it."""
+    text = bibtex(["miricigale 1.2.3 (CITATION.cff)"])
+    assert text.startswith("@misc{miricigale,\n  author = {{The miricigale developers}},")
+    assert "title = {miricigale}" in text
+    assert "version = {1.2.3}" in text
+
+
 def test_two_papers_of_an_author_and_year_have_two_keys():
     text = bibtex(["Carnall et al. 2018, MNRAS 480, 4379", "Carnall et al. 2018, MNRAS 481, 1"])
     assert re.findall(r"\{(\w+),\n", text) == ["carnall2018", "carnall2018_2"]
