@@ -38,7 +38,7 @@ def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
             low = low - middle
             high = high - middle
             if label:
-                label = f"{label}, minus {middle:.3g}"
+                label = f"{label} above a background of {middle:.3g}"
         options["norm"] = asinh_norm(low, max(high, width), width)
     drawn = ax.imshow(image, **{**options, **kwargs})
     ax.set(xlabel="x (pixel)", ylabel="y (pixel)")
