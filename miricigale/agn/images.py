@@ -9,14 +9,13 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.agn.photon_noise import photon_noise
 from miricigale.fitting.data.nuclei import CORRELATION, IS_LIMIT, NUCLEUS
 from miricigale.injection.field import check_psfs, field_psfs
 from miricigale.injection.light import light_on_file
+from miricigale.injection.photon_noise import photon_noise
 from miricigale.injection.trials import APART
 from miricigale.photometry import MosaicFile
 from miricigale.photometry.commands.file_inputs import Inputs, Pixels
-from miricigale.photometry.images.repeated_pixels import own_pixels
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.content_hash import content_sha256, file_sha256
 from miricigale.utils.exceptions import CatalogWarning, PhotometryWarning
@@ -94,13 +93,10 @@ class AGNImages:
 
     @cached_property
     def photon_noise(self):
-        """Photon noise of light in the images: `~miricigale.agn.photon_noise.PhotonNoise` by band."""
+        """Photon noise of light in the images: `~miricigale.injection.photon_noise.PhotonNoise` by band."""
         noises = {}
         for band, file in zip(self.bands, self.inputs.images, strict=True):
-            with warnings.catch_warnings():
-                # those of the image are given where it is measured
-                warnings.simplefilter("ignore", PhotometryWarning)
-                noises[band] = photon_noise(file, own_pixels(file.read()))
+            noises[band] = photon_noise(file)
             log.info("photon noise of AGN in %s: %s", band, noises[band].text)
         return noises
 
@@ -138,7 +134,9 @@ class AGNImages:
                 own_light = light_on_file(
                     file, sources, light[band], self._base.psfs[band], self.n_threads
                 )
-                own_light, added_variance = self._with_photons(band, own_light, key)
+                own_light, added_variance = self.photon_noise[band].add(
+                    own_light, self._base.correlation[band], stream(*key, band)
+                )
             images[band] = file.read(own_light, added_variance)
         if sources is not None:
             prior_light = light_on_file(
@@ -151,18 +149,6 @@ class AGNImages:
         pixels = Pixels(inputs.highres.read(prior_light), [], images)
         segments, catalog = inputs.find_sources(pixels, inputs.catalog)
         return inputs.measure(pixels, self._photometers, segments, catalog)
-
-    def _with_photons(self, band, light, key):
-        """Light (MJy/sr) with its photon noise, and the variance of this where errors have it (else None)."""
-        noise = self.photon_noise[band]
-        if noise.factor is None:
-            return light, None
-        rng = stream(*key, band)
-        drawn = noise.draw(light, self._base.correlation[band], rng)
-        added_variance = None
-        if noise.in_errors:
-            added_variance = noise.variance(light)
-        return light + drawn, added_variance
 
     def add_agn(self, photometry, lit, hosts, light, *, seed=1):
         """

@@ -7,6 +7,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.injection.light import light_on_file
+from miricigale.injection.photon_noise import photon_noise
 from miricigale.injection.population import fitted_shapes
 from miricigale.instrument.sky_axes import grid_angle
 from miricigale.photometry import ForcedPhotometer, detect_sources
@@ -119,6 +120,7 @@ class PriorField:
     def __init__(self, inputs, n_threads=None):
         self.inputs = inputs
         self.n_threads = n_threads
+        self.file = inputs.images[0]
         (self.band,) = inputs.bands
         self.prior_band = inputs.highres.header.filter
 
@@ -153,7 +155,12 @@ class PriorField:
         good[y[~on_prior], x[~on_prior]] = False
         return good
 
-    def measure(self, sources=None, psfs=None, former=None, image_file=None):
+    @functools.cached_property
+    def photon_noise(self):
+        """Photon noise of light in the image, `~miricigale.injection.photon_noise.PhotonNoise`."""
+        return photon_noise(self.file)
+
+    def measure(self, sources=None, psfs=None, former=None, image_file=None, photons=None):
         """
         Measure the field as its user does.
 
@@ -167,6 +174,9 @@ class PriorField:
             ``sky`` and ``flux`` of what is detected on the prior without them.
         image_file : `~miricigale.photometry.MosaicFile`, optional
             An image that shows the sources already; light is drawn on the prior alone then.
+        photons : dict, optional
+            ``covariance`` and ``rng`` of the photon noise of light in the image
+            (`~miricigale.injection.photon_noise.PhotonNoise.add`); none by default, and none in the prior.
 
         Returns
         -------
@@ -179,17 +189,20 @@ class PriorField:
         n = 0
         if sources is not None:
             n = len(sources)
-        light = prior_light = None
-        if n and image_file is None:
-            light = light_on_file(
-                inputs.images[0], sources, sources["flux"], psfs[0], self.n_threads
-            )
+        file = self.file
+        light = None
+        added_variance = None
+        if image_file is not None:
+            file = image_file
+        elif n:
+            light, added_variance = light_with_photons(self, sources, psfs[0], photons)
+        prior_light = None
         if n:
             prior_light = light_on_file(
                 inputs.highres, sources, sources["prior_flux"], psfs[1], self.n_threads
             )
-        file = image_file or inputs.images[0]
-        pixels = Pixels(inputs.highres.read(prior_light), [], {self.band: file.read(light)})
+        image = file.read(light, added_variance)
+        pixels = Pixels(inputs.highres.read(prior_light), [], {self.band: image})
         segments, catalog = inputs.find_sources(pixels, inputs.catalog)
         detected = inputs.segmentation is None and inputs.catalog is None
         if n and not detected:
@@ -232,6 +245,34 @@ class PriorField:
         """Return the fitted profiles of the sources (`~miricigale.injection.population.fitted_shapes`)."""
         psf = self.photometers[self.band].mean_kernel.source
         return fitted_shapes(pixels.prior, segments, catalog, psf, self.n_threads)
+
+
+def light_with_photons(field, sources, psf, photons):
+    """
+    Return the light of sources on the image of a field, with its photon noise.
+
+    Parameters
+    ----------
+    field : `PriorField` or `ImageField`
+        The field.
+    sources : `~astropy.table.QTable`
+        ``sky``, ``profile``, shapes and ``flux``.
+    psf : `~miricigale.psf.InstrumentPSF`
+        PSF of the image in the frame of the sky.
+    photons : dict or None
+        As for `PriorField.measure`.
+
+    Returns
+    -------
+    light : `~numpy.ndarray`, shape (ny, nx)
+        In MJy/sr.
+    variance : `~numpy.ndarray`, shape (ny, nx), or None
+        By which the variance of the image grows, in (MJy/sr)^2.
+    """
+    light = light_on_file(field.file, sources, sources["flux"], psf, field.n_threads)
+    if photons is None:
+        return light, None
+    return field.photon_noise.add(light, **photons)
 
 
 def joined_segments(segments, detected, places):
@@ -319,15 +360,24 @@ class ImageField:
         """Return the pixels of the image that have data: bool, (ny, nx)."""
         return ~np.asarray(image.mask, bool)
 
-    def measure(self, sources=None, psfs=None, former=None, image_file=None):
+    @functools.cached_property
+    def photon_noise(self):
+        """Photon noise of light in the image, `~miricigale.injection.photon_noise.PhotonNoise`."""
+        return photon_noise(self.file)
+
+    def measure(self, sources=None, psfs=None, former=None, image_file=None, photons=None):
         """As `PriorField.measure`; ``former`` are the sources of the field with their shapes."""
         n = 0
         if sources is not None:
             n = len(sources)
+        file = self.file
         light = None
-        if n and image_file is None:
-            light = light_on_file(self.file, sources, sources["flux"], psfs[0], self.n_threads)
-        image = own_pixels((image_file or self.file).read(light))
+        added_variance = None
+        if image_file is not None:
+            file = image_file
+        elif n:
+            light, added_variance = light_with_photons(self, sources, psfs[0], photons)
+        image = own_pixels(file.read(light, added_variance))
         segments = None
         if former is None:
             segmentation, catalog = detect_sources(image, preset=self.preset)

@@ -30,7 +30,7 @@ _HEADS = {
 _NEAR_LIMIT = 1.0
 
 
-def write_page(path, result, name, *, in_ramps=False):
+def write_page(path, result, name):
     """
     Write the page of an injection.
 
@@ -42,8 +42,6 @@ def write_page(path, result, name, *, in_ramps=False):
         What was found.
     name : str
         What it was injected into.
-    in_ramps : bool, optional
-        Whether light went into ramps rather than into a mosaic.
     """
     meta = result.meta
     report = Page("Injected sources", subtitle=f"{name}, {meta['band']}")
@@ -72,10 +70,7 @@ def write_page(path, result, name, *, in_ramps=False):
     drawn = "those of the field's sources"
     if has_catalog:
         drawn = "those of the catalog"
-    noise = "it has no photon noise of its own"
-    if in_ramps:
-        noise = "in ramps it has its photon noise"
-    page.section("method", drawn=drawn, apart=f"{APART:g}", noise=noise)
+    page.section("method", drawn=drawn, apart=f"{APART:g}", noise=meta["photon_noise"])
     report.write(path, overwrite=True)
 
 

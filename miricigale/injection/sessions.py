@@ -48,9 +48,9 @@ class Injection(Interactive, InjectionSettings):
 
     Notes
     -----
-    The injected light is noiseless in mosaics: their noise is their own, and the photon noise of sources much
-    brighter than the sky is missing. In ramps it has its Poisson noise. Light is drawn with the PSF that
-    photometry uses, so that a wrong PSF is not seen.
+    The injected light has its photon noise: in ramps always, in mosaics where they state what it is, by
+    VAR_POISSON, or by electrons and an exposure time; ``result.meta["photon_noise"]`` says so. Light in the prior
+    has none. Light is drawn with the PSF that photometry uses, so that a wrong PSF is not seen.
 
     References
     ----------

@@ -197,6 +197,10 @@ def field_stage(context, _):
     else:
         pulls = np.asarray(base.empty_pulls)
     context.save_table("field/empty.fits", QTable({"pull": pulls}))
+    if base.noise_correlation is not None:
+        context.save_table(
+            "field/noise_correlation.fits", QTable({"covariance": base.noise_correlation})
+        )
     context.save_image("field/model.fits", base.model)
     for name, psf in zip(("psf", "prior_psf"), base.psfs, strict=True):
         if psf is not None:
@@ -222,6 +226,10 @@ def _read_base(context):
     for k, name in enumerate(("psf", "prior_psf")):
         if context.products.path(f"field/{name}.fits").exists():
             psfs[k] = read_psf(context.path(f"field/{name}.fits"))
+    correlation = None
+    if context.products.path("field/noise_correlation.fits").exists():
+        table = context.table("field/noise_correlation.fits")
+        correlation = np.asarray(table["covariance"])
     return Base(
         table=None,
         former=context.table("field/sources.ecsv"),
@@ -231,6 +239,7 @@ def _read_base(context):
         psfs=tuple(psfs),
         model=context.image("field/model.fits"),
         empty_pulls=np.asarray(context.table("field/empty.fits")["pull"]),
+        noise_correlation=correlation,
         facts=json.loads(context.path("field/facts.json").read_text("utf-8")),
     )
 
@@ -253,7 +262,7 @@ def trial_stage(context, unit):
                 sources, context.seed, number, folder, context.n_threads
             )
             image = task.image.replace(path=mosaic)
-        rows, table = run_trial(field, task.injection, base, sources, image)
+        rows, table = run_trial(field, task.injection, base, sources, image, number)
     if len(rows):
         rows.add_column(np.full(len(rows), number), name="trial", index=0)
         texts = column_texts("miricigale.injection", "sources")
@@ -286,10 +295,9 @@ def result_stage(context, _):
     context.save_table("purity.ecsv", result.purity())
     task = Task.of(context.config, context.seed)
     name = Path(task.image.path).name
-    in_ramps = task.exposures is not None
-    if in_ramps:
+    if task.exposures is not None:
         name = f"{len(task.exposures.paths)} ramps"
-    context.save("index.html", lambda path: write_page(path, result, name, in_ramps=in_ramps))
+    context.save("index.html", lambda path: write_page(path, result, name))
 
 
 def _result(context, config, seed):
@@ -301,13 +309,16 @@ def _result(context, config, seed):
     for table, negative in ((base.detections, False), (base.negatives, True)):
         table["negative"] = np.full(len(table), negative)
     detections = vstack([base.detections, base.negatives], metadata_conflicts="silent")
-    injection = Task.of(config, seed).injection
+    task = Task.of(config, seed)
+    facts = dict(base.facts)
+    if task.exposures is not None:
+        facts["photon_noise"] = "drawn in the ramps"
     meta = provenance(
         seed=seed,
         n_trials=config.injection.n_trials,
-        threshold=injection.threshold,
-        preset=str(injection.preset),
-        **base.facts,
+        threshold=task.injection.threshold,
+        preset=str(task.injection.preset),
+        **facts,
     )
     sources.meta = dict(meta)
     return InjectionResult(

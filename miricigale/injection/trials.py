@@ -71,9 +71,12 @@ class Base:
         Fitted model of the image without background, with the image's noise.
     empty_pulls : `~numpy.ndarray` or None
         Flux over error at empty positions; None where there are none.
+    noise_correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1), or None
+        Covariance of the noise of the image's pixels, as photometry measured it.
     facts : dict
         Plain values: ``limit`` (5-sigma AB limit: 5 times the median error), ``slope`` of the counts, ``fwhm``
-        (arcsec), ``n_sources`` and ``n_injected`` (by default, each time).
+        (arcsec), ``n_sources`` and ``n_injected`` (by default, each time), ``photon_noise`` (what is known of that
+        of light in the image).
     """
 
     table: QTable
@@ -84,6 +87,7 @@ class Base:
     psfs: tuple
     model: object
     empty_pulls: np.ndarray | None
+    noise_correlation: np.ndarray | None
     facts: dict
 
 
@@ -139,6 +143,7 @@ def measure_base(field, injection):
         psfs=psfs,
         model=_model(result),
         empty_pulls=_empty_pulls(result, field, injection.seed),
+        noise_correlation=result.noise_correlation,
         facts={
             "limit": limit,
             "slope": counts_slope(np.asarray(population["magnitude"]), limit),
@@ -147,6 +152,7 @@ def measure_base(field, injection):
             "n_injected": n_injected,
             "band": field.band,
             "prior_band": field.prior_band,
+            "photon_noise": field.photon_noise.text,
         },
     )
 
@@ -268,7 +274,7 @@ def _fill_prior_fluxes(sources, base, rng):
     sources["prior_flux"][missing] = flux
 
 
-def run_trial(field, injection, base, sources, image_file):
+def run_trial(field, injection, base, sources, image_file, number):
     """
     Inject sources, detect and measure.
 
@@ -280,6 +286,8 @@ def run_trial(field, injection, base, sources, image_file):
         Of `injected_sources`.
     image_file : `~miricigale.photometry.MosaicFile` or None
         An image that shows them already.
+    number : int
+        Of the trial, from 1.
 
     Returns
     -------
@@ -293,7 +301,11 @@ def run_trial(field, injection, base, sources, image_file):
             former=None if field.has_prior else base.former, image_file=image_file
         )
         return QTable(), measured.table
-    measured = field.measure(sources, base.psfs, base.former, image_file)[0]
+    photons = {
+        "covariance": base.noise_correlation,
+        "rng": stream(injection.seed, "injected photons", number),
+    }
+    measured = field.measure(sources, base.psfs, base.former, image_file, photons)[0]
     image = measured.image
     result = measured.result
     rows = QTable({"row": sources["row"], "sky": sources["sky"].icrs})

@@ -13,9 +13,9 @@ from miricigale import BayesFitter, ErrorModel, FitResults, SEDModel
 from miricigale.agn import AGNSurvey, NoiseCurve, add_light, agn_light, injections
 from miricigale.agn.injection_draws import FIRST, InjectionDraws, batch_sizes
 from miricigale.agn.injections import write_batch
-from miricigale.agn.photon_noise import PhotonNoise
 from miricigale.evaluation import Estimate
 from miricigale.fitting import AGNBins, GridSettings
+from miricigale.injection.photon_noise import PhotonNoise
 from miricigale.utils.parallel import threads
 
 BANDS = [

@@ -28,6 +28,8 @@ PIXEL, SIDE, NOISE = 0.11, 330, 0.004
 #: Error of the flux of a point in white noise (uJy): noise of a pixel times the root of 4 pi, times the width.
 ERROR = NOISE * np.sqrt(4 * np.pi) * LO / PIXEL
 PRESET = "default"
+#: Exposure time of images in electrons per second.
+TIME = 50.0
 
 
 def psf_of(width):
@@ -134,6 +136,64 @@ def test_pulls_of_injected_sources_are_normal(result):
     assert abs(numbers["bias"]) < 3 * numbers["bias_err"]
     assert_allclose(result.sources["flux_err"].value[on_free_sky(result)], ERROR, rtol=0.02)
     assert result.false_rate() < 0.01
+
+
+def write_electrons(path, sky, flux, rng, electrons, *, variance=False):
+    """An image in electrons per second, of which a uJy has so many in all, with the noise of the sky and light."""
+    shape = (SIDE, SIDE)
+    wcs = north_up_wcs(CENTER, PIXEL * u.arcsec, shape)
+    light = render(sky, flux, LO, wcs, shape) * pixel_area_map(wcs, shape) * 1e12 * electrons
+    of_sky = (NOISE * electrons) ** 2
+    data = rng.poisson(light + of_sky) - of_sky
+    header = wcs.to_header()
+    header.update(BUNIT="electron/s", FILTER="F430M", EXPTIME=TIME)
+    error = np.sqrt(of_sky)
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(data / TIME, header, name="SCI")]
+    if variance:
+        of_light = np.maximum(light + of_sky, 0)
+        hdus.append(fits.ImageHDU(np.sqrt(of_light) / TIME, header, name="ERR"))
+        hdus.append(fits.ImageHDU(of_light / TIME**2, header, name="VAR_POISSON"))
+    else:
+        hdus.append(fits.ImageHDU(np.full(shape, error / TIME), header, name="ERR"))
+    fits.HDUList(hdus).writeto(path)
+    zero_point = ab_magnitude(TIME / electrons * u.uJy)
+    return MosaicFile(path, filter="irac.ch4", psf=path.parent / "psf.fits", zero_point=zero_point)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variance", [False, True])
+def test_bright_sources_scatter_by_their_electrons(folder, tmp_path, variance):
+    """
+    A point of F electrons that a Gaussian PSF fits with equal weights has the variance 4/3 F besides the sky's.
+
+    With errors that have the photon noise in them, pulls of the optimal weights are normal.
+    """
+    rng = np.random.default_rng(5)
+    sky = places(*lattice(rng, 5, 6.0, 1.0))
+    psf_of(LO).write(tmp_path / "psf.fits")
+    # the photon noise of injected sources has three times the variance of the sky's
+    flux = 400 * ERROR
+    electrons = 4 / 3 * flux / (3 * ERROR**2)
+    file = write_electrons(
+        tmp_path / "electrons.fits", sky, np.full(25, flux), rng, electrons, variance=variance
+    )
+    own = QTable({"irac.ch4": np.full(45, flux) * u.uJy})
+    injection = Injection(own, n_trials=3, n_sources=45, preset=PRESET)
+    result = injection.run(file, folder=tmp_path / "run")
+    sources = result.sources[on_free_sky(result)]
+    scatter = np.std(sources["flux"].value - flux)
+    tolerance = 3 / np.sqrt(2 * len(sources))
+    if variance:
+        pulls = (sources["flux"].value - flux) / sources["flux_err"].value
+        assert_allclose(np.std(pulls), 1.0, rtol=tolerance)
+        assert scatter < 2 * ERROR
+        assert "VAR_POISSON" in result.meta["photon_noise"]
+    else:
+        assert_allclose(scatter, 2 * ERROR, rtol=tolerance)
+        assert_allclose(np.median(sources["flux_err"].value), ERROR, rtol=0.03)
+        assert f"EXPTIME {TIME:g} s" in result.meta["photon_noise"]
+    assert len(sources) > 50
+    assert result.meta["photon_noise"] in (tmp_path / "run" / "index.html").read_text("utf-8")
 
 
 @pytest.mark.slow

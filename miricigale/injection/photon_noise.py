@@ -1,8 +1,12 @@
 """The photon noise of light that is added to an image, as far as the image states it."""
 
+import warnings
+
 import astropy.units as u
 import numpy as np
 
+from miricigale.photometry.images.repeated_pixels import own_pixels
+from miricigale.utils.exceptions import PhotometryWarning
 from miricigale.utils.values import value_class
 
 #: A pixel is bright whose value is further above the median than this many errors; least number of these.
@@ -160,6 +164,29 @@ class PhotonNoise:
         white = rng.standard_normal(np.shape(light))
         return np.sqrt(self.variance(light)) * _colored(white, covariance)
 
+    def add(self, light, covariance, rng):
+        """
+        Add its photon noise to light.
+
+        Parameters
+        ----------
+        light, covariance, rng
+            As for `draw`.
+
+        Returns
+        -------
+        light : `~numpy.ndarray`, shape (ny, nx)
+            In MJy/sr; without noise if it is not known.
+        variance : `~numpy.ndarray`, shape (ny, nx), or None
+            By which the variance of the image grows, in (MJy/sr)^2; None if its errors lack photon noise.
+        """
+        if self.factor is None:
+            return light, None
+        added_variance = None
+        if self.in_errors:
+            added_variance = self.variance(light)
+        return light + self.draw(light, covariance, rng), added_variance
+
 
 def _lines(data, variance, error, good):
     """
@@ -207,7 +234,7 @@ def _colored(white, covariance):
     return np.fft.irfft2(np.sqrt(power) * np.fft.rfft2(white), s=white.shape)
 
 
-def photon_noise(file, image):
+def photon_noise(file):
     """
     Find the photon noise of light in an image.
 
@@ -215,14 +242,16 @@ def photon_noise(file, image):
     ----------
     file : `~miricigale.photometry.MosaicFile`
         The file.
-    image : `~astropy.nddata.CCDData`
-        What it reads.
 
     Returns
     -------
     noise : `PhotonNoise`
         By the extension VAR_POISSON; without it by the unit of the pixels, EXPTIME and, of counts, GAIN.
     """
+    with warnings.catch_warnings():
+        # those of the image are given where it is measured
+        warnings.simplefilter("ignore", PhotometryWarning)
+        image = own_pixels(file.read())
     if image.meta.get("repeated_pixels", 1) != 1:
         return PhotonNoise.unknown("each pixel is there several times")
     facts = file.read_photon_facts()

@@ -8,7 +8,7 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from numpy.testing import assert_allclose
 
 from helpers.mosaics import CENTER
-from miricigale.agn.photon_noise import PhotonNoise, photon_noise
+from miricigale.injection.photon_noise import PhotonNoise, photon_noise
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import MosaicFile
 
@@ -123,7 +123,7 @@ def test_files_state_it(tmp_path):
     fits.HDUList(hdus).writeto(path)
     file = MosaicFile(path, filter="F770W")
     image = file.read()
-    noise = photon_noise(file, image)
+    noise = photon_noise(file)
     assert noise.in_errors
     assert_allclose(np.median(noise.factor), 1.0 / (RATE * 50.0), rtol=0.05)
     light = np.zeros((SIDE, SIDE))
@@ -136,4 +136,4 @@ def test_files_state_it(tmp_path):
     # errors by a map of weights are those of the sky, whatever the file has besides
     fits.writeto(tmp_path / "weight.fits", 1e-6 / variance, wcs.to_header())
     weighted = MosaicFile(path, filter="F770W", weight=tmp_path / "weight.fits")
-    assert not photon_noise(weighted, weighted.read()).in_errors
+    assert not photon_noise(weighted).in_errors
