@@ -86,11 +86,11 @@ def make_fitter(errors_of_models):
     )
 
 
-def draw_models(fitter, n, rng):
+def draw_models(fitter, n, share, rng):
     """
     Values of parameters drawn from the priors of a fitter but for mass: dict.
 
-    Half of the models have an AGN, with equal numbers in all bins of the fraction and the prior within these.
+    A share of the models has an AGN, with equal numbers in all bins of the fraction and the prior within these.
     """
     priors = fitter.priors
     galaxy = rng.choice(priors.galaxy.size, n, p=priors.galaxy / priors.galaxy.sum())
@@ -103,17 +103,17 @@ def draw_models(fitter, n, rng):
             node = rng.choice(axis.values.size, n, p=axis.weights)
         values[name] = low[node] + (high - low)[node] * rng.random(n)
         if name == "frac_agn":
-            values[name] = _equal_in_bins(values[name], rng)
+            values[name] = _equal_in_bins(values[name], share, rng)
     return values
 
 
-def _equal_in_bins(fraction, rng):
-    """Draw fractions of the prior again: half of them 0, the others with equal numbers in all bins."""
+def _equal_in_bins(fraction, share, rng):
+    """Draw fractions of the prior again: a share of them above 0, with equal numbers in all bins."""
     ones = np.ones(fraction.size)
     _, place, _ = BINS.place(ones, fraction, ones)
     n_bins = len(BINS.frac_agn) - 1
     wanted = np.where(
-        rng.random(fraction.size) < 0.5, 0, rng.integers(1, n_bins + 1, fraction.size)
+        rng.random(fraction.size) < 1.0 - share, 0, rng.integers(1, n_bins + 1, fraction.size)
     )
     out = np.zeros(fraction.size)
     for j in range(1, n_bins + 1):
@@ -122,11 +122,15 @@ def _equal_in_bins(fraction, rng):
     return out
 
 
-def draw_truths(fitter, n, rng):
-    """Models in the limit of the sample: fluxes in uJy, redshifts, AGN fractions, and luminosities in erg/s."""
+def draw_truths(fitter, n, rng, *, share=0.5):
+    """
+    Models in the limit of the sample, of which a share has an AGN, as a dict.
+
+    ``flux`` and ``host`` (without the AGN) are in uJy, ``luminosity`` of the AGN is in erg/s.
+    """
     models = fitter.backend.between.models
     n_drawn = 40 * n
-    values = draw_models(fitter, n_drawn, rng)
+    values = draw_models(fitter, n_drawn, share, rng)
     z = values["redshift"]
     flux, power = models.fluxes(values, z, values["frac_agn"])
     formed = np.ones(n_drawn)
@@ -147,8 +151,14 @@ def draw_truths(fitter, n, rng):
         raise RuntimeError(f"{accepted.size} models of {n} are within the limit: draw more")
     rows = {name: column[accepted] for name, column in values.items()}
     derived = models.describe(rows, z[accepted], power[accepted], (mass / stars)[accepted])
-    luminosity = derived["accretion_power"] * LUMINOSITY.to("erg / s")
-    return flux[accepted], z[accepted], rows["frac_agn"], luminosity
+    host, _ = models.fluxes(rows, z[accepted], np.zeros(accepted.size))
+    return {
+        "flux": flux[accepted],
+        "host": host * (mass / stars)[accepted, None],
+        "redshift": z[accepted],
+        "frac_agn": rows["frac_agn"],
+        "luminosity": derived["accretion_power"] * LUMINOSITY.to("erg / s"),
+    }
 
 
 def observe(flux, redshift, template_error, rng):
@@ -171,9 +181,9 @@ def fitted_objects(n, errors_of_models, seed):
     """Posteriors of objects in bins, their true bins, and the prior of the bins of the fraction: dict."""
     rng = np.random.default_rng(seed)
     fitter = make_fitter(errors_of_models)
-    flux, redshift, fraction, luminosity = draw_truths(fitter, n, rng)
-    results = fitter.fit(observe(flux, redshift, fitter.template_error, rng))
-    z_bin, frac_bin, l_bin = BINS.place(redshift, fraction, luminosity)
+    truth = draw_truths(fitter, n, rng)
+    results = fitter.fit(observe(truth["flux"], truth["redshift"], fitter.template_error, rng))
+    z_bin, frac_bin, l_bin = BINS.place(truth["redshift"], truth["frac_agn"], truth["luminosity"])
     return {
         "table": results.agn_weights,
         "z_bin": z_bin,

@@ -1,6 +1,7 @@
 """AGN of known luminosity added to the galaxies of a catalog, in batches, and fitted as the catalog was."""
 
 import logging
+import warnings
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
@@ -25,7 +26,7 @@ from miricigale.fitting import GridSettings
 from miricigale.fitting.catalogs.catalog_calibration import measured_calibration
 from miricigale.fitting.catalogs.catalog_rows import read_catalog_nuclei
 from miricigale.fitting.catalogs.classes import fit_classes
-from miricigale.fitting.data.likelihood import table_of_fluxes
+from miricigale.fitting.data.likelihood import NOT_CONVERGED_TEXT, table_of_fluxes
 from miricigale.utils.content_hash import content_sha256
 from miricigale.utils.exceptions import FitWarning, OtherResultsError, warn
 from miricigale.utils.files import make_folder, replacing
@@ -179,7 +180,10 @@ class Injections:
         options["calibrate"] = False
         options["interpolate"] = self.n_models
         folder = self.folder / batch_name(number)
-        return fit_classes(catalog, folder, agn_bins=self.survey.bins, **options)
+        with warnings.catch_warnings():
+            # only the selection of AGN is taken from these fits, for which their few models suffice
+            warnings.filterwarnings("ignore", f".*{NOT_CONVERGED_TEXT}", FitWarning)
+            return fit_classes(catalog, folder, agn_bins=self.survey.bins, **options)
 
     # ------------------------------------------------------------------ photometry
 

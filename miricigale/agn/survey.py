@@ -13,7 +13,9 @@ from miricigale.agn.shares import draw_shares
 from miricigale.evaluation.classes import CLASS_LIMITS
 from miricigale.fitting import AGNBins
 from miricigale.fitting.catalogs.classes import fit_classes
+from miricigale.fitting.data.template_error import pivots
 from miricigale.utils.arrays import spread_over
+from miricigale.utils.exceptions import CatalogWarning, warn
 from miricigale.utils.files import make_folder
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.options import check_that
@@ -29,6 +31,10 @@ REDSHIFT = (0.0, 1.0, 2.0, 4.0)
 LOG_LUMINOSITY = (43.0, 44.0, 45.0, 46.0)
 #: Files that a run writes besides the folders of fits.
 FILES = ("numbers.ecsv", "totals.ecsv", "prior.ecsv", "sources.ecsv", "injected.ecsv")
+#: Objects for each square arcmin that no catalog has: the deepest fields of JWST have about 1000.
+MAX_DENSITY = 3000.0
+#: Wavelength in um from which bands observe the dust of an AGN at the redshifts of most catalogs.
+MIN_WAVELENGTH = 5.0
 #: Solid angle of the whole sky in square degrees.
 _SKY = (4.0 * np.pi * u.sr).to_value(u.deg**2)
 
@@ -207,6 +213,8 @@ class AGNSurvey:
         fits = fit_classes(path, output / "fits", agn_bins=self.bins, **options)
         sample = FittedSample.of_fits(fits, self.bins, self.limit)
         check_that(sample.used.any(), "path", "a catalog of which objects can be fitted", "none")
+        self.warn_of_density(len(sample))
+        _warn_of_bands(fits["galaxy"])
         injections = Injections(self, path, fits, sample, output, images, options)
         result = self._result(sample, injections)
         make_folder(output)
@@ -215,6 +223,21 @@ class AGNSurvey:
 
         write_page(result, output / "page.html", Path(path).name)
         return result
+
+    def warn_of_density(self, n):
+        """
+        Warn of an area that is too small for a catalog, as of a wrong unit.
+
+        Parameters
+        ----------
+        n : int
+            Objects of the catalog.
+        """
+        area = (self.area * u.deg**2).to_value(u.arcmin**2)
+        density = n / area
+        if density > MAX_DENSITY:
+            text = f"{n} objects in {area:.4g} square arcmin are {density:.3g} for each, and the deepest fields"
+            warn(f"{text} have about 1000: is the area right?", CatalogWarning)
 
     # ---------------------------------------------------------------------- result
 
@@ -310,6 +333,15 @@ class AGNSurvey:
         if weight is not None:
             weight = weight[chosen]
         return np.bincount(flat, weight, n_z * n_lum).reshape(n_z, n_lum)
+
+
+def _warn_of_bands(results):
+    """Warn of a catalog whose bands do not show the dust of AGN."""
+    bands = results[np.zeros(1, int)].fitted_filters
+    longest = pivots(bands).max().to_value(u.um)
+    if longest < MIN_WAVELENGTH:
+        text = f"no band beyond {MIN_WAVELENGTH:g} um (the longest is at {longest:.2g} um): fractions of AGN are"
+        warn(f"{text} hardly measured, and numbers of AGN go by their prior", CatalogWarning)
 
 
 def _table_of_sources(sample, probability):

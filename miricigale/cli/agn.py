@@ -75,6 +75,7 @@ def _plan(args, survey):
     from miricigale.fitting.catalogs.class_names import chosen_classes
 
     rows = open_catalog(**filled(args, open_catalog))
+    survey.warn_of_density(rows.n_rows)
     names = chosen_classes(**filled(args, chosen_classes))
     n_classes = 1 + len(names)
     n_most = most_injections(survey.n_injections, rows.n_rows)

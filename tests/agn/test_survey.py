@@ -1,6 +1,7 @@
 """AGN added to photometry, and counted again."""
 
 import json
+import warnings
 
 import astropy.units as u
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from astropy.table import QTable
 
 from helpers.commands import command
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from miricigale import BayesFitter, ErrorModel, FitResults, SEDModel
 from miricigale.agn import AGNSurvey, NoiseCurve, add_light, agn_light, injections
 from miricigale.agn.injection_draws import FIRST, InjectionDraws, batch_sizes
@@ -399,6 +400,32 @@ def test_injected_agn_have_fewer_models(run, model, tmp_path):
     assert "40 models between the nodes" in (tmp_path / "page.html").read_text()
 
 
+def test_a_catalog_without_mid_infrared_bands_is_warned_of(photometry, model, tmp_path):
+    """An AGN's dust is seen by no band up to 4.4 um at z = 1."""
+    names = ["id"]
+    for band in (*BANDS[:2], "nircam.f444w"):
+        names += [band, f"{band}_err"]
+    table = photometry.copy()
+    table["nircam.f444w"] = table["irac.ch1"]
+    table["nircam.f444w_err"] = table["irac.ch1_err"]
+    table[names].write(tmp_path / "catalog.ecsv")
+    survey = AGNSurvey(20 * u.arcmin**2, redshift=(0.5, 1.5), n_injections=0)
+    options = OPTIONS | {"models": lambda _: (model, AXES)}
+    arguments = (tmp_path / "catalog.ecsv", tmp_path / "agn")
+    warned("no band beyond 5 um .the longest is at 4.4 um", survey.run, *arguments, **options)
+
+
+def test_injected_agn_are_not_warned_of_their_few_models(run, model, tmp_path):
+    """Fits of one model each are not converged; only those of the catalog say so."""
+    catalog = run("first")[1].parent / "catalog.ecsv"
+    survey = AGNSurvey(20 * u.arcmin**2, redshift=(0.5, 1.5), n_injections=8, injected_models=1)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        survey.run(catalog, tmp_path, **OPTIONS, models=lambda _: (model, AXES))
+    texts = [str(warning.message) for warning in caught]
+    assert not any(f"of {8} fits are not converged" in text for text in texts)
+
+
 def test_images_are_measured_once(run, model, tmp_path):
     """A stopped call, resumed with other workers, writes the bytes of one in a piece."""
     catalog = run("first")[1].parent / "catalog.ecsv"
@@ -527,6 +554,9 @@ def test_command_states_its_plan_and_names_its_options(photometry, tmp_path, cap
     arguments = ["agn", catalog, "--area", 20, "--injections", 76, "-o", tmp_path / "agn"]
     said = command(capsys, *arguments, "--classes", "quasars", "--plan").out
     assert "24 objects and at most 76 injected AGN in 2 classes: 200 fits" in said
+    # 20 square degrees in place of square arcmin would be 3600 times as many
+    small = ["agn", catalog, "--area", 20 / 3600, "--plan"]
+    warned("24 objects .* are 4.32e.03 for each, and the deepest fields", command, capsys, *small)
     assert not (tmp_path / "agn").exists()
     assert "--limit must be from 0.1" in command(capsys, *arguments, "--limit", 0, status=2).err
     said = command(capsys, *arguments, "--components", 2, status=2).err
