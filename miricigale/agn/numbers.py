@@ -21,6 +21,9 @@ _JEFFREYS = 0.5
 #: Smallest share of the injected AGN of a bin that must have a fraction of `FLOOR` or more: with fewer, the
 #: density of the bin is mostly an extrapolation.
 MIN_ABOVE = 0.5
+#: Smallest share of the injected AGN with a fraction from the limit on that must be selected: with fewer, the
+#: number of the bin is a sum of small probabilities, which go by the prior.
+MIN_SELECTED = 0.1
 
 
 def _texts(name):
@@ -148,7 +151,9 @@ class SampleNumbers:
             row["purity"] = self.pure[i, k] / n_selected
             row["purity_shipped"] = self.pure_shipped[i, k] / n_selected
         row |= _summary(self._corrected(i, k, "all"), "n_corrected")
-        row["constrained"] = bool(row["above"] >= MIN_ABOVE)
+        n_visible = injected["limit"]
+        are_selected = not n_visible or injected["right"] >= MIN_SELECTED * n_visible
+        row["constrained"] = bool(row["above"] >= MIN_ABOVE and are_selected)
         row |= self._density(number, row["n_shipped"], injected, i, k)
         return row | self._obscured(by_class, i, k)
 

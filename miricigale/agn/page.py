@@ -48,7 +48,12 @@ def write_page(result, path, name):
         page.notice("unused", n=n_unused, n_all=meta["n_all"])
     if not len(result.injected):
         page.notice("no_injections")
-    page.section("totals", classes=classes, **facts)
+    if meta.get("redshift_column") is None:
+        page.notice("photometric")
+    edges = (
+        f"{np.min(result.numbers['redshift_low']):g} to {np.max(result.numbers['redshift_high']):g}"
+    )
+    page.section("totals", classes=classes, edges=edges, **facts)
     page.table("table", _rows(result.totals))
     page.section("numbers", floor=f"{FLOOR:g}")
     page.figure("figure", _luminosity_function(result.numbers))

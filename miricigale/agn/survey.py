@@ -50,7 +50,8 @@ class AGNResult(Interactive):
         A row for each bin of redshift and luminosity: ``n`` AGN with a fraction of 0.1 or more by the measured
         prior and ``n_shipped`` by that of the fits, the share ``obscured`` of them, the luminosity function
         ``density``, the selection function ``completeness``, and ``n_selected``, ``purity``, ``n_corrected`` of
-        selected objects. ``constrained`` is false where most of the injected AGN have smaller fractions.
+        selected objects. ``constrained`` is false where most of the injected AGN have smaller fractions,
+        or fewer than 10 % of those from the limit on are selected.
     totals : `~astropy.table.QTable`
         The same of all AGN with a fraction of 0.1 or more, and of those from the limit on.
     prior : `~astropy.table.QTable`
@@ -298,6 +299,7 @@ class AGNSurvey:
             "area_deg2": float(self.area),
             "limit": self.limit,
             "seed": self.seed,
+            "redshift_column": injections.options.get("redshift"),
             "n_all": len(sample),
             "n_used": int(sample.used.sum()),
             "classes": list(sample.tables),

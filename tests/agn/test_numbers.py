@@ -1,5 +1,7 @@
 """Tables of numbers of AGN against closed forms."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -59,3 +61,17 @@ def test_purity_of_both_priors(numbers):
     assert row["purity"] == pytest.approx(0.9)
     assert row["purity_shipped"] == pytest.approx(0.8)
     assert np.isnan(numbers.by_luminosity()[0]["purity_shipped"])
+
+
+@pytest.mark.parametrize(
+    ("n_right", "constrained"), [(200, True), (20, True), (19, False), (0, False)]
+)
+def test_bins_in_which_no_agn_is_selected_are_not_constrained(numbers, n_right, constrained):
+    """Of 200 injected AGN with a fraction of 0.4 or more, 10 % must be selected."""
+    right = numbers.injected["right"].copy()
+    right[0, 2] = n_right
+    injected = numbers.injected | {"right": right}
+    with_fewer = dataclasses.replace(numbers, injected=injected)
+    row = with_fewer.by_luminosity()[-1]
+    assert row["above"] == 1.0
+    assert row["constrained"] == constrained
