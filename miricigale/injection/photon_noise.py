@@ -157,9 +157,12 @@ class PhotonNoise:
         """
         if covariance is None:
             covariance = np.ones((1, 1))
-        if not self.of_pixels:
+        middle = covariance[len(covariance) // 2, len(covariance) // 2]
+        if self.of_pixels:
+            # structure of the sky that is no noise makes residuals larger than errors
+            covariance = covariance / max(middle, 1.0)
+        else:
             # pixels share photons when they are resampled, and none is lost
-            middle = covariance[len(covariance) // 2, len(covariance) // 2]
             covariance = covariance / max(covariance.sum(), middle)
         white = rng.standard_normal(np.shape(light))
         return np.sqrt(self.variance(light)) * _colored(white, covariance)

@@ -82,6 +82,20 @@ def test_light_has_the_noise_of_its_electrons(correlated):
         assert_allclose(drawn.var(), 3.0 / RATE * covariance[2, 2], rtol=0.1)
 
 
+@pytest.mark.parametrize("excess", [1.0, 50.0])
+def test_pixels_have_the_variance_that_the_image_states(excess):
+    """Whether residuals are those of noise or, as on a nebula, far larger."""
+    noise = PhotonNoise(np.full((SIDE, SIDE), 1.0 / RATE), True, False, "")
+    shape = np.array([0.2, 1.0, 0.2])
+    light = np.full((SIDE, SIDE), 3.0)
+    drawn = noise.draw(light, excess * np.outer(shape, shape), np.random.default_rng(1))
+    assert_allclose(drawn.var(), 3.0 / RATE, rtol=0.1)
+    # 1.4 is the sum of the correlation along an axis
+    sums = drawn.reshape(16, SIDE // 16, 16, SIDE // 16).sum(axis=(1, 3))
+    expected = 3.0 / RATE * (SIDE // 16) ** 2 * 1.4**2
+    assert_allclose(sums.var(), expected, rtol=0.35)
+
+
 @pytest.mark.parametrize(
     ("unit", "keywords", "electrons"),
     [
