@@ -13,7 +13,7 @@ from miricigale.fitting.data.nuclei import NucleusColumns, nucleus_columns, nucl
 from miricigale.utils.row_files import open_rows
 
 
-def open_catalog(path, chunk_rows=10000, *, hdu=None, catalog_map=None, flux_unit=None):
+def open_catalog(path, chunk_rows=1000, *, hdu=None, catalog_map=None, flux_unit=None):
     """Open a catalog by rows (`~miricigale.utils.row_files.RowFile`), under our names or those of a map."""
     column_map = None
     id_names = ()

@@ -32,7 +32,7 @@ def fit_catalog(
     nuclei=False,
     nuclear_stars=0.1,
     hdu=None,
-    chunk_rows=10000,
+    chunk_rows=1000,
     **options,
 ):
     """

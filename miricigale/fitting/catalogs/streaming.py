@@ -67,7 +67,7 @@ def fit_file(
     path_in,
     path_out,
     *,
-    chunk_rows=10000,
+    chunk_rows=1000,
     redshift=None,
     redshift_prior=None,
     pairs=None,
@@ -100,8 +100,9 @@ def fit_file(
     path_out : path-like
         The folder; made if it is not there.
     chunk_rows : int, optional
-        Rows of a piece and so of a part file. 10000 objects of a grid of 65 redshifts and 11 AGN
-        fractions take some 100 MB of results.
+        Rows of a piece and so of a part file, which is what a stopped fit loses at most: a minute of work between
+        the nodes of the survey's grid. 10,000 objects of a grid of 65 redshifts and 11 AGN fractions take some
+        100 MB of results.
     redshift, redshift_prior, pairs : optional
         As for `BayesFitter.fit`, for all rows of the catalog; densities of redshift may be the name
         of a column that holds them.
