@@ -24,7 +24,7 @@ from miricigale.sed.parameter import default_values, parameter_table
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
 from miricigale.utils.interactive import Interactive
 from miricigale.utils.meta import provenance
-from miricigale.utils.named_values import without_none
+from miricigale.utils.named_values import ValuesByName, without_none
 from miricigale.utils.options import check_that
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import WAVE
@@ -294,12 +294,12 @@ class SEDModel(Interactive):
     @property
     def parameters(self):
         """All parameters, in the order of the chain: dict of name to `Parameter`."""
-        return dict(self._parameters)
+        return ValuesByName(self._parameters)
 
     @property
     def defaults(self):
         """Default of every parameter in its unit: dict of name to float."""
-        return default_values(self._parameters)
+        return ValuesByName(default_values(self._parameters))
 
     def to_table(self):
         """

@@ -19,6 +19,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import reading
 from miricigale.utils.interactive import WithTable
 from miricigale.utils.meta import full_meta
+from miricigale.utils.named_values import ValuesByName
 from miricigale.utils.options import check_that
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.table_files import read_table, write_table
@@ -116,12 +117,12 @@ class SED(Frozen, WithTable):
     @property
     def parameters(self):
         """Parameters of the model: dict of name to `~astropy.units.Quantity`, empty of other spectra."""
-        return self.meta.get("parameters", {})
+        return ValuesByName(self.meta.get("parameters", {}))
 
     @property
     def derived(self):
         """Derived quantities of the model by name, such as ``stellar_mass``; see `SEDModel.derived_columns`."""
-        return self.meta.get("derived", {})
+        return ValuesByName(self.meta.get("derived", {}))
 
     @property
     def ssfr(self):

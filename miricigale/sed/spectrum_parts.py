@@ -39,6 +39,11 @@ class Parts(dict):
             raise unknown_name("component", name, self.names)
         return functools.reduce(operator.add, groups[name])
 
+    def __call__(self, name=None):
+        if name is None:
+            return self
+        return self[name]
+
     @property
     def names(self):
         """Names of the parts and of their sums."""

@@ -1,6 +1,7 @@
 """Frozen classes that hold a row for each object of a catalog: slices, rows by id, joins."""
 
 import functools
+import inspect
 import numbers
 from dataclasses import fields
 from functools import cached_property
@@ -35,14 +36,14 @@ def of_id(method):
         not there, it raises `TypeError` or `KeyError`.
     """
     name = method.__name__
+    usage = f"{name} is of a single object: results.{name}(id), or results[0].{name}() by row"
 
     @functools.wraps(method)
     def method_of_id(rows, *args, **kwargs):
         if rows.isscalar:
-            return method(rows, *args, **kwargs)
+            return _call_of_object(method, usage, rows, *args, **kwargs)
         if "id" in kwargs and not args:
             args = (kwargs.pop("id"),)
-        usage = f"{name} is of a single object: results.{name}(id), or results[0].{name}() by row"
         if not args or np.ndim(args[0]) > 0:
             raise TypeError(usage)
         try:
@@ -50,9 +51,23 @@ def of_id(method):
         except KeyError as err:
             msg = f"{err.args[0]}; {usage}"
             raise KeyError(msg) from None
-        return method(result, *args[1:], **kwargs)
+        return _call_of_object(method, usage, result, *args[1:], **kwargs)
 
+    # calls are checked here
+    method_of_id.keyword_names = tuple(inspect.signature(method).parameters)
     return method_of_id
+
+
+def _call_of_object(method, usage, result, *args, **kwargs):
+    """Call a method of a single object, after a check of its arguments."""
+    signature = inspect.signature(method)
+    try:
+        signature.bind(result, *args, **kwargs)
+    except TypeError as err:
+        names = ", ".join(list(signature.parameters)[1:]) or "nothing"
+        msg = f"{usage}; besides it takes {names}: {err}"
+        raise TypeError(msg) from None
+    return method(result, *args, **kwargs)
 
 
 def _frozen(array, copy):
@@ -80,7 +95,12 @@ class ArraysByName(dict):
             raise unknown_name("parameter", name, self)
         raise KeyError(name)
 
-    def __call__(self, name, *others):
+    def __call__(self, name=None, *others):
+        if name is None:
+            msg = (
+                f"a name gives the arrays of all objects, such as {next(iter(self), 'redshift')!r}"
+            )
+            raise TypeError(msg)
         if others:
             msg = f"{name!r} alone gives the arrays of all objects; results.loc[id] is one object"
             raise TypeError(msg)
@@ -303,6 +323,9 @@ class ByID:
         if isinstance(key, (list, np.ndarray)) and np.ndim(key):
             return self._rows[[self._rows.row(id_) for id_ in key]]
         return self._rows._take(self._rows.row(key))
+
+    #: ``loc(id)`` is ``loc[id]``.
+    __call__ = __getitem__
 
     def _ipython_key_completions_(self):
         """Return what a session offers in brackets: the ids."""

@@ -116,6 +116,9 @@ def test_linear_model_has_the_posterior_and_evidence_of_the_closed_form(engine):
     # the best of some thousand models comes near the minimum
     assert chi2 <= results.chi2[0] < chi2 + 0.1
     drawn = results.samples(0)
+    assert_allclose(results[0].samples()["a"], drawn["a"])
+    assert results[0].samples("b").colnames == results.samples(0, "b").colnames == ["b"]
+    refuses("'key' must be the id of an object", results.samples)
     both = np.cov(drawn["a"].value, drawn["b"].value)
     # 1000 draws of two variables that are correlated by 0.43
     assert_allclose(both, covariance, atol=0.15 * np.sqrt(np.prod(np.diag(covariance))))

@@ -66,9 +66,21 @@ def test_quantities_are_found_by_the_names_of_cigale(results):
     refuses("probability.'redshift', 2.", results.probability, len, error=TypeError)
     assert f"<GridAxis redshift: {len(axis)} values from " in repr(axis)
     assert_array_equal(results.best("agn.fracAGN"), results.best["frac_agn"])
+    refuses("a name gives the arrays", results.best, error=TypeError)
     assert "z" not in results.pdf
     refuses("no parameter 'redshft'; .*redshift", results.pdf, "redshft", error=KeyError)
     refuses("no parameter 'stellar.mstar'", results.mean, "stellar.mstar", error=KeyError)
+
+
+def test_calls_that_results_do_not_take_end_in_those_that_they_do(results):
+    for sampled in (lambda: results[0].samples("mass", 100), lambda: results.samples()):
+        refuses("a grid hold no draws; fitter.sample.photometry, 1000, seed=1. makes", sampled)
+    key = results.ids[0]
+    assert_array_equal(results.loc(key).chi2, results.loc[key].chi2)
+    refuses("plot_sed.id., or results.0.*takes ax, model, filters", results[0].plot_sed, *range(9),
+            error=TypeError)  # fmt: skip
+    refuses("is no function.*results.name., mean.name.", results, "mass", error=TypeError)
+    refuses("FitResults.mean.. needs 'name'", results.mean, error=TypeError)
 
 
 def test_a_table_without_units_is_fitted_in_the_unit_that_is_said(fitter, photometry, results):

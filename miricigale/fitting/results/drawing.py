@@ -17,9 +17,16 @@ from miricigale.utils.units import FNU, to_array
 CORNER = ("redshift", "stellar_mass", "sfr", "a_v", "frac_agn")
 
 
-def samples(results, key):
+def samples(results, key=None, *names):
     """
     Tabulate the draws of a sampler from the posterior of one object, all of the same weight.
+
+    Parameters
+    ----------
+    key : object
+        Id of the object; left out of a single one: ``results[0].samples()``.
+    *names : str, optional
+        Parameters to keep; all by default.
 
     Returns
     -------
@@ -30,14 +37,30 @@ def samples(results, key):
     ------
     ValueError
         If the object was not fitted, or the fit was no sampler's (see `BayesFitter.sample`).
+    KeyError
+        If there is no such object or parameter.
     """
     if results.draws is None:
-        msg = "results of a grid hold no draws; fitter.sample(photometry, 1000, seed=1) makes some"
+        msg = (
+            "results of a grid hold no draws; fitter.sample(photometry, 1000, seed=1) makes some, "
+        )
+        msg += "whose values(name) are those of a parameter"
         raise ValueError(msg)
-    result = results.loc[key]._fitted_one()
+    if results.isscalar:
+        result = results
+        if key is not None and key != results.ids:
+            names = (key, *names)
+    else:
+        check_that(key is not None, "key", "the id of an object", "None")
+        result = results.loc[key]
+    result = result._fitted_one()
+    names = [results._named(name) for name in names]
+    check_names(names, "parameter", results.parameters)
     values = zip(results.parameters, result.draws.T, strict=True)
     columns = {n: (u.Quantity(v, results.unit(n)), results._meaning(n)) for n, v in values}
-    return described_table(columns, dict(results.meta) | {"id": str(key)})
+    if names:
+        columns = {name: columns[name] for name in names}
+    return described_table(columns, dict(results.meta) | {"id": str(result.ids)})
 
 
 def best_parameters(results, model):

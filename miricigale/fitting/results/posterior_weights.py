@@ -22,7 +22,7 @@ class PosteriorWeights(ArraysByName):
             raise KeyError(msg)
         return super().__missing__(name)
 
-    def __call__(self, name, *others):
+    def __call__(self, name=None, *others):
         weights = super().__call__(name, *others)
         axis = self.axes[self.other_name(name, self)]
         return axis.values * u.Unit(axis.unit), weights
