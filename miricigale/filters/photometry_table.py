@@ -16,6 +16,7 @@ from miricigale.utils.exceptions import CatalogWarning, units_error, warn
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.tables import as_table, error_column
 from miricigale.utils.units import FNU, flux_unit, own_unit
 
@@ -37,6 +38,7 @@ _ALONE = ("flux", "flux_density", "fnu", "f_nu", "mag", "magnitude", "abmag")
 _LIMIT = "_limit"
 
 
+@takes_other_keywords
 def as_photometry(data, bands, argument="photometry", *, units=None):
     """
     Return the catalog with columns by the names of bands, of any table.
@@ -125,6 +127,29 @@ def as_photometry(data, bands, argument="photometry", *, units=None):
     of_their_unit = codes_of(out, in_their_unit)
     _warn_of_codes(coded | of_their_unit, argument)
     return without_codes_of(out, of_their_unit)
+
+
+def names_of_columns(data, bands, argument="photometry"):
+    """
+    Return the names that a catalog has for fluxes and errors of bands.
+
+    Parameters
+    ----------
+    data : object
+        As for `as_photometry`.
+    bands : iterable of str
+        Bands.
+    argument : str, optional
+        The argument's name, for messages.
+
+    Returns
+    -------
+    names : dict of str to str
+        Column of the catalog by that of `as_photometry`; empty of photometry that is no table.
+    """
+    if _is_of_prospector(data):
+        return {}
+    return _our_names(as_table(data, argument).colnames, tuple(bands), argument)
 
 
 def _warn_of_codes(coded, argument):

@@ -6,9 +6,11 @@ import numpy as np
 
 from miricigale.filters import as_photometry
 from miricigale.filters.catalog_files import count_negative_errors, negative_error_message
+from miricigale.filters.photometry_table import names_of_columns
 from miricigale.fitting.data.likelihood import (
     FitFlags,
     PhotometryReader,
+    check_fluxes,
     flags_of_fits,
     unused_bands,
 )
@@ -84,6 +86,8 @@ class CatalogFits(Interactive):
             for name in missing:
                 table[name] = nans(len(table)) * FNU
                 table[error_column(name)] = nans(len(table)) * FNU
+        user_names = names_of_columns(photometry, self.filters or self.bands)
+        check_fluxes(table, self._reader.fitted(table), user_names)
         warn_of_duplicates(read_ids(table), "photometry")
         self._warn_of_bands(table)
         text = negative_error_message(count_negative_errors(table, self._reader.fitted(table)))

@@ -1,5 +1,6 @@
 """BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from miricigale.filters.band_names import known_filter
@@ -36,7 +37,7 @@ from miricigale.fitting.survey.defaults import (
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.sed.presets import grid_name
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_that
+from miricigale.utils.options import check_that, check_type
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import check_count
@@ -228,6 +229,8 @@ class BayesFitter(CatalogFits):
         if on_grid and default_axes is not axes:
             changed_axes = axes
             axes = default_axes
+        if priors is not None:
+            check_type(priors, "priors", Mapping, "a dict of parameter name to prior")
         self.curves = own_curves(filters)
         self._options = {
             "model": model,

@@ -203,6 +203,10 @@ class MatchingKernel(Interactive):
         """
         hi = named_psf(hi)
         lo = named_psf(lo)
+        for name, psf in {"hi": hi, "lo": lo}.items():
+            is_psf = hasattr(psf, "param_names") or np.ndim(getattr(psf, "array", psf)) == 2
+            wanted = "a PSF, its file, a name of a filter or a 2D array"
+            check_that(is_psf, name, wanted, type(psf).__name__)
         if pixel_scale is None:
             pixel_scale = getattr(hi, "pixel_scale", None)
         check_that(

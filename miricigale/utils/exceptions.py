@@ -1,8 +1,10 @@
 """Errors and warnings of the package, and the one way to word them."""
 
 import contextlib
+import contextvars
 import difflib
 import sys
+import types
 import warnings
 
 from astropy.units import UnitsError
@@ -131,12 +133,45 @@ def unknown_name(kind, name, names):
     return KeyError(f"no {kind} {name!r}; known: {', '.join(names)}{hint}")
 
 
+#: What the caller of a function wrote for some of its arguments, by their names.
+_WRITTEN = contextvars.ContextVar("written", default=types.MappingProxyType({}))
+
+
+@contextlib.contextmanager
+def written_names(names):
+    """
+    Name arguments in errors and warnings as the caller wrote them.
+
+    Parameters
+    ----------
+    names : dict of str to str
+        What was written, by the name of the argument, whose name stands in quotes in messages.
+    """
+    token = _WRITTEN.set(names)
+    try:
+        yield
+    except Exception as err:
+        if err.args and isinstance(err.args[0], str):
+            err.args = (_as_written(err.args[0]), *err.args[1:])
+        raise
+    finally:
+        _WRITTEN.reset(token)
+
+
+def _as_written(message):
+    """Return a message with the names of arguments that the caller wrote."""
+    for name, written in _WRITTEN.get().items():
+        message = message.replace(f"'{name}'", f"'{written}'")
+    return message
+
+
 #: Modules that are not the caller of a public function.
 _INNER = ("miricigale.", "contextlib", "functools")
 
 
 def warn(message, category):
     """Warn at the line outside of the package that led here, however deep the call is."""
+    message = _as_written(message)
     frame = sys._getframe(1)
     level = 2
     while frame.f_back and frame.f_globals.get("__name__", "").startswith(_INNER):

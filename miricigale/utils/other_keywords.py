@@ -5,6 +5,7 @@ import functools
 import inspect
 
 from miricigale.utils.attribute_hints import near_names
+from miricigale.utils.exceptions import written_names
 from miricigale.utils.named_values import field_names
 from miricigale.utils.package_tables import declared, hint_sentences
 
@@ -120,11 +121,14 @@ def _renaming(function, label, settings, options_of=()):
 
     @functools.wraps(function)
     def call(*args, **keywords):
+        written = {}
         n_args = len(args) - n_owners
         if n_args > n_most and not takes_any_number:
             raise TypeError(_too_many(label, names[:n_most], n_args))
         if not keywords.keys() <= known:
-            keywords = _our_keywords(keywords, label, names, settings, is_open=is_open)
+            ours = _our_keywords(keywords, label, names, settings, is_open=is_open)
+            written = _written_names(keywords, ours)
+            keywords = ours
         twice = sorted(keywords.keys() & set(names[:n_args]))
         if _is_text_alone(args[n_owners:], twice, names):
             # such as the name of a filter whose wavelengths are given by keyword
@@ -137,7 +141,10 @@ def _renaming(function, label, settings, options_of=()):
         missing = [name for name in required if name not in (*names[:n_args], *keywords)]
         if missing:
             raise TypeError(_with_call(f"{label}() needs {', '.join(map(repr, missing))}", label))
-        return function(*args, **keywords)
+        if not written:
+            return function(*args, **keywords)
+        with written_names(written):
+            return function(*args, **keywords)
 
     call.keyword_names = tuple(names)
     return call
@@ -206,6 +213,18 @@ def _our_keywords(keywords, label, names, settings, *, is_open=False):
             raise TypeError(msg)
         ours[part] = settings[part](**fields)
     return ours
+
+
+def _written_names(keywords, ours):
+    """Return the keywords of a call by our names for the same values, of those that are ours by another name."""
+    written = {}
+    for keyword, value in keywords.items():
+        if keyword in ours:
+            continue
+        for name, our_value in ours.items():
+            if our_value is value and name not in keywords:
+                written[name] = keyword
+    return written
 
 
 def _settings_of(cls):

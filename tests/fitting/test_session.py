@@ -88,6 +88,15 @@ def test_a_table_without_units_is_fitted_in_the_unit_that_is_said(fitter, photom
         name: getattr(photometry[name], "value", photometry[name]) for name in photometry.colnames
     }
     refuses("got no unit: give one, as unit='uJy'", fitter.fit, plain, error=u.UnitsError)
+    # messages name the columns as the user does
+    theirs = {"band0": "f_band0", "band0_err": "e_band0"}
+    renamed = {theirs.get(name, name): column for name, column in plain.items()}
+    refuses("columns 'f_band0', 'e_band0', .*got no unit", fitter.fit, renamed,
+            error=u.UnitsError)  # fmt: skip
+    text = renamed | {"f_band0": np.full(len(plain["id"]), "faint")}
+    refuses("with numbers in column 'f_band0', got text, faint in row 0", fitter.fit, text)
+    del renamed["e_band0"]
+    refuses("with the columns .'f_band0_err'.*got columns .*'f_band0'", fitter.fit, renamed)
     fitted = fitter.fit(plain, unit="uJy")
     assert_array_equal(fitted.pdf["redshift"], results.pdf["redshift"])
     smaller = fitter.fit(plain, unit="nJy")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import miricigale
-from helpers.errors import refuses
+from helpers.errors import refuses, warned
 from miricigale import (
     BayesFitter,
     Detector,
@@ -23,6 +23,7 @@ from miricigale import (
     psf,
 )
 from miricigale.reduction import MosaicSettings
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error, warn
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared, hint_sentences
 
@@ -154,6 +155,19 @@ def test_other_calls_say_what_is_meant():
     assert width(2, power=3) == 6
     refuses("has no argument 'n'; it has wave, power", width, 2, n=3, error=TypeError)
     refuses("takes wave without a keyword, got 2 without$", width, 2, 3, error=TypeError)
+
+
+def test_errors_and_warnings_name_arguments_as_they_were_written():
+    @takes_other_keywords
+    def draw(n_dithers, *, seed=0):
+        if seed < 0:
+            raise argument_error("seed", "positive", seed)
+        warn("'n_dithers' is large", MiricigaleWarning)
+
+    refuses("^'rng' must be positive", draw, 3, rng=-1)
+    refuses("^'seed' must be positive", draw, 3, seed=-1)
+    warned("^'ndither' is large", draw, ndither=3)
+    warned("^'n_dithers' is large", draw, 3, rng=1)
 
 
 def test_classes_say_what_is_meant_too():

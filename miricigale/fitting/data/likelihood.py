@@ -9,12 +9,19 @@ from astropy.table import QTable
 from miricigale.filters import Filter
 from miricigale.filters.library import SEDPY
 from miricigale.utils.arrays import nans
-from miricigale.utils.exceptions import argument_error, units_error
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import first_word, own_mask
 from miricigale.utils.named_values import attributes
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.options import check_that
-from miricigale.utils.tables import Flags, columns_among, error_column, read_ids, require_columns
+from miricigale.utils.tables import (
+    Flags,
+    check_units,
+    columns_among,
+    error_column,
+    read_ids,
+    require_columns,
+)
 from miricigale.utils.units import FNU, flux_unit, own_unit, to_array
 from miricigale.utils.values import value_class
 
@@ -24,6 +31,8 @@ LOW_SIGNAL = 3.0
 NOT_CONVERGED_TEXT = "fits are not converged"
 #: Largest limit of the reduced chi2 above which an object is flagged.
 HIGH_CHI2 = 100.0
+#: Most columns that a message lists.
+_MAX_LISTED = 6
 #: Stellar mass in solar masses below which an object is flagged.
 LOW_MASS = 3e6
 #: Smallest error in units of the flux: below it chi2 in double precision has no digits left.
@@ -308,16 +317,8 @@ class PhotometryReader:
             If a flux has no unit of flux density.
         """
         filters = self.fitted(table)
-        columns = flux_columns(filters)
-        require_columns(table, ["id"] + list(columns), "photometry")
-        for name in columns:
-            if own_unit(table[name]) is None:
-                got = (
-                    "no unit: give one, as unit='uJy' (or 'ABmag', 'mJy') in Python or "
-                    "--flux-unit uJy on the command line"
-                )
-                raise units_error("photometry", f"convertible to {FNU}", got, column=name)
-        require_columns(table, [], "photometry", units=dict.fromkeys(columns, FNU))
+        require_columns(table, ["id"], "photometry")
+        check_fluxes(table, filters)
         n = len(table)
         shape = (n, len(self.bands))
         flux = nans(shape)
@@ -376,6 +377,73 @@ def flux_columns(bands):
     for band in bands:
         columns += [band, error_column(band)]
     return columns
+
+
+def check_fluxes(table, bands, user_names=None):
+    """
+    Check that a catalog has fluxes and errors of bands, which are numbers in units of flux densities.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        With fluxes by band and errors ``<band>_err``.
+    bands : iterable of str
+        Bands to check.
+    user_names : dict, optional
+        What the user calls columns, by the names of the table; messages have these.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, or holds no numbers.
+    `~astropy.units.UnitsError`
+        If columns have no unit of flux density.
+    """
+    user_names = user_names or {}
+    labels = {name: user_names.get(name, name) for name in table.colnames}
+    without_unit = []
+    missing = []
+    for band in bands:
+        for name in (band, error_column(band)):
+            if name in table.colnames:
+                _check_numbers(table[name], labels[name])
+                if own_unit(table[name]) is None:
+                    without_unit.append(labels[name])
+            elif name == band:
+                missing.append(band)
+            else:
+                missing.append(error_column(labels.get(band, band)))
+    got = f"columns {list(labels.values())}"
+    check_that(not missing, "photometry", f"a table with the columns {missing}", got)
+    if without_unit:
+        columns = "column"
+        if len(without_unit) > 1:
+            columns = "columns"
+        names = ", ".join(map(repr, without_unit[:_MAX_LISTED]))
+        if len(without_unit) > _MAX_LISTED:
+            names += f" and {len(without_unit) - _MAX_LISTED} more"
+        msg = f"'photometry' {columns} {names} must be convertible to {FNU}, got no unit: give one, as unit='uJy' "
+        msg += "(or 'ABmag', 'mJy') in Python or --flux-unit uJy on the command line"
+        raise u.UnitsError(msg)
+    units = dict.fromkeys(flux_columns(bands), FNU)
+    check_units(table, units, "photometry", user_names=labels)
+
+
+def _check_numbers(column, label):
+    """Refuse a column of fluxes without real numbers, or with several in a row."""
+    column = getattr(column, "unmasked", column)
+    kind = getattr(column, "dtype", np.dtype(float)).kind
+    if kind not in "fiuO":
+        got = _KINDS.get(kind, str(column.dtype))
+        row = None
+        if kind in "US":
+            row = first_word(np.ma.getdata(column))
+        if row is not None:
+            got += f", {column[row]!s:.40} in row {row} (from 0)"
+        raise argument_error("photometry", f"a table with numbers in column {label!r}", got)
+    shape = np.shape(column)
+    wanted = f"a table with a number in each row of column {label!r}"
+    check_that(len(shape) == 1, "photometry", wanted, f"shape {shape}")
 
 
 def table_of_fluxes(ids, bands, flux, flux_err, limit):
@@ -485,17 +553,8 @@ def flux_column(table, name):
     A `ValueError` is raised for one without real numbers, or with several in a row.
     """
     column = table[name]
+    _check_numbers(column, name)
     column = getattr(column, "unmasked", column)
-    kind = getattr(column, "dtype", np.dtype(float)).kind
-    if kind not in "fiuO":
-        wanted = f"a table with numbers in column {name!r}"
-        got = _KINDS.get(kind, str(column.dtype))
-        row = None
-        if kind in "US":
-            row = first_word(np.ma.getdata(column))
-        if row is not None:
-            got += f", {column[row]!s:.40} in row {row} (from 0)"
-        raise argument_error("photometry", wanted, got)
     array = to_array(column, FNU, name, ndim=1).copy()
     array[np.broadcast_to(np.asarray(getattr(table[name], "mask", False)), array.shape)] = np.nan
     return array
