@@ -11,10 +11,10 @@ from miricigale.depth import _core
 from miricigale.depth.published import residual_amplitude
 from miricigale.instrument import (
     DetectorProperties,
-    background_level,
     electrons_per_brightness,
     miri_detector,
 )
+from miricigale.instrument.photometric import chosen_level
 from miricigale.psf import MIRI_PIXEL_SCALE
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import attributes
@@ -31,8 +31,9 @@ class ExposureNoise:
     ----------
     filter : str
         One of `~miricigale.instrument.imager_filters`.
-    background : `~astropy.units.Quantity` or None
-        Surface brightness of sky and telescope; the low background if None.
+    background : `~astropy.units.Quantity`, str or None
+        Surface brightness of sky and telescope, or a level of `~miricigale.instrument.background_level`; the low
+        one if None.
     n_groups : int
         Groups of an integration.
     group_time : float
@@ -62,7 +63,7 @@ class ExposureNoise:
     """
 
     filter: str
-    background: u.Quantity | None
+    background: u.Quantity | str | None
     n_groups: int
     group_time: float
     n_ramps: float
@@ -76,11 +77,7 @@ class ExposureNoise:
             detector = miri_detector()
         else:
             detector = self.detector
-        if self.background is None:
-            level = background_level(self.filter)
-        else:
-            level = self.background
-        value = scalar(level, SURFACE_BRIGHTNESS, "background")
+        value = scalar(chosen_level(self.filter, self.background), SURFACE_BRIGHTNESS, "background")
         check_that(value >= 0, "background", "at least 0", self.background)
         self.__dict__.update(detector=detector, background=value * SURFACE_BRIGHTNESS)
 

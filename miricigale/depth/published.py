@@ -7,6 +7,7 @@ from miricigale.instrument import frame_time, imager_filters
 from miricigale.instrument.published_tables import filter_row, imager_filter, table
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import to_array
 from miricigale.utils.values import value_class
 
@@ -60,6 +61,7 @@ class EtcSetup:
         return n_frames * frame_time(self.readout)
 
 
+@takes_other_keywords
 def etc_setup(filter):
     """
     Return the exposures and extraction behind the published limits: 10 sigma in 10 ks.
@@ -93,6 +95,7 @@ def etc_setup(filter):
     return EtcSetup(f"miri.{name}", radius, radius * common.pop("annulus"), **common, **setup)
 
 
+@takes_other_keywords
 def etc_limit(filter, version="4.0"):
     """
     Point-source limit of the exposure time calculator: 10 sigma in 10 ks.
@@ -120,6 +123,7 @@ def etc_limit(filter, version="4.0"):
     return filter_row(filter)[versions[str(version)]] * u.uJy
 
 
+@takes_other_keywords
 def scaled_limit(filter, time, *, n_sigma=5.0, version="4.0"):
     """
     Return the calculator's limit scaled to another exposure, as the root of the time.
@@ -153,6 +157,7 @@ def scaled_limit(filter, time, *, n_sigma=5.0, version="4.0"):
     return etc_limit(filter, version) * (n_sigma / 10) * np.sqrt(1e4 / seconds)
 
 
+@takes_other_keywords
 def proposal_limit(filter):
     """
     Return the 5-sigma limit that the CEERS proposal quotes for its exposures.
@@ -198,6 +203,7 @@ def residual_presets():
     return tuple(table("etc")["residual"])
 
 
+@takes_other_keywords
 def residual_amplitude(filter, preset="etc"):
     """
     Return the size of the fixed pattern that flat field and sky subtraction leave behind.

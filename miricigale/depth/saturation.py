@@ -180,6 +180,7 @@ def saturation_forecast(exposure, *, background=None, detector=None):
     return fraction
 
 
+@takes_other_keywords
 def saturation_time(filter, *, background=None, detector=None):
     """
     Return the time in which the sky and the dark current fill the well.
@@ -199,6 +200,8 @@ def saturation_time(filter, *, background=None, detector=None):
     """
     if detector is None:
         detector = miri_detector()
+    # an exposure has one
+    filter = getattr(filter, "filter", filter)
     return detector.full_well / electron_rate(filter, background, detector=detector) * u.s
 
 
@@ -244,6 +247,7 @@ def _sources(sources, rate, group, limit, exposure):
     return table
 
 
+@takes_other_keywords
 def forecast_table(forecasts):
     """
     Return the forecasts of several exposures side by side.

@@ -39,6 +39,7 @@ def zodiacal_levels():
     return tuple(dict.fromkeys(map(str, _table()["level"])))
 
 
+@takes_other_keywords
 def zodiacal_factor(filter, level="medium", *, position=None, date=None):
     """
     Zodiacal light over the low one, which `~miricigale.instrument.background_level` takes as its ``zodi``.

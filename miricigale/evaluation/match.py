@@ -8,6 +8,7 @@ from astropy.table import QTable
 from miricigale.utils.arrays import nans
 from miricigale.utils.ids import id_column, ids_and_missing
 from miricigale.utils.options import check_that, check_type
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import at_epoch
 from miricigale.utils.tables import (
     Flags,
@@ -50,6 +51,7 @@ class AssociationFlags(Flags):
 _STATUS = ("matched", "ambiguous", "unmatched")
 
 
+@takes_other_keywords
 def associate(first, second, *, radius):
     """
     Sort the rows of two catalogs into matched, ambiguous and unmatched ones.
@@ -204,6 +206,7 @@ def _at_one_time(first, second):
     return at_epoch(first, epoch, "first"), at_epoch(second, epoch, "second")
 
 
+@takes_other_keywords
 def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     """
     Match a measured catalog to the truth, one to one.

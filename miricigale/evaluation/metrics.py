@@ -9,6 +9,7 @@ from astropy.stats import binom_conf_interval
 from miricigale.utils.arrays import quiet_division
 from miricigale.utils.missing_values import floats, without_mask
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 
 #: abs(dz) / (1 + z) above which a redshift is an outlier.
 OUTLIER = 0.15
@@ -42,6 +43,7 @@ def _plain_values(values, name, dtype):
     return np.asarray(values, dtype)
 
 
+@takes_other_keywords
 def sigma_mad(values, *, axis=None, ignore_nan=False):
     """
     Return the robust scatter: 1.48 times the median absolute deviation from the median.
@@ -149,6 +151,7 @@ class PhotozMetrics:
     n_outliers: int
 
 
+@takes_other_keywords
 def photoz_metrics(z_true, z_fit):
     """
     Compare photometric with true redshifts.
@@ -216,6 +219,7 @@ class RecoveryMetrics:
     sigma_mad: float
 
 
+@takes_other_keywords
 def recovery_metrics(true, measured, *, relative=False):
     """
     Compare measured with true values.

@@ -14,6 +14,7 @@ from miricigale.utils.exceptions import CatalogWarning, argument_error, warn
 from miricigale.utils.files import is_path, reading
 from miricigale.utils.ids import counted_ids, warn_of_duplicates
 from miricigale.utils.missing_values import plain_floats, without_codes
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import own_unit
@@ -24,6 +25,7 @@ _FLAGGED = 1e60
 _FEW = 8
 
 
+@takes_other_keywords
 def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     """
     Read the photometry of a catalog of other people.

@@ -220,6 +220,7 @@ class FilterSet(WithTable):
         return ax
 
 
+@takes_other_keywords
 def filter_table(pattern=""):
     """
     Return the filters whose name holds a text, or that see a wavelength.

@@ -2,6 +2,7 @@
 
 from miricigale.instrument.exposure import Exposure
 from miricigale.utils.options import check_names
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 
 _COUNTS = declared("miricigale.instrument", "ceers.toml")
@@ -10,6 +11,7 @@ _COUNTS = declared("miricigale.instrument", "ceers.toml")
 CEERS_FILTERS = tuple(_COUNTS["whole"])
 
 
+@takes_other_keywords
 def ceers_exposures(pointing, roll, *, filters=None, quick=False):
     """
     Return the exposures of one CEERS/MIRI pointing.

@@ -13,6 +13,7 @@ from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_least, check_positive, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import frozen_array, to_array
 
@@ -262,6 +263,7 @@ def _full_flat(filter, seed):
     return frozen_array(flat, np.float32)
 
 
+@takes_other_keywords
 def flat_field(filter, *, subarray="FULL", seed=_SEED):
     """
     Return the relative response of the pixels: the same for the simulated detector and the reduction.

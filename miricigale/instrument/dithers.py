@@ -17,6 +17,7 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import reading, unpacked_size
 from miricigale.utils.named_values import first_value
 from miricigale.utils.options import check_data, check_names, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import require_columns
 from miricigale.utils.units import ANGLE, check_count, to_array
@@ -74,6 +75,7 @@ def dither_patterns():
     return tuple(patterns)
 
 
+@takes_other_keywords
 def dither_offsets(pattern, n=None, *, start=0):
     """
     Return the offsets of the pointing.
@@ -139,6 +141,7 @@ def dither_offsets(pattern, n=None, *, start=0):
     return offsets[start:last] * ANGLE
 
 
+@takes_other_keywords
 def tile_offsets(n_x, n_y, *, overlap=0.1):
     """
     Return the offsets of the pointings of a mosaic of fields side by side.

@@ -10,12 +10,14 @@ from miricigale.refdata import locate
 from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_least, check_names, check_positive
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import SURFACE_BRIGHTNESS, WAVE, to_array
 
 #: Factor on the low zodiacal light for each name that ``zodi`` may have.
 _ZODI = {"none": 0.0, "low": 1.0}
 
 
+@takes_other_keywords
 def photmjsr(filter, *, gain=None):
     """
     Return the surface brightness per count rate.
@@ -61,6 +63,7 @@ def _zodi_factor(zodi):
     return float(zodi)
 
 
+@takes_other_keywords
 def background_level(filter, *, zodi="low"):
     """
     Return the sky and telescope background of a filter.
@@ -98,6 +101,15 @@ def background_level(filter, *, zodi="low"):
 def _thermal():
     curve = QTable.read(locate("instrument.thermal"), format="ascii.ecsv")
     return np.log(curve["wave"].to_value(WAVE)), np.log(curve["level"].to_value(SURFACE_BRIGHTNESS))
+
+
+def chosen_level(filter, background):
+    """Return a surface brightness: the low background of a filter for None, one of its levels for a text."""
+    if background is None:
+        return background_level(filter)
+    if isinstance(background, str):
+        return background_level(filter, zodi=background)
+    return background
 
 
 def background_spectrum(wave, *, zodi="low"):
@@ -143,6 +155,7 @@ def background_spectrum(wave, *, zodi="low"):
     return level
 
 
+@takes_other_keywords
 def psf_fwhm(filter):
     """
     Return the full width at half maximum of the point-spread function in flight.
@@ -195,6 +208,7 @@ def electrons_per_brightness(filter, detector=None, *, subarray="FULL"):
     return response * detector.gain / photmjsr(filter, gain=detector.gain)
 
 
+@takes_other_keywords
 def electron_rate(filter, background=None, *, detector=None, subarray="FULL"):
     """
     Return the charge that a pixel of the sky collects.
@@ -203,8 +217,8 @@ def electron_rate(filter, background=None, *, detector=None, subarray="FULL"):
     ----------
     filter : str
         One of `imager_filters`.
-    background : `~astropy.units.Quantity`, optional
-        Surface brightness; the low background of the filter if not given.
+    background : `~astropy.units.Quantity` or str, optional
+        Surface brightness, or a level of `background_level`; its low one if not given.
     detector, subarray : optional
         As for `electrons_per_brightness`.
 
@@ -221,9 +235,6 @@ def electron_rate(filter, background=None, *, detector=None, subarray="FULL"):
     """
     if detector is None:
         detector = miri_detector()
-    level = background
-    if background is None:
-        level = background_level(filter)
-    level = to_array(level, SURFACE_BRIGHTNESS, "background")
+    level = to_array(chosen_level(filter, background), SURFACE_BRIGHTNESS, "background")
     electrons = electrons_per_brightness(filter, detector, subarray=subarray)
     return level * electrons + detector.dark_current

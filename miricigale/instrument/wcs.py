@@ -15,6 +15,7 @@ from miricigale.instrument.siaf import (
 from miricigale.instrument.sky_axes import lon_lat, pixel_to_radec
 from miricigale.utils.caching import cached
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import as_position
 from miricigale.utils.units import positive, scalar, to_array
 
@@ -118,6 +119,7 @@ def _sip(subarray):
     return cd, a, b, ap, bp
 
 
+@takes_other_keywords
 def imager_wcs(pointing, roll, *, subarray="FULL"):
     """
     Return the world coordinates of an exposure, as TAN-SIP.
@@ -291,6 +293,7 @@ def pixel_area_map(wcs, shape, out=None):
     return out
 
 
+@takes_other_keywords
 def north_up_wcs(center, pixel_scale, shape):
     """
     Return the undistorted gnomonic coordinates with north up and east left.
@@ -330,6 +333,7 @@ def north_up_wcs(center, pixel_scale, shape):
     return wcs
 
 
+@takes_other_keywords
 def mosaic_wcs(exposures, pixel_scale):
     """
     Return the smallest north-up grid that holds every pixel of the exposures.

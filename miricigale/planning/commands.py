@@ -9,6 +9,7 @@ from astropy.table import QTable
 
 from miricigale.utils.files import make_folder, replacing
 from miricigale.utils.folder import check_folder
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.outputs import check_outputs
 from miricigale.utils.table_files import write_table
 
@@ -55,6 +56,7 @@ def plan_table(*, quick=False):
     return QTable(rows)[order]
 
 
+@takes_other_keywords
 def depth_table(config):
     """
     Return the exposures of all bands of a plan: time, filling of the well by the sky, limits and saturation.
@@ -91,6 +93,7 @@ def depth_table(config):
     return QTable(rows)
 
 
+@takes_other_keywords
 def write_plan(config, folder, *, executor=None, overwrite=False, progress_bar=False):
     """
     Work out a plan and write it.

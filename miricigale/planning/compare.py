@@ -6,6 +6,7 @@ from astropy.table import QTable
 
 from miricigale.evaluation.estimates import weighted_share
 from miricigale.planning.accuracy import sky_weights
+from miricigale.utils.other_keywords import takes_other_keywords
 
 
 def _row(planner, plan, numbers):
@@ -80,6 +81,7 @@ def comparison_table(planner, plans):
     return table
 
 
+@takes_other_keywords
 def area_table(planner, plans):
     """
     Return the depth against area.

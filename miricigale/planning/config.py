@@ -6,6 +6,9 @@ from typing import ClassVar
 from miricigale.depth.fitted import EXCESS
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
 from miricigale.instrument.published_tables import imager_filter
+from miricigale.utils.files import is_path
+from miricigale.utils.options import check_that, check_type
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.workflow.analysis_sections import FitBasics
 from miricigale.workflow.background import check_levels
 from miricigale.workflow.earlier import EarlierKey
@@ -351,6 +354,13 @@ class PlanConfig(Configuration):
         return tuple(sorted(bands, key=imager_filters().index))
 
 
+def check_plan(config):
+    """Refuse what is no `PlanConfig` (a `ValueError`)."""
+    wanted = "a PlanConfig (load_plan(path) or load_plan(overrides={'exposures': {'bands': ['miri.f1500w']}}))"
+    check_type(config, "config", PlanConfig, wanted)
+
+
+@takes_other_keywords
 def load_plan(path=None, *, overrides=None):
     """
     Read the configuration of a plan.
@@ -381,5 +391,7 @@ def load_plan(path=None, *, overrides=None):
     """
     texts = []
     if path is not None:
+        wanted = "the path of a configuration; load_plan(overrides=...) takes a dict of sections"
+        check_that(is_path(path), "path", wanted, type(path).__name__)
         texts = [(str(path), read_text(path))]
     return PlanConfig.from_texts(texts, overrides)

@@ -11,12 +11,12 @@ from miricigale.fitting import GridSettings
 from miricigale.fitting.results.pulls import without_scatter_warnings
 from miricigale.instrument import frame_time, frames_per_group
 from miricigale.planning.accuracy import accuracy
-from miricigale.planning.config import PlanConfig
+from miricigale.planning.config import PlanConfig, check_plan
 from miricigale.planning.exposures import band_plans, wall_clock
 from miricigale.planning.sample import make_sample
 from miricigale.utils.exceptions import config_error
 from miricigale.utils.named_values import places, subset
-from miricigale.utils.options import check_names, check_that, check_type
+from miricigale.utils.options import check_names, check_that
 from miricigale.utils.progress import progress
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.values import value_class
@@ -138,8 +138,7 @@ class Planner:
     def __init__(self, config=None, *, sources=None, executor=None):
         if config is None:
             config = PlanConfig()
-        wanted = "a PlanConfig (load_plan(path) or load_plan(overrides={'exposures': {'bands': ['miri.f1500w']}}))"
-        check_type(config, "config", PlanConfig, wanted)
+        check_plan(config)
         self.config = config
         self.executor = executor
         #: Sources of the caller, if there are any.

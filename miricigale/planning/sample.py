@@ -4,12 +4,14 @@ import astropy.units as u
 import numpy as np
 from astropy.table import vstack
 
+from miricigale.planning.config import check_plan
 from miricigale.refdata import resources
 from miricigale.sed import SEDModel
 from miricigale.utils.arrays import middles, quiet_division
 from miricigale.utils.exceptions import argument_error, config_error
 from miricigale.utils.missing_values import floats, plain_floats
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.random import stream
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import require_columns
@@ -41,6 +43,7 @@ def catalog_area(config, catalog):
     return None
 
 
+@takes_other_keywords
 def make_sample(config, bands, *, executor=None):
     """
     Return the sources with their true parameters and fluxes.
@@ -76,6 +79,7 @@ def make_sample(config, bands, *, executor=None):
     >>> sources = make_sample(config, ["wfc3.f160w", "miri.f770w"])  # doctest: +SKIP
     >>> sources["redshift", "frac_agn", "miri.f770w"]  # doctest: +SKIP
     """
+    check_plan(config)
     seed = config.plan.seed
     rng = stream(seed, "plan", "sample")
     sources, density = _catalog_galaxies(config, executor)

@@ -6,6 +6,7 @@ from photutils.psf import GriddedPSFModel, ImagePSF
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 
 #: Sum of a PSF from which on it was normalized on its grid, and says nothing of the light beyond.
 UNIT_SUM = 0.995
@@ -13,6 +14,7 @@ UNIT_SUM = 0.995
 _LEAST_PART = 0.85
 
 
+@takes_other_keywords
 def as_psf(psf, argument="psf"):
     """
     Return the PSF of whatever a user has for one.

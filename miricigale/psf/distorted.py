@@ -9,9 +9,11 @@ from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.miri import MIRI_PIXEL_SCALE, local_pixel
 from miricigale.utils.arrays import centered
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE
 
 
+@takes_other_keywords
 def undistorted_psf(psf):
     """
     Return the PSF of a place on the imager's array, on square cells.

@@ -9,6 +9,7 @@ from miricigale.filters.band_names import find_filter
 from miricigale.psf import _core
 from miricigale.psf.optics import jwst_constants
 from miricigale.utils.options import check_choice
+from miricigale.utils.other_keywords import takes_other_keywords
 
 #: Effects that a PSF may include, in the order in which they act.
 EFFECTS = ("jitter", "cruciform", "pixel", "ipc")
@@ -47,6 +48,7 @@ def _profile(distance, filter_name, calibration):
     return profile * (0.75 + 0.25 * np.sign(distance - inner))
 
 
+@takes_other_keywords
 def cruciform_fraction(filter_name, *, calibration="flight"):
     """
     Return the light that the detector scatters out of the image's core, into the cross and its halo.

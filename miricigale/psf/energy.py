@@ -12,6 +12,7 @@ from miricigale.psf.by_filter import exposure_psf
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import enclosed_light, instrument_psf
 from miricigale.utils.options import check_choice, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import described_rows
 from miricigale.utils.units import ANGLE, scalar
@@ -24,6 +25,7 @@ def _psf_or_model(psf):
     return instrument_psf(psf)
 
 
+@takes_other_keywords
 def encircled_energy(psf, radius, *, pixel_scale=None):
     """
     Return the fraction of a point source's light inside circles around the center.
@@ -66,6 +68,7 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
     return enclosed_light(psf, data, radius)
 
 
+@takes_other_keywords
 def radius_of_encircled_energy(psf, fraction):
     """
     Return the radius of the circle that holds a fraction of the light.
@@ -108,6 +111,7 @@ def radius_of_encircled_energy(psf, fraction):
     return (cells[k - 1] + part * 0.25) * psf.cell * ANGLE
 
 
+@takes_other_keywords
 def fwhm(psf, *, method="half_maximum"):
     """
     Return the full width at half maximum.
@@ -168,6 +172,7 @@ def _r80(psf):
         return np.nan
 
 
+@takes_other_keywords
 def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
     """
     Tabulate PSFs: width, radius of 80 %, encircled energies.

@@ -14,6 +14,7 @@ from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import middle_pixel
 
 
+@takes_other_keywords
 def psf_grid(psfs, positions):
     """
     Put PSFs of different places in one gridded model.
@@ -46,8 +47,11 @@ def psf_grid(psfs, positions):
     >>> print(f"{psf_at(grid, 50, 20).fwhm:.3f}")
     0.331 arcsec
     """
-    psfs = list(psfs)
-    positions = floats(positions)
+    psfs = alike(psfs, ("oversampling", "frame", "angle", "includes"))
+    try:
+        positions = floats(positions)
+    except (TypeError, ValueError):
+        raise argument_error("positions", "pairs of numbers (x, y)", repr(positions)) from None
     if positions.ndim != 2 or positions.shape != (len(psfs), 2):
         raise argument_error("positions", f"of shape ({len(psfs)}, 2)", positions.shape)
     columns = np.unique(positions[:, 0])
@@ -56,7 +60,6 @@ def psf_grid(psfs, positions):
     n = columns.size * rows.size
     if min(columns.size, rows.size) < 2 or not len(psfs) == len(points) == n:
         raise argument_error("positions", "each point of a rectangular grid", positions.tolist())
-    psfs = alike(psfs, ("oversampling", "frame", "angle", "includes"))
     for i, psf in enumerate(psfs):
         good = np.allclose(psf.origin, middle_pixel(psf.data.shape))
         check_that(good, "psfs", "centered on the middle", f"{psf.origin} (psfs[{i}])")
@@ -160,6 +163,7 @@ def grid_weights(grid, x, y):
     return (np.array(hats[0]) * np.array(hats[1])).T
 
 
+@takes_other_keywords
 def psf_at(grid, x, y):
     """
     Return the PSF of a grid at a position.

@@ -9,8 +9,10 @@ from miricigale.psf.kernel_field import KernelField
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import is_path
+from miricigale.utils.other_keywords import takes_other_keywords
 
 
+@takes_other_keywords
 def as_kernel(kernel):
     """
     Return the kernel of anything that is one.

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Iterable
 
 import astropy.units as u
 import numpy as np
@@ -106,6 +107,7 @@ def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
     return psf.replace(data, frame="sky", angle=grid * u.deg)
 
 
+@takes_other_keywords
 def average_psf(psfs):
     """
     Average PSFs, for instance over dithers or rolls.
@@ -133,8 +135,6 @@ def average_psf(psfs):
     >>> print(f"{both.fwhm:.3f}")
     0.331 arcsec
     """
-    psfs = list(psfs)
-    check_that(psfs, "psfs", "at least one PSF", "none")
     psfs = alike(psfs, ("pixel_scale", "oversampling", "frame", "angle", "includes", "origin"))
     weights = np.full(len(psfs), 1 / len(psfs))
     data = np.tensordot(weights, np.stack([psf.data for psf in psfs]), axes=1)
@@ -143,7 +143,11 @@ def average_psf(psfs):
 
 def alike(psfs, names):
     """Return the PSFs, checked: of one shape, and with the same ``names`` among their facts."""
+    wanted = "a list of PSFs, at least one"
+    is_list = isinstance(psfs, Iterable) and not isinstance(psfs, (str, np.ndarray))
+    check_that(is_list, "psfs", wanted, type(psfs).__name__)
     psfs = [instrument_psf(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
+    check_that(psfs, "psfs", wanted, "none")
     first = psfs[0].facts
     for i, psf in enumerate(psfs[1:], start=1):
         for name in names:

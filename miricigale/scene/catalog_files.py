@@ -12,6 +12,7 @@ from miricigale.refdata import locate, resources
 from miricigale.scene.catalog import CatalogFlags, check_catalog
 from miricigale.utils.exceptions import CatalogWarning, DataError, warn
 from miricigale.utils.files import reading, split_extension
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ab_magnitude
 
 #: Counts of galaxies in K: AB magnitude and log of the number per magnitude and square degree (Weaver et
@@ -27,6 +28,7 @@ _FEW = 20  # sources that counts and colors are not judged by
 _COLOR = 2.2, 2.9
 
 
+@takes_other_keywords
 def read_catalog(path, catalog_map=None, **options):
     """
     Read a catalog of sources.

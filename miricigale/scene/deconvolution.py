@@ -6,8 +6,10 @@ import scipy.fft
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 
 
+@takes_other_keywords
 def deconvolve(image, psf, *, max_gain=3.0):
     """
     Undo the blur of a PSF at the spatial frequencies that it has left.

@@ -14,6 +14,7 @@ from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.highres import highres_image
 from miricigale.sed import SEDModel
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import positive
 
 _CENTER = SkyCoord(53.129, -27.842, unit="deg")
@@ -50,6 +51,7 @@ class ExampleField:
     truth: QTable
 
 
+@takes_other_keywords
 def example_field(filters=("wfc3.f160w", "miri.f770w"), *, size=30 * u.arcsec, seed=1):
     """
     Return the simulated images of a part of GOODS-S, with noise, for examples and first tries.

@@ -10,6 +10,7 @@ from miricigale.instrument import pixel_area_map
 from miricigale.scene.scene import Scene
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import positive
 
@@ -19,6 +20,7 @@ _APERTURE = 0.2 * u.arcsec
 _N_SIGMA = 5
 
 
+@takes_other_keywords
 def depth_to_rms(depth, *, pixel_area):
     """
     Return the noise of a pixel that belongs to a depth in an aperture of 0.2" in radius.
@@ -59,6 +61,7 @@ def depth_to_rms(depth, *, pixel_area):
     return (1e-12 * limit / _N_SIGMA / np.sqrt(n_pixels) / pixel_area)[()]
 
 
+@takes_other_keywords
 def highres_image(
     catalog, *, filter="wfc3.f160w", wcs, psf, depth=_DEPTH, seed=None, noise=None, **options
 ):

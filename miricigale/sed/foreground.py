@@ -12,6 +12,7 @@ from miricigale.utils.caching import cached
 from miricigale.utils.exceptions import argument_error, units_error
 from miricigale.utils.missing_values import floats, mask_of
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, own_unit
@@ -236,6 +237,7 @@ def _band_grid(band, low, high, sed):
     return wave[inside], weights[inside], weights.sum()
 
 
+@takes_other_keywords
 def color_excess(sky, dust_map, *, scale=1.0):
     """
     Return the color excess E(B-V) at positions, by a map.
@@ -283,6 +285,7 @@ def color_excess(sky, dust_map, *, scale=1.0):
     return ebv * u.mag
 
 
+@takes_other_keywords
 def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refuse"):
     """
     Return the Galactic extinction in bands.
@@ -352,6 +355,7 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     return out
 
 
+@takes_other_keywords
 def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="refuse"):
     """
     Free a table of band fluxes from Galactic extinction.

@@ -12,6 +12,7 @@ from miricigale.sed.spectrum import SED
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import without
 from miricigale.utils.options import check_names, check_that, check_type
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import FNU, WAVE, to_array
 
 #: Planck's h c / k in um K.
@@ -69,6 +70,7 @@ def _wavelengths():
 _WAVE_UM = _wavelengths()
 
 
+@takes_other_keywords
 def red_dot(*, atmosphere=None, **parameters):
     r"""
     Return the spectrum of a little red dot.
@@ -165,6 +167,7 @@ def red_dot(*, atmosphere=None, **parameters):
     return SED(_WAVE_UM * WAVE, fnu * FNU, meta={"parameters": quantities})
 
 
+@takes_other_keywords
 def red_dots(axes=None, *, atmospheres=None):
     """
     Return the spectra of little red dots of all values of some axes, for `template_grid` at redshifts.

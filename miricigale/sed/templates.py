@@ -18,6 +18,7 @@ from miricigale.utils.exceptions import ModelWarning, data_error, file_errors, w
 from miricigale.utils.meta import provenance
 from miricigale.utils.missing_values import floats, plain_floats
 from miricigale.utils.options import check_choice, check_data, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import FLAM, FNU, WAVE, is_ascending
@@ -31,6 +32,7 @@ _FAR = 100.0  # um
 _END = 0.95
 
 
+@takes_other_keywords
 def read_spectra(path):
     r"""
     Read spectra, such as those of a library of stars.
@@ -126,6 +128,7 @@ def _stated_units(file, table):
     return stated_units(file, table.colnames)
 
 
+@takes_other_keywords
 def template_grid(spectra, filters, *, beyond="error", redshift=None):
     """
     Return a grid of given spectra, for `~miricigale.fitting.BayesFitter`: at redshift 0, or at redshifts.

@@ -9,6 +9,7 @@ from miricigale.sed.cosmology import COSMOLOGY, distance
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import without_mask
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import LUMINOSITY, to_array
 
 #: nu L_nu at 6 um that the samples of Stern 2015 span, roughly: Seyferts to luminous quasars.
@@ -142,6 +143,7 @@ def band_luminosity(l_x, *, from_band, to_band, photon_index=1.8):
     return np.where(mask, np.nan, values)
 
 
+@takes_other_keywords
 def xray_flux(l_x_2_10, redshift, *, band=(0.5, 7.0) * u.keV, photon_index=1.8, transmission=1.0):
     r"""
     Return the observed X-ray flux of a power law.

@@ -6,7 +6,8 @@ from typing import ClassVar
 
 from miricigale.refdata import resources as known_resources
 from miricigale.utils.exceptions import ConfigError
-from miricigale.utils.options import check_names
+from miricigale.utils.options import check_names, check_type
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.workflow.analysis_sections import (
     ErrorSection,
     FitSection,
@@ -166,6 +167,12 @@ class StudyConfig(Configuration):
             self.check(not self.variants.images, "variants.images", wanted)
 
 
+def check_config(config):
+    """Refuse what is no `StudyConfig` (a `ValueError`)."""
+    wanted = "a StudyConfig (load_config('goodss', quick=True) makes one)"
+    check_type(config, "config", StudyConfig, wanted)
+
+
 def preset_names():
     """
     Return the names of the configurations that come with the package.
@@ -186,6 +193,7 @@ def preset_names():
     return sorted(names)
 
 
+@takes_other_keywords
 def load_config(source, *, quick=False, overrides=None):
     """
     Read a run configuration.

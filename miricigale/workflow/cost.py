@@ -8,6 +8,8 @@ from astropy.table import QTable
 from miricigale.instrument import imager_columns
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import convert_values, first_value
+from miricigale.utils.other_keywords import takes_other_keywords
+from miricigale.workflow.config import check_config
 from miricigale.workflow.stage_list import study_stages
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.grids import grid_of, patch_bands, study_patches
@@ -15,6 +17,7 @@ from miricigale.workflow.stages.inputs import REDSHIFT_STEP, bright_sources, stu
 from miricigale.workflow.truths import study_truths
 
 
+@takes_other_keywords
 def disk_use(config):
     """
     Estimate how many bytes the products of a run take, as `study_cost` has them by stage.
@@ -36,9 +39,11 @@ def disk_use(config):
     >>> print(f"{sum(use.values()) / 1e6:.0f} MB")
     270 MB
     """
+    check_config(config)
     return convert_values(int, _Size(config).disk())
 
 
+@takes_other_keywords
 def study_cost(config):
     """
     Estimate what a run takes: units, processor time, disk and memory by stage.
@@ -64,6 +69,7 @@ def study_cost(config):
     >>> print(cost["units"][cost["stage"] == "exposures"][0], "exposures")
     12 exposures
     """
+    check_config(config)
     size = _Size(config)
     disk = size.disk()
     seconds = size.seconds()

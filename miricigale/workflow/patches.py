@@ -29,6 +29,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file, make_folder
 from miricigale.utils.meta import provenance
 from miricigale.utils.options import check_least, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.outputs import check_output
 from miricigale.utils.package_tables import declared
 from miricigale.utils.table_files import read_table, write_table
@@ -245,6 +246,7 @@ def patch_stages():
     return patch_stage, table_stage
 
 
+@takes_other_keywords
 def measure_patches(
     image,
     highres,

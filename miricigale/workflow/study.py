@@ -9,6 +9,8 @@ from miricigale.depth import saturation_forecast
 from miricigale.filters import Filter
 from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.files import file_place
+from miricigale.utils.other_keywords import takes_other_keywords
+from miricigale.workflow.config import check_config
 from miricigale.workflow.cost import disk_use
 from miricigale.workflow.engine.runner import StudyRunner
 from miricigale.workflow.options import of_option
@@ -25,6 +27,7 @@ from miricigale.workflow.warmup import compile_missing
 MIN_SOURCES = 3
 
 
+@takes_other_keywords
 def check_study(config):
     """
     Refuse what would fail only after hours of work.
@@ -45,6 +48,7 @@ def check_study(config):
     >>> from miricigale.workflow import check_study, load_config
     >>> check_study(load_config("goodss", quick=True))
     """
+    check_config(config)
     for key in ("cutouts", "cutouts_psf"):
         path = getattr(config.perturb, key)
         good = not path or Path(file_place(path)[0]).expanduser().is_file()
@@ -92,6 +96,7 @@ def check_study(config):
             prior_psf(config)
 
 
+@takes_other_keywords(options_of=(StudyRunner,))
 def run_study(config, folder, **options):
     """
     Run all stages of a study in a folder; what stands there and is current is kept.

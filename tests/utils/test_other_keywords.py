@@ -7,6 +7,8 @@ import re
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
 
 import miricigale
 from helpers.errors import refuses, warned
@@ -19,8 +21,13 @@ from miricigale import (
     Reducer,
     Scene,
     depth,
+    evaluation,
+    instrument,
     photometry,
+    planning,
     psf,
+    reduction,
+    workflow,
 )
 from miricigale.reduction import MosaicSettings
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error, warn
@@ -36,7 +43,7 @@ OTHER_KEYWORDS = {
 def called(label):
     """Return what a label of the table stands for: a class or one of its methods."""
     owner = miricigale
-    for module in (psf, depth, photometry):
+    for module in (psf, depth, photometry, evaluation, reduction, workflow):
         if label in module.__all__:
             owner = module
     return operator.attrgetter(label)(owner)
@@ -50,7 +57,7 @@ def test_other_keywords_are_of_arguments(label):
         call = target.__init__
     # what is declared is taken
     assert hasattr(call, "__wrapped__"), label
-    parameters = inspect.signature(target).parameters
+    parameters = {*inspect.signature(target).parameters, *call.keyword_names}
     for other, ours in OTHER_KEYWORDS[label].items():
         assert other not in parameters, other
         is_setting = label == "Reducer" and ours in MosaicSettings.__dataclass_fields__
@@ -105,6 +112,55 @@ def test_functions_take_other_keywords_too():
             0.1 * u.arcsec, normalize=True, error=TypeError)  # fmt: skip
     refuses(r"miri_psf\(\) has no argument 'fov_arcsec'; did you mean 'fov'", psf.miri_psf, "F770W",
             fov_arcsec=3, error=TypeError)  # fmt: skip
+
+
+def test_functions_of_psfs_and_images_take_other_keywords(tmp_path):
+    model = psf.gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=2 * u.arcsec)
+    radius = 0.3 * u.arcsec
+    share = psf.encircled_energy(model, radius)
+    assert psf.encircled_energy(psf=model, r=radius) == share
+    refuses("no argument 'diameter'; circles have radii", psf.encircled_energy, model,
+            diameter=radius, error=TypeError)  # fmt: skip
+    assert psf.fwhm(band="F1500W") == psf.fwhm("F1500W")
+    assert psf.average_psf(psf_list=[model, model]).fwhm == model.fwhm
+    places = [(0, 0), (0, 9), (9, 0), (9, 9)]
+    assert psf.psf_grid([model] * 4, xypos=places).data.shape == (4, *model.data.shape)
+    refuses("weights'; PSFs have the same weight", psf.average_psf, [model], weights=[1],
+            error=TypeError)  # fmt: skip
+    for single in (model, None, "F770W", model.data):
+        refuses("'psfs' must be a list of PSFs, at least one, got", psf.average_psf, single)
+        refuses("'psfs' must be a list of PSFs, at least one, got", psf.psf_grid, single, places)
+    refuses("'psfs' must be a list of PSFs, at least one, got none", psf.average_psf, [])
+    refuses("'positions' must be pairs of numbers", psf.psf_grid, [model] * 4, "corner")
+    refuses("positions are pairs: psf_grid.psfs, list.zip.x, y", psf.psf_grid, [model] * 4, [0],
+            [0], error=TypeError)  # fmt: skip
+    exposure = Exposure("F770W", n_groups=5)
+    assert depth.saturation_time(exposure) == depth.saturation_time(band="F770W", sky="low")
+    dark = depth.saturation_time("F770W", background="none")
+    assert dark > depth.saturation_time("F770W", background=None)
+    data = fits.PrimaryHDU(np.ones((4, 4), np.float32), wcs_header())
+    data.writeto(tmp_path / "sci.fits")
+    path = tmp_path / "sci.fits"
+    image = warned("no map of the noise", photometry.read_mosaic, path, zp=23.9, band="F770W")
+    assert image.meta["filter"] == "miri.f770w"
+    refuses("'path' must be the path of a file", photometry.read_mosaic, ["sci.fits"])
+
+
+def wcs_header():
+    """Return the WCS of a small image as cards."""
+    place = SkyCoord(53, -27, unit="deg")
+    return instrument.north_up_wcs(place, 0.1 * u.arcsec, (4, 4)).to_header()
+
+
+def test_studies_say_what_a_configuration_is():
+    for call in (workflow.check_study, workflow.study_cost, workflow.disk_use):
+        refuses("'config' must be a StudyConfig .load_config.'goodss'", call, "goodss")
+    refuses("'config' must be a StudyConfig", workflow.StudyRunner, {}, "folder", ())
+    refuses("needs 'stages'; run_study.load_config", workflow.StudyRunner, {}, "folder",
+            error=TypeError)  # fmt: skip
+    refuses("needs 'folder'; run_study.load_config", workflow.run_study, {}, error=TypeError)
+    refuses("'config' must be a PlanConfig", planning.make_sample, "goodss", ["F770W"])
+    refuses("overrides=.... takes a dict", planning.load_plan, {"exposures": {}})
 
 
 @takes_other_keywords

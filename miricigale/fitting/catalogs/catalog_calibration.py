@@ -32,6 +32,7 @@ from miricigale.utils.exceptions import OtherResultsError
 from miricigale.utils.files import make_folder
 from miricigale.utils.named_values import places, rows_of
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import WAVE
 
@@ -192,6 +193,7 @@ class SourceSample:
         return self._reader.read(self.table)
 
 
+@takes_other_keywords
 def calibrate_bands(
     fitter,
     photometry,

@@ -17,6 +17,7 @@ from miricigale.utils.arrays import nans
 from miricigale.utils.column_units import quantity_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_names, check_that, check_type
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import (
@@ -33,6 +34,7 @@ _LEVELS = (0.16, 0.84)
 _COLUMNS = declared("miricigale.fitting", "columns.toml")
 
 
+@takes_other_keywords
 def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **options):
     """
     Refit a mock catalog whose true parameters are known: the best models with noise.

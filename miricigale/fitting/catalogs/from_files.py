@@ -9,10 +9,12 @@ from miricigale.fitting.data.likelihood import unused_bands
 from miricigale.fitting.data.nuclei import nucleus_columns
 from miricigale.utils.files import is_path
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 
 log = logging.getLogger(__name__)
 
 
+@takes_other_keywords
 def fit_catalog(
     path,
     output,

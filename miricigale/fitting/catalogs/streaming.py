@@ -51,6 +51,7 @@ from miricigale.utils.ids import Duplicates
 from miricigale.utils.meta import package_version, plain_value, undated
 from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_data, check_that, check_type
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import ascii_ids, read_ids, require_columns
@@ -62,6 +63,7 @@ _WRITING = threading.Lock()
 _PACKAGES = ("numpy", "numba", "astropy")
 
 
+@takes_other_keywords
 def fit_file(
     fitter,
     path_in,

@@ -21,6 +21,7 @@ from miricigale.utils.folder import RecordFolder
 from miricigale.utils.named_values import attributes, subset
 from miricigale.utils.object_rows import ByID
 from miricigale.utils.options import check_data, check_type
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.row_files import write_rows
 from miricigale.utils.store import native, open_parts, write_parts
 from miricigale.utils.table_files import write_ecsv
@@ -240,6 +241,7 @@ def part_ids(path):
     return part_columns(path, "ids")[0]
 
 
+@takes_other_keywords
 def open_results(path, *, partial=False, model=None, curves=()):
     """
     Open the results that `fit_file` wrote.

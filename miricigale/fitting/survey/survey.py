@@ -26,6 +26,7 @@ from miricigale.utils.exceptions import DataError, FitWarning, warn
 from miricigale.utils.files import replacing
 from miricigale.utils.named_values import convert_values
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import column_texts
 from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import described_rows, described_table, require_columns
@@ -288,6 +289,7 @@ def _band_row(band, errors):
     }
 
 
+@takes_other_keywords
 def calibrate(
     fitter,
     photometry,

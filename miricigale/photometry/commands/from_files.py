@@ -9,6 +9,7 @@ from miricigale.photometry.commands.point_files import PointInputs
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import make_folder
 from miricigale.utils.named_values import without_none
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.outputs import check_output, check_outputs
 from miricigale.utils.parallel import check_memory
 from miricigale.utils.progress import progress
@@ -25,6 +26,7 @@ _IN_PATCHES = (
 )
 
 
+@takes_other_keywords
 def measure_files(
     image,
     highres=None,

@@ -28,6 +28,7 @@ from miricigale.photometry.shapes.shapes import Shape, center_change
 from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import at_epoch
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed, stream
@@ -50,6 +51,7 @@ _HALF = 16
 _MOST = 96
 
 
+@takes_other_keywords
 def calibrate_errors(
     photometer,
     image,

@@ -221,6 +221,7 @@ def detect_sources(
     return SegmentationImage(labels), _catalog(objects, detected, labels, arrays, meta)
 
 
+@takes_other_keywords
 def detection_purity(image, *, snr_edges=None, preset="yang2021", **settings):
     """
     Estimate which share of the detections is real, from the image's negative.

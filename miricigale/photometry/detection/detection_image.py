@@ -9,9 +9,11 @@ from miricigale.photometry.images.arrays import image_arrays, same_grid
 from miricigale.photometry.images.mosaics import as_mosaic
 from miricigale.photometry.images.sky_noise import sky_noise
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 
+@takes_other_keywords
 def chi_image(images):
     """
     Add images of several bands up to one in which sources of any color are detected.

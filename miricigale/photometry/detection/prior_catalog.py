@@ -16,6 +16,7 @@ from miricigale.utils.exceptions import CatalogWarning, data_error, warn
 from miricigale.utils.files import is_path, open_fits, split_extension
 from miricigale.utils.ids import counted_ids, id_column
 from miricigale.utils.options import check_data, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import as_positions
 from miricigale.utils.table_formats import table_suffix
 from miricigale.utils.tables import as_table, unique_ids
@@ -27,6 +28,7 @@ _log = logging.getLogger(__name__)
 SEGMENTS = ("SEGMENTATION", "SEGMAP", "SEG", "SCI")
 
 
+@takes_other_keywords
 def read_prior(highres, *, segmentation=None, catalog=None):
     """
     Read the sources of a prior.

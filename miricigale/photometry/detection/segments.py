@@ -9,6 +9,7 @@ from photutils.segmentation import SegmentationImage
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import is_ascending
 
 
@@ -79,6 +80,7 @@ DILATION_RULES = {
 }
 
 
+@takes_other_keywords
 def dilate_segments(segmentation, rule, *, pixel_scale, mask=None):
     """
     Grow segments into the sky around them.

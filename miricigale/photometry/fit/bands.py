@@ -20,9 +20,11 @@ from miricigale.photometry.templates.sources import SourceTemplates
 from miricigale.utils.meta import provenance
 from miricigale.utils.named_values import first_value
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import own_unit
 
 
+@takes_other_keywords
 def measure_bands(images, kernels, templates, **options):
     """
     Measure the same sources on images of several bands.
@@ -189,6 +191,7 @@ def _measure_prior(images, photometers, highres, segmentation, catalog):
     return last_results
 
 
+@takes_other_keywords
 def join_bands(results):
     """
     Put the photometry of several bands in one table, by id.

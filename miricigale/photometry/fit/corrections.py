@@ -11,9 +11,11 @@ from miricigale.photometry.images.arrays import pixel_scale as image_scale
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import ANGLE, FNU, to_array
 
 
+@takes_other_keywords
 def encircled_flux(image, sky, flux, radii):
     """
     Measure the light of point sources within radii, over their true flux.
@@ -83,6 +85,7 @@ def encircled_flux(image, sky, flux, radii):
     )
 
 
+@takes_other_keywords
 def flux_scaling(image, sky, flux, psf):
     """
     Calculate the factor by which an image is multiplied to have the true flux scale.
@@ -140,6 +143,7 @@ def flux_scaling(image, sky, flux, psf):
     return factor, error
 
 
+@takes_other_keywords
 def aperture_correction(psf, radius, *, pixel_scale=None):
     """
     Calculate the factor from light in a circle to total light, for a point source.

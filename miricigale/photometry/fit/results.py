@@ -31,6 +31,7 @@ from miricigale.utils.interactive import Tabular
 from miricigale.utils.missing_values import floats
 from miricigale.utils.named_values import field_names
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import column_texts
 from miricigale.utils.random import check_seed
 from miricigale.utils.region_files import circles, write_circles
@@ -51,6 +52,7 @@ def band_column(key, band):
     return f"{band}_{key}"
 
 
+@takes_other_keywords
 def crowded(sky, flux, *, radius=2 * u.arcsec):
     """
     Find sources that have a neighbor which is bright enough to matter.

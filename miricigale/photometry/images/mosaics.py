@@ -46,6 +46,7 @@ from miricigale.utils.arrays import box_shape, quiet_division
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, data_error, warn
 from miricigale.utils.files import is_path
 from miricigale.utils.options import check_data, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import SURFACE_BRIGHTNESS, scalar
 
 _log = logging.getLogger(__name__)
@@ -56,31 +57,7 @@ _GAINS = ("GAIN", "EGAIN", "CCDGAIN")
 _ODD_SCALE = 10.0
 
 
-def read_mosaic(path, **options):
-    """
-    Read an image of any origin.
-
-    Parameters
-    ----------
-    path : path-like
-        FITS, packed or not; ``file.fits[EXTENSION]`` names an extension.
-    **options
-        Fields of `MosaicFile`: ``filter``, ``unit``, ``zero_point``, ``error``, ``variance``,
-        ``inverse_variance``, ``weight`` and ``background_box``.
-
-    Returns
-    -------
-    image : `~astropy.nddata.CCDData`
-        See `MosaicFile.read`.
-
-    Examples
-    --------
-    >>> from miricigale.photometry import read_mosaic
-    >>> image = read_mosaic("f444w_sci.fits.gz", weight="f444w_wht.fits.gz")  # doctest: +SKIP
-    """
-    return MosaicFile(path, **options).read()
-
-
+@takes_other_keywords
 def as_mosaic(image, argument="image"):
     """
     Make an image of whatever holds one.
@@ -565,6 +542,34 @@ class MosaicFile:
             raise data_error(path, problem) from None
         _log.info("%s: from %s to %s", path, have, wanted**power)
         return values * values.dtype.type(factor)
+
+
+@takes_other_keywords(options_of=(MosaicFile,))
+def read_mosaic(path, **options):
+    """
+    Read an image of any origin.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS, packed or not; ``file.fits[EXTENSION]`` names an extension.
+    **options
+        Fields of `MosaicFile`: ``filter``, ``unit``, ``zero_point``, ``error``, ``variance``,
+        ``inverse_variance``, ``weight`` and ``background_box``.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+        See `MosaicFile.read`.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import read_mosaic
+    >>> image = read_mosaic("f444w_sci.fits.gz", weight="f444w_wht.fits.gz")  # doctest: +SKIP
+    """
+    wanted = "the path of a file; miricigale.photometry.chi_image joins several images"
+    check_that(is_path(path), "path", wanted, type(path).__name__)
+    return MosaicFile(path, **options).read()
 
 
 def _native(data):

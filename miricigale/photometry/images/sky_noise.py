@@ -6,6 +6,7 @@ from astropy.stats import mad_std
 from miricigale.utils.exceptions import PhotometryWarning, argument_error, warn
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import FNU
 
 #: Pixels of the smallest area that counts as filled.
@@ -22,6 +23,7 @@ _WIDTH = 2.0
 _RIM = 3
 
 
+@takes_other_keywords
 def weight_scale(data, weight, *, mask=None):
     """
     Measure the factor between the noise of an image and that of its weights.

@@ -17,6 +17,7 @@ from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import listed_images
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.positions import at_epoch
 from miricigale.utils.units import ANGLE, positive
 
@@ -67,6 +68,7 @@ class Alignment:
     scatter: u.Quantity
 
 
+@takes_other_keywords
 def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     """
     Correct the coordinates of an image by the positions of a catalog.
@@ -126,6 +128,7 @@ def align_to_catalog(image, catalog, *, radius=1 * u.arcsec):
     return aligned, alignment
 
 
+@takes_other_keywords
 def align_images(images, catalog=None, *, radius=1 * u.arcsec, groups=None):
     """
     Align images to each other, or to a catalog.

@@ -24,6 +24,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.named_values import field_values, subset, without
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.package_tables import declared
 from miricigale.utils.progress import progress
 from miricigale.utils.table_files import write_table
@@ -39,6 +40,7 @@ _VERSION = 8
 _ERRORS = (ArithmeticError, ImportError, KeyError, MemoryError, OSError, ValueError)
 
 
+@takes_other_keywords
 def reduce_files(
     paths,
     folder,

@@ -28,6 +28,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import listed_images
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.values import value_class
 
 # pixels of the boxes by which the variance that gives weights is smoothed
@@ -236,6 +237,7 @@ def weight_map(source):
     return np.where(bad, 0.0, 1.0 / smooth).astype(np.float32)
 
 
+@takes_other_keywords
 def noise_correction(pixfrac, ratio):
     """
     Return the noise of large areas of a drizzled image over what its pixels' noise says.
@@ -269,6 +271,7 @@ def noise_correction(pixfrac, ratio):
     return 1 / (1 - r / 3)
 
 
+@takes_other_keywords
 def drizzle_images(images, wcs, *, pixfrac=1.0, weights=None, pixel_maps=None, variances=()):
     """
     Drizzle images onto one grid.

@@ -17,6 +17,7 @@ from miricigale.reduction.mosaic.mosaic import add_image, extent_of, pixel_maps_
 from miricigale.utils.arrays import box_shape
 from miricigale.utils.files import listed_images
 from miricigale.utils.options import check_positive
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.parallel import chunks
 from miricigale.utils.values import value_class
 
@@ -35,6 +36,7 @@ _STAR_SHARE = 0.1
 _NOISE_SLOPES = 2.0
 
 
+@takes_other_keywords
 def reject_outliers(images, wcs, *, threshold=5.0, weights=None, pixel_maps=None):
     """
     Mask pixels that disagree with the other dithers.

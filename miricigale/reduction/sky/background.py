@@ -12,6 +12,7 @@ from miricigale.reduction.sky.sky_mesh import SkyMesh, sky_boxes
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import ReductionWarning, warn
 from miricigale.utils.options import check_choice, check_least, check_positive, check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.tables import Flags
 from miricigale.utils.values import value_class
 
@@ -126,6 +127,7 @@ class Background:
         )
 
 
+@takes_other_keywords
 def estimate_background(image, *, method="masked", box=64, filter_size=3, plane=True, warn=True):
     """
     Estimate the background of an image, masking what stands above it.
@@ -385,6 +387,7 @@ def _sep_background(data, mask, box, filter_size, correlation):
     return Background(level, rms, error, np.zeros(mask.shape, bool), box, filter_size, flags)
 
 
+@takes_other_keywords
 def remove_background(image, background, *, negative_threshold=10.0, negative_noise="larger"):
     """
     Take a background off an image and mask what lies far below it.

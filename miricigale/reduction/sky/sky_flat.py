@@ -13,11 +13,13 @@ from miricigale.reduction.sky.sky_mesh import sky_boxes
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import listed_images
 from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 
 #: Pixels over which the flat is smoothed.
 _BOX = 16
 
 
+@takes_other_keywords
 def sky_flats(images, *, window=None):
     """
     Return the flat field of each of several exposures, from the sky of the others.

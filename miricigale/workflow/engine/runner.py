@@ -15,6 +15,8 @@ from pathlib import Path
 from miricigale.refdata.lookup import fingerprint
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, OtherResultsError
 from miricigale.utils.named_values import convert_values
+from miricigale.utils.options import check_that
+from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import print_line
 from miricigale.workflow.engine.display import Display
@@ -33,6 +35,7 @@ _REMEDY = "redo=True to replace it"
 _NAMED = 5
 
 
+@takes_other_keywords
 class StudyRunner:
     """
     Runs a study in a folder.
@@ -92,6 +95,9 @@ class StudyRunner:
         prepare=None,
         progress_bar=False,
     ):
+        # other runs have configurations of their own
+        wanted = "a StudyConfig (load_config('goodss', quick=True) makes one)"
+        check_that(hasattr(config, "run"), "config", wanted, type(config).__name__)
         self.config = config
         self.folder = Path(folder)
         if callable(stages):
