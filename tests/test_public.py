@@ -45,6 +45,33 @@ def test_the_classes_of_the_package_import_from_it():
     assert caught.value.name == "FitResult"
 
 
+@pytest.mark.parametrize("subpackage", SUBPACKAGES)
+def test_public_classes_say_what_an_object_is(subpackage):
+    module = importlib.import_module(f"miricigale.{subpackage}")
+    for name in module.__all__:
+        cls = getattr(module, name)
+        if isinstance(cls, type):
+            assert cls.__repr__ is not object.__repr__, f"{subpackage}.{name}"
+
+
+def test_objects_say_what_they_are(objects, tmp_path):
+    results = objects["results"][0]
+    assert "results.loc[id] of <FitResults of 3 objects" in repr(results.loc)
+    assert repr(results.write) == "<method FitResults.write>"
+    assert repr(objects["model"][0].chain).startswith("<Chain of ")
+    assert repr(miricigale.workflow.ProductStore(tmp_path)) == f"<ProductStore {tmp_path}>"
+    page = miricigale.pages.Page("Depths")
+    assert repr(page) == "<Page 'Depths', 0 sections>"
+    assert repr(miricigale.pages.SectionWriter(page, {})) == f"<SectionWriter of {page!r}>"
+    config = miricigale.workflow.load_config("goodss", quick=True)
+    assert repr(miricigale.workflow.Context(config, tmp_path)) == f"<Context in {tmp_path}>"
+    exposure = objects["exposure"][0]
+    block = miricigale.detector.Block(exposure, None, slice(0, 64), None, None, None)
+    assert repr(block) == f"<Block of rows 0 to 64, {exposure!r}>"
+    study = miricigale.evaluation.StudyResults((), ("miri.f770w",))
+    assert repr(study) == "<StudyResults of no truth: miri.f770w>"
+
+
 def test_names_that_a_subpackage_lacks_end_in_what_to_write():
     from miricigale import depth, psf
 

@@ -192,6 +192,10 @@ class StudyResults:
     etc_limits: dict = dataclasses.field(default_factory=dict)
     extra: dict = dataclasses.field(default_factory=dict)
 
+    def __repr__(self):
+        names = ", ".join(truth.name for truth in self.truths)
+        return f"<StudyResults of {names or 'no truth'}: {', '.join(self.bands)}>"
+
     def at(self, frac_agn):
         """Return the truth of an AGN fraction, or None."""
         for sky in self.truths:

@@ -36,6 +36,10 @@ class Page:
         self.dpi = dpi
         self._sections = []
 
+    def __repr__(self):
+        n = len(self._sections)
+        return f"<Page {self.title!r}, {n} section{'s' * (n != 1)}>"
+
     def section(self, title, text="", *, closed=""):
         """Begin a section with an optional paragraph; a ``closed`` one shows that line until it is opened."""
         self._sections.append((title, [], closed))

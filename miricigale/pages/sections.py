@@ -52,6 +52,9 @@ class SectionWriter:
         self.texts = texts
         self._section = None
 
+    def __repr__(self):
+        return f"<{type(self).__name__} of {self.report!r}>"
+
     def sentence(self, name, /, **facts):
         """Return a sentence of the current section, filled with the facts of all and further ones."""
         return sentence(self.texts[self._section][name], self.facts | facts)

@@ -126,6 +126,10 @@ class Chain:
         for name in _KEEPING.split():
             setattr(self, name, cached(getattr(self, name), maxsize=MAX_KEPT))
 
+    def __repr__(self):
+        components = [type(part).__name__ for part in self.by_role.values() if part is not None]
+        return f"<Chain of {', '.join(components)}>"
+
     def _functionals(self):
         wave = self.wave
         n = self.wave.size

@@ -37,6 +37,9 @@ class _Method(UnifiedReadWrite):
         msg = f"{path} must end in one of {', '.join(suffixes)}, or 'format' be one of {formats}"
         raise registry.IORegistryError(msg)
 
+    def __repr__(self):
+        return f"<method {self._cls.__name__}.{self.method}>"
+
 
 class _Read(_Method):
     """

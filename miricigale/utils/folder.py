@@ -37,6 +37,9 @@ class FileFolder:
     def __init__(self, folder):
         self.folder = Path(folder)
 
+    def __repr__(self):
+        return f"<{type(self).__name__} {self.folder}>"
+
     def path(self, name):
         """
         Path of a file.

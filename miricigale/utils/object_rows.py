@@ -319,6 +319,9 @@ class ByID:
     def __init__(self, rows):
         self._rows = rows
 
+    def __repr__(self):
+        return f"<objects by id: results.loc[id] of {self._rows!r}>"
+
     def __getitem__(self, key):
         if isinstance(key, (list, np.ndarray)) and np.ndim(key):
             return self._rows[[self._rows.row(id_) for id_ in key]]

@@ -69,6 +69,10 @@ class Block(Timed):
     key: np.ndarray
     previous: tuple = ()
 
+    def __repr__(self):
+        name = type(self).__name__
+        return f"<{name} of rows {self.rows.start} to {self.rows.stop}, {self.exposure!r}>"
+
     @property
     def reference(self):
         """True where a pixel is a reference pixel, (n_row, n_col)."""

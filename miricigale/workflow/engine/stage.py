@@ -272,6 +272,12 @@ class Context:
         else:
             self._inputs = frozenset(inputs)
 
+    def __repr__(self):
+        stage = ""
+        if self._name:
+            stage = f" of stage {self._name!r}"
+        return f"<Context{stage} in {self.products.folder}>"
+
     def path(self, name):
         """Return the path of a product that an earlier stage wrote."""
         if self._inputs is not None and name not in self._inputs:
