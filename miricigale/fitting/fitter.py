@@ -449,7 +449,7 @@ class BayesFitter(CatalogFits):
         pairs=None,
         seed=None,
         executor=None,
-        progress_bar=False,
+        progress_bar=None,
         chunk_size=None,
     ):
         """
@@ -486,7 +486,7 @@ class BayesFitter(CatalogFits):
             Fits pieces of the catalog at the same time; the answer is the same. Threads serve well
             on a grid, whose kernels hold no lock, processes for samplers, which are Python.
         progress_bar : bool, optional
-            Whether to show one.
+            Whether to show one; by default in interactive sessions, after some seconds.
         chunk_size : int, optional
             Objects in a piece: by default 64 on a grid, more (up to 1024) on one of few models, 1 for a sampler.
 
@@ -550,7 +550,7 @@ class BayesFitter(CatalogFits):
         redshift=None,
         redshift_prior=None,
         executor=None,
-        progress_bar=False,
+        progress_bar=None,
     ):
         """
         Draw models from the posterior of every object.

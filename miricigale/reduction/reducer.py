@@ -415,7 +415,7 @@ class Reducer(Interactive):
         return rate, *self.subtract_background(exposure)
 
     @takes_other_keywords
-    def run(self, ramps, *, wcs=None, pixel_scale=None, align=None, progress_bar=False):
+    def run(self, ramps, *, wcs=None, pixel_scale=None, align=None, progress_bar=None):
         """
         Reduce the dithers of one filter.
 
@@ -434,7 +434,7 @@ class Reducer(Interactive):
             Positions of a catalog to which the images are aligned (`align_images`), or to each other, the images
             of a visit together with ``"visits"``; not at all by default.
         progress_bar : bool, optional
-            Whether a progress bar is shown.
+            Whether a progress bar is shown; by default in interactive sessions, after some seconds.
 
         Returns
         -------

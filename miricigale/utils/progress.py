@@ -1,4 +1,4 @@
-"""Progress: off in the API unless asked for, on in the command line."""
+"""Progress: on in the command line, and for long work in sessions; off in scripts unless asked for."""
 
 import contextlib
 import sys
@@ -8,6 +8,18 @@ from tqdm import tqdm
 
 #: Seconds between lines where no bar is drawn.
 _EVERY = 60.0
+
+
+#: Seconds after which a bar that nobody asked for is drawn.
+_DELAY = 3.0
+
+
+def in_session():
+    """Whether a person waits at a prompt or a notebook, where a bar can be drawn."""
+    if "ipykernel" in sys.modules:
+        return True
+    at_prompt = hasattr(sys, "ps1") or bool(sys.flags.interactive)
+    return at_prompt and sys.stderr.isatty()
 
 
 def on_terminal():
@@ -82,7 +94,7 @@ def progress(iterable=None, *, show=False, total=None, desc=None, unit="it"):
     iterable : iterable, optional
         What is looped over; without it the caller calls ``update``.
     show : bool, optional
-        Whether anything is shown.
+        Whether anything is shown; for None a bar in sessions alone (`in_session`), of loops after some seconds.
     total : int, optional
         Number of steps.
     desc, unit : str, optional
@@ -93,10 +105,14 @@ def progress(iterable=None, *, show=False, total=None, desc=None, unit="it"):
     bar : `tqdm.auto.tqdm` or an object with the same ``update``, ``set_description`` and ``close``
         A bar; where stderr is no terminal, lines: one at the end and one a minute.
     """
+    delay = 0.0
+    if show is None:
+        show = in_session()
+        delay = _DELAY
     if not (show and on_terminal()):
         # without tqdm, whose semaphore outlives a process that is stopped
         return _Lines(iterable, total, desc, unit, show)
     # the notebook's bar is slow to import
     from tqdm.auto import tqdm
 
-    return tqdm(iterable, total=total, desc=desc, unit=unit, leave=False)
+    return tqdm(iterable, total=total, desc=desc, unit=unit, leave=False, delay=delay)

@@ -24,6 +24,7 @@ from miricigale.photometry.fit.offsets import (
     shrunk_offsets,
     source_offsets,
 )
+from miricigale.photometry.fit.progress import measurement_steps
 from miricigale.photometry.fit.result_table import CatalogRows, warn_of_none
 from miricigale.photometry.images.arrays import (
     fit_arrays,
@@ -51,7 +52,9 @@ _MAX_SHIFT_STEPS = 8
 _REFINED = 2
 
 
-def measure_exposures(photometer, images, highres, segmentation, catalog, *, templates):
+def measure_exposures(
+    photometer, images, highres, segmentation, catalog, *, templates, progress_bar=None
+):
     """
     Measure the sources of a catalog on exposures that are fitted together.
 
@@ -61,7 +64,7 @@ def measure_exposures(photometer, images, highres, segmentation, catalog, *, tem
         The settings; its kernel is one for all exposures, or `ExposureKernels`.
     images : sequence
         The exposures, each as the image of `~miricigale.photometry.ForcedPhotometer.measure`.
-    highres, segmentation, catalog, templates
+    highres, segmentation, catalog, templates, progress_bar
         As for `~miricigale.photometry.ForcedPhotometer.measure`.
 
     Returns
@@ -87,26 +90,32 @@ def measure_exposures(photometer, images, highres, segmentation, catalog, *, tem
         exposure = fit_arrays(image, f"image[{k}]")
         arrays.append(exposure)
         placed.append(Placement.of(settings[k], exposure, sources.sky))
-    # templates of those sources alone that an exposure shows
-    near_rows = np.unique(np.concatenate([place.near_rows for place in placed]))
-    warn_of_none(sources, near_rows, "the exposures")
-    if templates is None:
-        highres, segmentation, catalog = prior
-        templates = photometer._templates(highres, segmentation, catalog[near_rows])
-    else:
-        templates = templates[near_rows]
-    photometer._check_grid(templates)
-    # a common plane, for the search of new sources and for pictures
-    plane = _plane(arrays)
-    margin = max(place.margin for place in placed)
-    xy = sky_pixels(sources.sky, plane.wcs, plane.shape, margin)
-    rows = CatalogRows.of(sources, xy, near_rows, templates)
-    meta = photometer._meta_of(images[0], templates)
-    with threads(photometer.n_threads) as executor, single_threaded():
-        joint = _Joint(photometer, plane, rows)
-        joint.place(placed, templates, executor)
-        fit, new_xy, evidence, offsets = joint.fit_all()
-        return joint_result(fit, plane, images, rows, new_xy, evidence, offsets, meta)
+    n_pixels = sum(exposure.flux.size for exposure in arrays)
+    with measurement_steps(progress_bar, n_pixels) as steps:
+        # templates of those sources alone that an exposure shows
+        near_rows = np.unique(np.concatenate([place.near_rows for place in placed]))
+        warn_of_none(sources, near_rows, "the exposures")
+        if templates is None:
+            highres, segmentation, catalog = prior
+            steps.begin("templates")
+            templates = photometer._templates(highres, segmentation, catalog[near_rows])
+        else:
+            templates = templates[near_rows]
+        photometer._check_grid(templates)
+        # a common plane, for the search of new sources and for pictures
+        plane = _plane(arrays)
+        margin = max(place.margin for place in placed)
+        xy = sky_pixels(sources.sky, plane.wcs, plane.shape, margin)
+        rows = CatalogRows.of(sources, xy, near_rows, templates)
+        meta = photometer._meta_of(images[0], templates)
+        with threads(photometer.n_threads) as executor, single_threaded():
+            joint = _Joint(photometer, plane, rows)
+            steps.begin("templates on the exposures")
+            joint.place(placed, templates, executor)
+            steps.begin("fit")
+            fit, new_xy, evidence, offsets = joint.fit_all()
+            steps.begin("errors")
+            return joint_result(fit, plane, images, rows, new_xy, evidence, offsets, meta)
 
 
 def _opened(images):

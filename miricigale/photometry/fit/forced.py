@@ -17,6 +17,7 @@ from miricigale.photometry.detection.prior_catalog import (
 from miricigale.photometry.fit.chosen_kernel import SampledPSFs, check_one_band, chosen_kernel
 from miricigale.photometry.fit.exposure_kernels import ExposureKernels, are_exposures
 from miricigale.photometry.fit.fit_loop import fit_image
+from miricigale.photometry.fit.progress import measurement_steps
 from miricigale.photometry.fit.result_table import CatalogRows, NewSources, package, warn_of_none
 from miricigale.photometry.fit.settings import ErrorSettings, MemorySettings
 from miricigale.photometry.fit.stars import with_stars
@@ -230,7 +231,16 @@ class ForcedPhotometer(Interactive):
         return field_values(self)
 
     @takes_other_keywords
-    def measure(self, image, highres=None, segmentation=None, catalog=None, *, templates=None):
+    def measure(
+        self,
+        image,
+        highres=None,
+        segmentation=None,
+        catalog=None,
+        *,
+        templates=None,
+        progress_bar=None,
+    ):
         """
         Measure all sources of a catalog.
 
@@ -253,6 +263,9 @@ class ForcedPhotometer(Interactive):
         templates : `SourceTemplates`, optional
             What the sources look like, in place of the three above, made once for several
             images. The settings ``template`` and ``wings`` are then theirs.
+        progress_bar : bool, optional
+            Whether the steps are shown; by default in interactive sessions, for images of more than 0.2
+            megapixels.
 
         Returns
         -------
@@ -288,12 +301,19 @@ class ForcedPhotometer(Interactive):
             if highres is not None:
                 highres = as_mosaic(highres, "highres")
             options = {"segmentation": segmentation, "catalog": catalog, "templates": templates}
+            options["progress_bar"] = progress_bar
             return self.on_pixels(image, highres).measure(image, highres, **options)
         if are_exposures(image):
             from miricigale.photometry.fit.exposure_photometry import measure_exposures
 
             return measure_exposures(
-                self, image, highres, segmentation, catalog, templates=templates
+                self,
+                image,
+                highres,
+                segmentation,
+                catalog,
+                templates=templates,
+                progress_bar=progress_bar,
             )
         if isinstance(self.kernel, ExposureKernels):
             wanted = f"{len(self.kernel)} exposures, one for each kernel"
@@ -306,9 +326,11 @@ class ForcedPhotometer(Interactive):
             catalog_sources = QTable({"id": sources.id, "sky": sources.sky})
             sharp = prior and prior[0]
             photometer, stars = with_stars(self, image, catalog_sources, sharp, sources.wcs)
-            result = photometer.measure(image, *(prior or ()), templates=templates)
+            options = {"templates": templates, "progress_bar": progress_bar}
+            result = photometer.measure(image, *(prior or ()), **options)
             return stars.noted(result)
-        return self._measured(image, arrays, sources, prior=prior)
+        with measurement_steps(progress_bar, arrays.flux.size) as steps:
+            return self._measured(image, arrays, sources, prior=prior, steps=steps)
 
     def on_pixels(self, image, highres=None):
         """
@@ -356,14 +378,16 @@ class ForcedPhotometer(Interactive):
         if are_exposures(image) or (self.psf_stars is not False and not self.bare):
             return self.measure(image, templates=templates)
         image = own_pixels(as_mosaic(image, "image"))
-        return self._measured(image, fit_arrays(image, "image"), templates, until_new=True)
+        arrays = fit_arrays(image, "image")
+        with measurement_steps(False, arrays.flux.size) as steps:
+            return self._measured(image, arrays, templates, until_new=True, steps=steps)
 
-    def _measured(self, image, arrays, sources, *, prior=None, until_new=False):
+    def _measured(self, image, arrays, sources, *, prior=None, until_new=False, steps):
         """
         Measure sources on an image, ``arrays`` being its pixels.
 
         Their templates are made of the ``prior`` (high-resolution image, segments and catalog), or else they are
-        templates already. With ``until_new`` it is as `_measure_or_find`.
+        templates already. With ``until_new`` it is as `_measure_or_find`; ``steps`` is of `measurement_steps`.
         """
         # sources on or near the image, and their templates
         place = Placement.of(self, arrays, sources.sky)
@@ -372,6 +396,7 @@ class ForcedPhotometer(Interactive):
             templates = sources[place.near_rows]
         else:
             highres, segmentation, catalog = prior
+            steps.begin("templates")
             templates = self._templates(highres, segmentation, catalog[place.near_rows])
             # models and stamps of the fits to the prior
             return_freed_memory()
@@ -381,13 +406,16 @@ class ForcedPhotometer(Interactive):
         if "repeated_pixels" in image.meta:
             meta["repeated_pixels"] = image.meta["repeated_pixels"]
         with threads(self.n_threads) as executor, single_threaded():
+            steps.begin("templates on the image")
             bank = place.bank(rows.near_rows, templates, executor)
             grid = place.grid(templates)
+            steps.begin("fit")
             fit, diagnostics, new_xy = fit_image(
                 arrays, bank, self, rows, grid, until_new=until_new
             )
             if diagnostics is None:
                 return NewSources.of(fit, new_xy, rows)
+            steps.begin("errors")
             result = package(fit, diagnostics, new_xy, rows, meta)
         if self.background_order is None:
             warn_of_background(result, self.mean_kernel)
