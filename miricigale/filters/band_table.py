@@ -1,12 +1,10 @@
 """Tables whose columns of bands are found by any name of the band."""
 
-from astropy.table import QTable
-
 from miricigale.filters.band_names import find_filter
-from miricigale.utils.table_files import write_table
+from miricigale.utils.result_table import ResultTable
 
 
-class BandTable(QTable):
+class BandTable(ResultTable):
     """
     A `~astropy.table.QTable` in which ``table["F770W"]`` is the column ``miri.f770w``.
 
@@ -30,19 +28,6 @@ class BandTable(QTable):
         elif isinstance(item, (list, tuple)) and all(isinstance(name, str) for name in item):
             item = [self._column_name(name) for name in item]
         return super().__getitem__(item)
-
-    def write(self, *args, **options):
-        """
-        Write the table, as `astropy.table.Table.write` does.
-
-        Where the name of the file alone says that it is FITS, the metadata are kept as JSON in the card ``META``,
-        and the unit dex, which FITS does not know: astropy leaves both out with a warning for each.
-        """
-        is_fits = len(args) == 1 and str(args[0]).lower().endswith((".fits", ".fits.gz"))
-        if is_fits and set(options) <= {"overwrite"}:
-            write_table(self, args[0], **options)
-        else:
-            super().write(*args, **options)
 
     def _column_name(self, name):
         """Return the name of a column by another name of its band; itself if there is none."""

@@ -105,8 +105,16 @@ def fits_meta(meta):
 
 def full_meta(meta):
     """The meta dictionary that `fits_meta` put into a header; of other headers what they hold."""
-    if "META" in meta:
-        return json.loads(meta["META"])
+    text = meta.get("META")
+    if not isinstance(text, str):
+        return dict(meta)
+    try:
+        values = json.loads(text)
+    except ValueError:
+        # a keyword of another program
+        return dict(meta)
+    if isinstance(values, dict):
+        return values
     return dict(meta)
 
 

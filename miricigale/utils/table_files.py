@@ -31,7 +31,7 @@ from miricigale.utils.fits_tables import (
     table_read,
 )
 from miricigale.utils.ids import is_id_name
-from miricigale.utils.meta import plain_value
+from miricigale.utils.meta import full_meta, plain_value
 from miricigale.utils.optional_packages import require
 from miricigale.utils.options import check_that
 from miricigale.utils.positions import sky_as_angles
@@ -124,6 +124,7 @@ def _read_fits(path, wanted, hdu):
         table = Table.read(hdus, format="fits", character_as_bytes=False, hdu=hdu)
         mask_scaled_nulls(table, read)
         leave_ragged_out(table, read, Path(path).name)
+        table.meta = full_meta(table.meta)
         return table
 
 

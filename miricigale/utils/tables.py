@@ -145,16 +145,16 @@ def described_table(columns, meta=None, *, cls=None):
     meta : dict, optional
         Provenance.
     cls : type, optional
-        Class of the table; `~astropy.table.QTable` by default.
+        Class of the table, a `~astropy.table.QTable`; by default one that FITS files keep with its meta.
 
     Returns
     -------
     table : `~astropy.table.QTable`
         With copies of the values.
     """
-    from astropy.table import QTable
+    from miricigale.utils.result_table import ResultTable
 
-    cls = cls or QTable
+    cls = cls or ResultTable
     table = cls({name: values for name, (values, _) in columns.items()}, meta=meta, copy=True)
     for name, (_, text) in columns.items():
         table[name].info.description = text

@@ -4,14 +4,17 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
+from miricigale.utils.table_files import read_table
 from miricigale.utils.tables import (
     Flags,
     ascii_ids,
     described_rows,
+    described_table,
     match_sky,
     require_columns,
 )
@@ -91,3 +94,19 @@ def test_ids_that_fits_does_not_hold_are_refused():
     ids = ["a", "Kümmel", "b ", "\N{GREEK SMALL LETTER ALPHA}", "c", "😀"]
     refuses(r"'catalog' must be ASCII.* got 'Kümmel', 'b ', 'α' and 1", ascii_ids, ids, "catalog")
     refuses(r"got 'b '$", ascii_ids, ["a", "b "], "ids")
+
+
+def test_tables_of_results_keep_their_metadata_in_fits_without_warnings(tmp_path, recwarn):
+    meta = {"pixel_scale": 0.06, "correlated_noise": True, "offset": [0.1, -0.2], "filter": "F770W"}
+    table = described_table({"flux": ([1.0] * u.uJy, "Total flux")}, meta)
+    path = tmp_path / "fluxes.fits"
+    table.write(path)
+    assert not recwarn.list
+    again = read_table(path, wanted="a table")
+    assert again.meta == meta
+    assert again["flux"].info.description == "Total flux"
+    # and any reader of FITS finds numbers and short texts on cards
+    header = fits.getheader(path, 1)
+    for name in ("pixel_scale", "correlated_noise", "filter"):
+        assert header[name] == meta[name]
+    assert isinstance(table[:1], type(table))

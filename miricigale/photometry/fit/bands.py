@@ -21,6 +21,7 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.named_values import first_value
 from miricigale.utils.options import check_that
 from miricigale.utils.other_keywords import takes_other_keywords
+from miricigale.utils.result_table import ResultTable
 from miricigale.utils.units import own_unit
 
 
@@ -246,7 +247,7 @@ def join_bands(results):
     meta = provenance(stage="photometry")
     if bands:
         meta["bands"] = bands
-    joined = QTable(meta=meta)
+    joined = ResultTable(meta=meta)
     first = first_value(tables)
     joined["id"] = np.array(ids) if ids else np.asarray(first["id"])[:0]
     if all(np.array_equal(table["id"], first["id"]) for table in tables.values()):
