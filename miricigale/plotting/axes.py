@@ -222,3 +222,28 @@ def resolve_axes(ax):
     if plt.get_fignums() and plt.gcf() in _PANEL_FIGURES:
         return plt.figure().gca()
     return plt.gca()
+
+
+def plain_log_ticks(*axes):
+    """
+    Label logarithmic axes with plain numbers from 0.001 to 1000, where matplotlib writes powers of ten.
+
+    Parameters
+    ----------
+    *axes : `~matplotlib.axis.Axis`
+        Such as ``ax.xaxis``; linear ones stay as they are.
+    """
+    from matplotlib.ticker import LogFormatterSciNotation
+
+    class PlainNumbers(LogFormatterSciNotation):
+        def __call__(self, x, pos=None):
+            text = super().__call__(x, pos)
+            # empty where there is no space for a label
+            if text and 1e-3 <= abs(x) <= 1e3:
+                return f"{x:g}"
+            return text
+
+    for axis in axes:
+        if axis.get_scale() == "log":
+            axis.set_major_formatter(PlainNumbers())
+            axis.set_minor_formatter(PlainNumbers(minor_thresholds=(1.0, 0.4)))

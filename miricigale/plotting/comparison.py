@@ -2,7 +2,15 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, plain_text, resolve_axes
+from miricigale.plotting.axes import (
+    MEASURED,
+    SECOND,
+    TRUE,
+    legend,
+    plain_log_ticks,
+    plain_text,
+    resolve_axes,
+)
 
 #: dz / (1 + z) beyond which a redshift is an outlier.
 _OUTLIER = 0.15
@@ -153,6 +161,7 @@ def plot_relation(x, y, *, lines=(), ax=None, labels=("", "")):
     """
     ax = resolve_axes(ax)
     ax.loglog(x, y, ".", ms=4, color=MEASURED, alpha=0.6)
+    plain_log_ticks(ax.xaxis, ax.yaxis)
     for k, (line_x, line_y, label) in enumerate(lines):
         ax.plot(line_x, line_y, color=TRUE, lw=1.4, ls=("-", "--", ":", "-.")[k % 4], label=label)
     ax.set(xlabel=labels[0], ylabel=labels[1])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import legend, plain_text, resolve_axes
+from miricigale.plotting.axes import legend, plain_log_ticks, plain_text, resolve_axes
 
 
 def plot_filters(curves, ax=None, **kwargs):
@@ -62,5 +62,6 @@ def plot_spectrum(wave, fnu, ax=None, *, rest_frame=False, label_y=r"$F_\nu$ (µ
         frame = "rest"
     fnu = np.where(np.asarray(fnu) > 0.0, fnu, np.nan)
     ax.loglog(wave, fnu, **kwargs)
+    plain_log_ticks(ax.xaxis, ax.yaxis)
     ax.set(xlabel=f"{frame} wavelength (µm)", ylabel=label_y)
     return ax

@@ -108,7 +108,9 @@ def add_colorbar(drawn, label):
     """
     from matplotlib.colors import AsinhNorm
 
-    bar = drawn.axes.figure.colorbar(drawn, ax=drawn.axes, label=label, shrink=0.85)
+    # as high as the image, whatever its shape
+    place = drawn.axes.inset_axes((1.03, 0.0, 0.05, 1.0))
+    bar = drawn.axes.figure.colorbar(drawn, cax=place, label=label)
     if isinstance(drawn.norm, AsinhNorm):
         # from the bright end, as many as the bar has space for
         ticks = []

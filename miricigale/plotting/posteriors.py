@@ -5,7 +5,14 @@ import itertools
 import astropy.units as u
 import numpy as np
 
-from miricigale.plotting.axes import AxesArray, add_borders, legend, resolve_axes, row_mask
+from miricigale.plotting.axes import (
+    AxesArray,
+    add_borders,
+    legend,
+    plain_log_ticks,
+    resolve_axes,
+    row_mask,
+)
 from miricigale.utils.arrays import finite_values, quotient
 
 #: Upper limits: a bar, and an arrow down from it.
@@ -26,6 +33,7 @@ _SPECTRA = (
     ("C8", "-"),
 )
 #: Wavelengths in um that an axis of photometry is labeled with.
+_MOST_ABOVE = 100.0
 _WAVELENGTHS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 #: Part of the largest density above which an axis shows a posterior, and of all its weight for a single value.
 _SHOWN = 0.01
@@ -94,6 +102,7 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
         )
     if log:
         ax.set_xscale("log")
+        plain_log_ticks(ax.xaxis)
     if truth is not None:
         ax.axvline(truth, color="black", linestyle="--", linewidth=1)
     if label is not None:
@@ -275,7 +284,10 @@ def plot_sed_fit(
     _draw_undetected(ax, wave, flux, err, low, negative, bound)
     ax.set(xscale="log", xlim=(0.7 * wave.min(), 1.4 * wave.max()))
     _label_wavelengths(ax)
+    if spectrum is not None:
+        high = _with_lines(high, spectrum, ax.get_xlim())
     ax.set(yscale="log", ylim=(low, high), ylabel="flux density (µJy)")
+    plain_log_ticks(ax.yaxis)
     if parts or groups is not None:
         legend(ax)
     if title is not None:
@@ -306,6 +318,14 @@ def _flux_range(flux, model):
     if not shown.size:
         return 0.1, 10.0
     return shown.min() / 4, shown.max() * 4
+
+
+def _with_lines(high, spectrum, limits):
+    """Return the upper limit of fluxes with the emission lines of a spectrum, up to a hundred times above."""
+    wave = _value(spectrum[0], u.um)
+    flux = _value(spectrum[1], u.uJy)
+    shown = flux[(wave >= limits[0]) & (wave <= limits[1]) & np.isfinite(flux)]
+    return max(high, min(1.3 * shown.max(initial=0.0), _MOST_ABOVE * high))
 
 
 def _draw_spectra(ax, spectra, wave):
@@ -397,6 +417,7 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
     else:
         labels = {"xlabel": "observed wavelength (µm)", "ylabel": "flux density (µJy)"}
     ax.set(xscale="log", yscale="log", **labels)
+    plain_log_ticks(ax.xaxis, ax.yaxis)
     if top > 0:
         ax.set_ylim(1e-5 * top, 3.0 * top)
     return ax
@@ -481,6 +502,7 @@ def plot_recovery(true, mean, std, *, ax=None, name=None, unit="", log=False, **
         ax.plot(ends, ends, color="0.4", linewidth=1)
     if log:
         ax.set(xscale="log", yscale="log")
+        plain_log_ticks(ax.xaxis, ax.yaxis)
     text = name or ""
     if unit:
         text += f" ({unit})"

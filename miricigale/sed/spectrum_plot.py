@@ -4,12 +4,17 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters import FilterSet
+from miricigale.plotting.axes import resolve_axes
 from miricigale.plotting.curves import plot_spectrum
 from miricigale.sed.flux_units import flux_density_unit
 from miricigale.utils.options import check_that
 
 #: Faintest flux density that is shown with the parts, in units of the highest: faint parts span many decades.
 _FAINTEST = 1e-6
+#: Wavelengths at the source in um that are shown, from the Lyman limit to the millimeter.
+_SHOWN_REST = np.array([0.09, 1000.0])
+#: How far beyond the bands a spectrum is shown with them.
+_AROUND_BANDS = 3.0
 
 
 def plot_sed(sed, ax, components, filters, rest_frame, unit, **kwargs):
@@ -47,9 +52,22 @@ def plot_sed(sed, ax, components, filters, rest_frame, unit, **kwargs):
     if components:
         check_that(sed.components, "components", "False for a spectrum without components", True)
         kwargs = {"color": "black", "lw": 1.5, "label": "sum"} | kwargs
-    ax = plot_spectrum(wave, values, ax=ax, **axes, **kwargs)
+    ax = resolve_axes(ax)
+    is_first = not ax.has_data()
+    plot_spectrum(wave, values, ax=ax, **axes, **kwargs)
+    limits = _SHOWN_REST
+    if not rest_frame:
+        limits = limits * (1 + sed.redshift)
     if filters is not None:
-        _plot_bands(sed, FilterSet(filters), ax, rest_frame, unit)
+        filters = FilterSet(filters)
+        _plot_bands(sed, filters, ax, rest_frame, unit)
+        pivots = filters.pivots.to_value(sed.wave.unit)
+        if rest_frame:
+            pivots = pivots / (1 + sed.redshift)
+        limits = np.array([pivots.min() / _AROUND_BANDS, pivots.max() * _AROUND_BANDS])
+    if is_first:
+        # axes with other curves keep their limits
+        _limit_to(ax, wave, values, limits)
     if not components:
         return ax
     low, high = ax.get_ylim()
@@ -60,9 +78,22 @@ def plot_sed(sed, ax, components, filters, rest_frame, unit, **kwargs):
             options = {"label": label, "ls": style, "lw": 1}
             values = part.fnu.to_value(unit, density)
             plot_spectrum(wave, values, ax=ax, **axes, **options)
-    ax.set_ylim(max(low, _FAINTEST * high), high)
+    # a decade below the sum for the parts
+    ax.set_ylim(max(0.1 * low, _FAINTEST * high), high)
     ax.legend(fontsize="small")
     return ax
+
+
+def _limit_to(ax, wave, values, limits):
+    """Show a range of wavelengths, cut to those of a spectrum, and the flux densities in it."""
+    low = max(limits[0], wave.min())
+    high = min(limits[1], wave.max())
+    shown = values[(wave >= low) & (wave <= high) & (values > 0)]
+    if low >= high or not shown.size:
+        return
+    peak = shown.max()
+    ax.set_xlim(low, high)
+    ax.set_ylim(max(shown.min() / 1.5, _FAINTEST * peak), 1.5 * peak)
 
 
 def _plot_bands(sed, filters, ax, rest_frame, unit):

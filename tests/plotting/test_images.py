@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from helpers.errors import refuses
 from helpers.figures import line_data
+from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import (
     add_colorbar,
     asinh_norm,
@@ -186,3 +187,13 @@ def test_all_images_have_one_stretch():
         asinh_places([-1.0, 0.0, 1.0], -3.0, 3.0, 2.0),
         0.5 + np.array([-1, 0, 1]) * (0.5 * np.arcsinh(0.5) / np.arcsinh(1.5)),
     )
+
+
+def test_a_color_bar_is_as_high_as_its_image():
+    figure, axes = new_figure()
+    drawn = axes[0, 0].imshow(np.arange(40.0).reshape(4, 10))
+    bar = add_colorbar(drawn, "flux")
+    figure.draw_without_rendering()
+    of_image = drawn.axes.get_window_extent()
+    of_bar = bar.ax.get_window_extent()
+    assert_allclose([of_bar.y0, of_bar.y1], [of_image.y0, of_image.y1], atol=1.0)

@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior.posterior import cell_edges
+from miricigale.fitting.posterior.quantities import DERIVED_LEVELS
 from miricigale.fitting.results.corner_panels import marked_values
 from miricigale.fitting.results.table_columns import OUTLIER
 from miricigale.sed.cosmology import distance
@@ -188,6 +189,13 @@ def plot_pdf(results, name, ax=None, **kwargs):
     from miricigale.plotting.posteriors import plot_pdf
 
     edges, weights = results.distribution(name)
+    name = results._named(name)
+    quantiles = results._stored(name, "quantiles")
+    n_cells = np.count_nonzero(weights > 1e-3)
+    if quantiles is not None and n_cells < len(quantiles) and np.all(np.diff(quantiles) > 0):
+        # of posteriors between nodes: narrower than the few cells around these
+        edges = quantiles * results.unit(name)
+        weights = np.diff(DERIVED_LEVELS)
     kwargs.setdefault("label", plain_text(name))
     if results.extensive(name):
         kwargs.setdefault("log", bool(edges.value[0] > 0))

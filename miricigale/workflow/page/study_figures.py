@@ -29,6 +29,7 @@ from miricigale.plotting.axes import (
     legend,
     new_figure,
     panels,
+    plain_log_ticks,
     plain_text,
 )
 from miricigale.plotting.comparison import plot_offsets, plot_redshifts
@@ -210,6 +211,7 @@ def disk_figure(study):
     for label, ax in axes.items():
         true, fitted, note = values[label]
         ax.loglog(true, fitted, ".", ms=4, color=MEASURED, alpha=0.6)
+        plain_log_ticks(ax.xaxis, ax.yaxis)
         corner_note(ax, note, "left")
         ax.plot(ends, ends, color=TRUE, lw=1)
         ax.fill_between(ends, ends / 2, ends * 2, color=TRUE, alpha=0.12, lw=0)
