@@ -54,6 +54,8 @@ class _Survey:
         return columns, lost
 
 
+#: Bands that a catalog has at least whose columns are taken for those of a survey.
+_MIN_BANDS = 2
 #: Column names and units of catalogs, by name of the survey.
 SURVEYS = types.MappingProxyType(
     {n: _Survey(**entry) for n, entry in declared("miricigale.filters", "surveys.toml").items()}
@@ -73,3 +75,38 @@ def is_band(name):
     """Tell whether a column is called by a filter of the library, or is the error of one."""
     band = name.removesuffix(error_column(""))
     return band in Filter.names() or band.startswith("sedpy.")
+
+
+def map_names(colnames, *, own_names=True):
+    """
+    Say how catalogs with some columns are read by the map of their survey.
+
+    Parameters
+    ----------
+    colnames : iterable of str
+        Columns of a catalog.
+    own_names : bool, optional
+        Whether maps count whose columns are bands and ``<band>_err``, as any catalog may have them.
+
+    Returns
+    -------
+    text : str
+        Options of the command line and calls; empty if no map has two bands of these columns.
+    """
+    surveys = []
+    for survey, columns in SURVEYS.items():
+        if not own_names and columns.error.endswith("_err"):
+            continue
+        try:
+            ours, _ = columns.columns(colnames)
+        except DataError:
+            # two columns of a band, of which the map says more
+            surveys.append(survey)
+            continue
+        if len(flux_bands(ours)) >= _MIN_BANDS:
+            surveys.append(survey)
+    options = " or ".join(f"--map {survey}" for survey in surveys)
+    calls = " or ".join(f"read_catalog_photometry(path, {survey!r})" for survey in surveys)
+    if not surveys:
+        return ""
+    return f"{options} ({calls} in Python)"

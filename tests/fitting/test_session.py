@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 from helpers.errors import refuses
 from helpers.grids import node_fitter
+from miricigale import BayesFitter, SEDModel
 from miricigale.fitting.posterior.posterior import shares_between
 from miricigale.fitting.results.corner_panels import DrawPanel
 
@@ -255,3 +256,26 @@ def test_distributions_that_are_unknown_have_no_shares(low):
     levels = np.array([[0.0, 1.0], [np.nan, np.nan]])
     shares = shares_between(values, levels, low, None)
     assert_allclose(shares, [1.5 - max(low, 0.5), np.nan])
+
+
+def test_catalogs_of_surveys_are_refused_with_the_map_that_reads_them():
+    bands = ("F814W", "F115W", "F444W")
+    three_d = {"id": [1]}
+    jades = {"ID": [1]}
+    dja = {"id": [1]}
+    for band in bands:
+        three_d |= {f"f_{band}": [9.0], f"e_{band}": [0.5]}
+        jades |= {f"{band}_KRON": [9.0], f"{band}_KRON_e": [0.5]}
+        dja |= {f"{band.lower()}_tot_1": [9.0], f"{band.lower()}_etot_1": [0.5]}
+    model = SEDModel.yang2021(libraries="bundled")
+    fitter = BayesFitter(model, ["F444W", "F115W"], axes={"redshift": [0.5, 1.0]})
+    for fit in (fitter.fit, BayesFitter(model, axes={"redshift": [0.5, 1.0]}).fit):
+        refuses("--map jades .read_catalog_photometry.path, 'jades'.", fit, jades)
+        refuses("--map dja .read_catalog_photometry.path, 'dja'.", fit, dja)
+    # fluxes without a unit are of zero point 25 there, not uJy
+    refuses("no unit: .*has its own unit, which --map 3dhst", fitter.fit, three_d,
+            error=u.UnitsError)  # fmt: skip
+    plain = {"id": [1], "F444W": [1.0], "F444W_err": [0.1], "F115W": [1.0], "F115W_err": [0.1]}
+    with pytest.raises(u.UnitsError) as refusal:
+        fitter.fit(plain)
+    assert "--map" not in str(refusal.value)

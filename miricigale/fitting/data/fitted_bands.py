@@ -1,14 +1,11 @@
 """Bands of a catalog that can be fitted."""
 
 from miricigale.filters.photometry_table import our_names
-from miricigale.filters.surveys import SURVEYS, flux_bands
+from miricigale.filters.surveys import map_names
 from miricigale.fitting.data.likelihood import is_filter, unused_bands
-from miricigale.utils.exceptions import DataError, FitWarning, warn
+from miricigale.utils.exceptions import FitWarning, warn
 from miricigale.utils.options import check_that
 from miricigale.utils.tables import as_table, error_column
-
-#: Bands of a table that a survey's names must match to be meant.
-_MIN_BANDS = 2
 
 
 def bands_of(photometry):
@@ -55,19 +52,8 @@ def bands_with_errors(names, argument):
 
 
 def _maps_for(names):
-    """Say which maps of surveys have some columns; empty if none has two bands of them."""
-    fitting = []
-    for survey, columns in SURVEYS.items():
-        try:
-            ours, _ = columns.columns(names)
-        except DataError:
-            # two columns of a band, of which the map says more
-            fitting.append(survey)
-            continue
-        if len(flux_bands(ours)) >= _MIN_BANDS:
-            fitting.append(survey)
-    if not fitting:
+    """Return what to say of maps that fit the columns of a catalog, or of maps at all."""
+    maps = map_names(names)
+    if not maps:
         return ", or names by --map (read_catalog_photometry in Python)"
-    options = " or ".join(f"--map {survey}" for survey in fitting)
-    calls = " or ".join(f"read_catalog_photometry(path, {survey!r})" for survey in fitting)
-    return f", or {options} ({calls} in Python), whose columns these are"
+    return f", or {maps}, whose columns these are"

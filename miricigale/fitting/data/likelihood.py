@@ -8,6 +8,7 @@ from astropy.table import QTable
 
 from miricigale.filters import Filter
 from miricigale.filters.library import SEDPY
+from miricigale.filters.surveys import map_names
 from miricigale.utils.arrays import nans
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing_values import first_word, own_mask
@@ -414,7 +415,11 @@ def check_fluxes(table, bands, user_names=None):
             else:
                 missing.append(error_column(labels.get(band, band)))
     got = f"columns {list(labels.values())}"
-    check_that(not missing, "photometry", f"a table with the columns {missing}", got)
+    wanted = f"a table with the columns {missing}"
+    maps = map_names(list(labels.values()), own_names=False)
+    if maps:
+        wanted += f", or, of a catalog of the survey, read by {maps}"
+    check_that(not missing, "photometry", wanted, got)
     if without_unit:
         columns = "column"
         if len(without_unit) > 1:
@@ -424,6 +429,8 @@ def check_fluxes(table, bands, user_names=None):
             names += f" and {len(without_unit) - _MAX_LISTED} more"
         msg = f"'photometry' {columns} {names} must be convertible to {FNU}, got no unit: give one, as unit='uJy' "
         msg += "(or 'ABmag', 'mJy') in Python or --flux-unit uJy on the command line"
+        if maps:
+            msg += f"; a catalog of the survey has its own unit, which {maps} knows"
         raise u.UnitsError(msg)
     units = dict.fromkeys(flux_columns(bands), FNU)
     check_units(table, units, "photometry", user_names=labels)
