@@ -211,7 +211,7 @@ def chain():
 @pytest.fixture(scope="module")
 def finer(chain):
     """A fit between the nodes of a finer grid of the chain."""
-    return interpolated(chain[1], 300, chain[0])
+    return interpolated(chain[1], 150, chain[0])
 
 
 @pytest.fixture(scope="module")

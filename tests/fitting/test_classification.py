@@ -107,15 +107,16 @@ def test_upper_limits_and_files_of_template_grids(stars, tmp_path):
 
 @pytest.fixture(scope="module")
 def fitters(stars):
-    """Thin grids of the three classes, in steps of 0.05 in ln(1 + z)."""
+    """Thin grids of the three classes, in steps of 0.05 in ln(1 + z), and few models between their nodes."""
     model, z = SEDModel.survey(), np.expm1(np.arange(0.1, 1.8, 0.05))
     galaxies = {
         "tau": [0.1, 1.0], "age": [0.1, 0.3, 1.0, 3.0], "ebv": [0.0, 0.2, 0.5, 0.8], "q_pah": [2.5],
         "tau97": [5.0], "frac_agn": [0.0, 0.3, 0.7], "redshift": z,
     }  # fmt: skip
     quasars = quasar_axes() | {"redshift": z, "tau97": [5.0]}
+    options = {"model_error": 0.1, "settings": GridSettings(interpolate=150)}
     galaxy, quasar = (
-        BayesFitter(model, BANDS, axes=axes, model_error=0.1) for axes in (galaxies, quasars)
+        BayesFitter(model, BANDS, axes=axes, **options) for axes in (galaxies, quasars)
     )
     star = BayesFitter(template_grid(stars, BANDS), model_error=0.1)
     return {"galaxy": galaxy, "quasar": quasar, "star": star}
