@@ -28,7 +28,7 @@ SMALLER = {
     "how_to/fit/galaxy_quasar_star": {"n = 20": "n = 6"},
     "how_to/fit/large_catalog": {"n = 60": "n = 16", '"chunk_rows": 15': '"chunk_rows": 4'},
     "how_to/fit/mock_analysis": {"[bright][:36]": "[bright][:12]"},
-    "how_to/fit/model_errors": {"n = 120": "n = 40"},
+    "how_to/fit/model_errors": {"n = 120": "n = 24"},
     "how_to/fit/photometric_redshifts": {"[:220]": "[:130]"},
     "how_to/measure/image_offsets": {"size=50 ": "size=36 "},
     "how_to/measure/large_mosaic": {"size=30 ": "size=18 ", "patch_size=300": "patch_size=180"},
@@ -38,6 +38,7 @@ SMALLER = {
     "tutorials/agn_from_images": {
         "width = 45 ": "width = 27 ",
         "n_injections=24": "n_injections=8",
+        "calibrate=False": "calibrate=False, interpolate=60",
     },
     "tutorials/by_hand": {"n_groups=60, n_integrations=2": "n_groups=20, n_integrations=1"},
     "tutorials/large_catalogs": {"n = 240": "n = 80", "chunk_rows=60": "chunk_rows=20"},
