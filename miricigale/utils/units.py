@@ -24,7 +24,7 @@ DN = u.adu
 TIME = u.s
 RATE = u.adu / u.s
 ANGLE = u.arcsec
-
+_FLUX_DENSITY = FNU.physical_type
 
 #: Flux density of AB magnitude 0, and with it the unit of the SDSS and the Legacy Surveys.
 _MAGGY = 3630.780547701013 * u.Jy
@@ -218,7 +218,8 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     """
     unit = u.Unit(unit)
     value, mask = without_mask(value)
-    if isinstance(own_unit(value), u.UnitBase) and unit.is_equivalent(u.Jy):
+    # not is_equivalent, which tries the equivalency of redshifts that astropy.cosmology enables
+    if isinstance(own_unit(value), u.UnitBase) and unit.physical_type == _FLUX_DENSITY:
         # maggies, which astropy ties to no flux
         flux = flux_unit(value.unit)
         if flux is not None:
