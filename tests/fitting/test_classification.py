@@ -180,8 +180,14 @@ def test_spectra_at_redshifts_are_seen_behind_the_medium():
     refuses("'redshift' must be finite, asc", template_grid, spectra, bands, redshift=[2, 1])
 
 
+@pytest.fixture(scope="module")
+def dots():
+    """Spectra of little red dots, of all values by default."""
+    return red_dots()
+
+
 @pytest.mark.slow
-def test_little_red_dots_are_no_dwarfs(fitters):
+def test_little_red_dots_are_no_dwarfs(fitters, dots):
     """Broken power laws with H alpha of 700 A are red dots, at 0.15 of 1 + z; galaxies stay such."""
     bands = [
         "acs.f814w",
@@ -197,9 +203,9 @@ def test_little_red_dots_are_no_dwarfs(fitters):
     line = np.abs(wave / 0.6563 - 1) < 0.003
     fnu[line] *= 1.0 + 700.0 / (0.006 * 6563.0)
     grid = template_grid({"dot": SED(wave * u.um, fnu * u.uJy)}, bands, redshift=z)
-    dots = noisy(grid.galaxy[:, 0], 12, 3, z.astype(str), bands)
+    light = noisy(grid.galaxy[:, 0], 12, 3, z.astype(str), bands)
     error = {"model_error": 0.1}
-    shapes = template_grid(red_dots(), bands, redshift=np.expm1(np.arange(1.1, 2.3, 0.04)))
+    shapes = template_grid(dots, bands, redshift=np.expm1(np.arange(1.1, 2.3, 0.04)))
     nodes = GridSettings(interpolate=0)
     classes = {"red_dot": BayesFitter(shapes, settings=nodes, **error)}
     axes = {name: axis.values for name, axis in fitters["galaxy"].priors.axes.items()}
@@ -208,7 +214,7 @@ def test_little_red_dots_are_no_dwarfs(fitters):
     galaxies = BayesFitter(model, bands, axes=axes, settings=nodes, **error)
     classes = {"galaxy": galaxies} | classes
     with without_warnings():
-        found = {name: fitter.fit(dots) for name, fitter in classes.items()}
+        found = {name: fitter.fit(light) for name, fitter in classes.items()}
     assert np.sum(compare_classes(found)["class"] == "red_dot") >= 11
     middle = found["red_dot"].median("redshift").value
     assert np.median(np.abs(middle - z) / (1 + z)) < 0.15
@@ -257,7 +263,7 @@ WITH_SPECTRA = """
 
 
 @pytest.mark.slow
-def test_redshifts_of_little_red_dots_are_those_of_their_spectra():
+def test_redshifts_of_little_red_dots_are_those_of_their_spectra(dots):
     """Published photometry and redshifts, none of which the models were made with."""
     rows = np.array([line.split() for line in WITH_SPECTRA.split("\n") if line], dtype=float)
     z, (flux, error) = rows[:, 0], 1e-3 * np.array([rows[:, 1:10], rows[:, 10:]])
@@ -265,7 +271,7 @@ def test_redshifts_of_little_red_dots_are_those_of_their_spectra():
     bands = ["acs.f606w", "acs.f814w", *(f"nircam.{name}" for name in names)]
     axis = red_dot_axes()["redshift"][::2]
     fitter = BayesFitter(
-        template_grid(red_dots(), bands, redshift=axis),
+        template_grid(dots, bands, redshift=axis),
         model_error=0.1,
         priors={"redshift": red_dot_prior(axis)},
         settings=GridSettings(interpolate=0),
