@@ -28,6 +28,13 @@ def test_uses_equivalencies():
     assert_allclose(wave, 1)
 
 
+def test_a_nanomaggy_is_of_magnitude_22_5():
+    """In any unit of flux density; of the zero point of AB magnitudes (Oke & Gunn 1983) 3631 Jy."""
+    want = (22.5 * u.ABmag).to_value(u.uJy)
+    assert_allclose(to_array(1 * u.nmgy, u.uJy, "x"), want, rtol=1e-12)
+    assert_allclose(to_array([1e9] * u.nmgy, u.Jy, "x"), 1e3 * want, rtol=1e-12)
+
+
 def test_refuses_wrong_shape_and_nan():
     match = r"'x' must be an array of 1 dimension\(s\), got shape"
     refuses(match, to_array, np.ones((2, 2)) * u.s, u.s, "x", ndim=1)
