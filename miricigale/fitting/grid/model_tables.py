@@ -38,8 +38,9 @@ _COLUMN_TOLERANCE = 0.01
 _NEGLIGIBLE_FORMED = 0.01
 #: Redshifts at which axes are refined.
 _N_LINE_REDSHIFTS = 5
-#: Largest step of the tables in ln(1 + z): lines, breaks and features of dust cross the edges of bands.
-REDSHIFT_STEP = 0.01
+#: Largest step of the tables in ln(1 + z): lines, breaks and features of dust cross the edges of bands. Cells of
+#: the redshifts of surveys are divided by three.
+REDSHIFT_STEP = 0.02 / 3
 #: Bursts differ by less than this along an axis that has no effect on them.
 _NO_EFFECT = 1e-6
 #: Largest number of tables kept for further fitters of a process (some 50 MB each), the last used at the end.

@@ -18,7 +18,7 @@ LEAST = 1e-290
 #: Largest relative error of the interpolation along one axis for 95 % of fluxes.
 TOLERANCE = 0.005
 #: Largest number of models of one table.
-MAX_MODELS = 6144
+MAX_MODELS = 9216
 #: Number of lines along which an axis is refined.
 _N_LINES = 24
 #: Largest number of times that a cell is halved.
