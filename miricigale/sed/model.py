@@ -22,9 +22,9 @@ from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import default_values, parameter_table
 from miricigale.utils.exceptions import argument_error, config_error, unknown_name
-from miricigale.utils.interactive import Interactive
+from miricigale.utils.interactive import Interactive, ValuesByName
 from miricigale.utils.meta import provenance
-from miricigale.utils.named_values import ValuesByName, without_none
+from miricigale.utils.named_values import without_none
 from miricigale.utils.options import check_that
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.units import WAVE

@@ -17,9 +17,8 @@ from miricigale.sed.spectrum_parts import BandFlux, Parts, component_of, points_
 from miricigale.sed.spectrum_tables import spectrum_columns, spectrum_table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import reading
-from miricigale.utils.interactive import WithTable
+from miricigale.utils.interactive import ValuesByName, WithTable
 from miricigale.utils.meta import full_meta
-from miricigale.utils.named_values import ValuesByName
 from miricigale.utils.options import check_that
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.table_files import read_table, write_table

@@ -161,3 +161,22 @@ class Tabular(WithTable):
         table = self.to_table()
         table.add_index("id")
         return table.loc
+
+
+class ValuesByName(dict):
+    """
+    Values by name, which a call gives too: ``sed.derived("sfr")``; errors say which names there are.
+
+    Each is printed on a line of its own.
+    """
+
+    def __missing__(self, name):
+        raise unknown_name("value", name, self)
+
+    def __call__(self, name=None):
+        if name is None:
+            return self
+        return self[name]
+
+    def __str__(self):
+        return "\n".join(f"{name}: {value}" for name, value in self.items())

@@ -2,8 +2,6 @@
 
 import dataclasses
 
-from miricigale.utils.exceptions import unknown_name
-
 
 def attributes(instance, names):
     """Return attributes of an object by name, in the order of ``names``."""
@@ -53,15 +51,3 @@ def convert_values(function, mapping):
 def rows_of(columns, rows):
     """Return some rows (an index, a slice or a mask) of columns by name."""
     return {name: column[rows] for name, column in columns.items()}
-
-
-class ValuesByName(dict):
-    """Values by name, which a call gives too: ``sed.derived("sfr")``; errors say which names there are."""
-
-    def __missing__(self, name):
-        raise unknown_name("value", name, self)
-
-    def __call__(self, name=None):
-        if name is None:
-            return self
-        return self[name]
