@@ -6,7 +6,6 @@ from astropy.table import Table
 
 from miricigale.utils.curve_columns import FLUX_NAME, curve_columns
 from miricigale.utils.exceptions import ModelWarning, argument_error, units_error, warn
-from miricigale.utils.interactive import Interactive
 from miricigale.utils.missing_values import floats
 from miricigale.utils.options import check_that
 from miricigale.utils.units import FNU, WAVE, is_ascending, own_unit, to_array
@@ -105,7 +104,7 @@ def _wave_and_flux(sed, bands):
         if wave is None:
             wave = _inside(bands)
         return wave, sed(wave, flux_unit=u.Jy)
-    if callable(sed) and not isinstance(sed, Interactive):
+    if callable(sed):
         wave = _inside(bands)
         return wave, sed(wave)
     wanted = "a spectrum: an SED, (wavelengths, flux densities), or one of specutils or synphot"

@@ -57,12 +57,6 @@ class Image(Interactive, CCDData):
             # a filter of the user's own has its own name
             self.meta["filter"] = find_filter(name) or name
 
-    def __call__(self, *args, **keywords):
-        if args or keywords:
-            return super().__call__(*args, **keywords)
-        # model_image and the like are methods of other packages
-        return self
-
     def __repr__(self):
         if self.ndim == 0:
             # a sum or a mean of pixels

@@ -72,7 +72,10 @@ def attribute_hint(cls, name, names):
     >>> attribute_hint(Filter, "synthetic_fluxe", ["pivot", "synthetic_flux"])
     "did you mean 'synthetic_flux'?"
     """
-    sentences = _sentences(cls)
+    sentences = {}
+    for base in reversed(cls.__mro__):
+        hints = declared("miricigale.utils", "hints.toml").get(base.__name__, {})
+        sentences |= hint_sentences(hints)
     if name in sentences:
         return sentences[name]
     public = [candidate for candidate in names if not candidate.startswith("_")]
@@ -82,41 +85,11 @@ def attribute_hint(cls, name, names):
     suggestions = names_sharing_words(name, sentences)
     if suggestions:
         return sentences[suggestions[0]]
-    return general_hint(cls, public)
-
-
-def general_hint(cls, names):
-    """
-    Say what an object has: the sentence of its class in ``hints.toml``, else its public names if they are few.
-
-    Parameters
-    ----------
-    cls : type
-        Class of the object.
-    names : iterable of str
-        Names of its attributes.
-
-    Returns
-    -------
-    hint : str
-        Empty where there is no sentence and there are many names.
-    """
-    sentences = _sentences(cls)
     if _OTHERWISE in sentences:
         return sentences[_OTHERWISE]
-    public = [name for name in names if not name.startswith("_")]
     if len(public) <= _MAX_LISTED:
         return f"it has {', '.join(public)}"
     return ""
-
-
-def _sentences(cls):
-    """Sentences for attributes of a class and its bases, by name."""
-    sentences = {}
-    for base in reversed(cls.__mro__):
-        hints = declared("miricigale.utils", "hints.toml").get(base.__name__, {})
-        sentences |= hint_sentences(hints)
-    return sentences
 
 
 def near_names(name, candidates):

@@ -2,12 +2,10 @@
 
 import abc
 import html
-import inspect
 import operator
 
-from miricigale.utils.attribute_hints import UnknownAttributeError, general_hint
+from miricigale.utils.attribute_hints import UnknownAttributeError
 from miricigale.utils.exceptions import unknown_name
-from miricigale.utils.other_keywords import with_sentences
 from miricigale.utils.package_tables import declared
 from miricigale.utils.positions import sky_as_angles
 
@@ -37,28 +35,10 @@ class Interactive(metaclass=_Hinted):
 
     An attribute that a user of other packages knows by another name is found by it. The quantities that an object
     holds are attributes, which sessions complete. In notebooks an object is shown as a table of what it holds.
-    Public methods answer arguments that they do not take with a sentence, and so does an object that is called as
-    if it were a function.
     """
 
     #: Attributes, such as the exposure of a ramp, whose own values are found through the object too.
     _parts = ()
-
-    def __init_subclass__(cls, **options):
-        super().__init_subclass__(**options)
-        for name, value in list(vars(cls).items()):
-            if name.startswith("_"):
-                continue
-            if inspect.isfunction(value):
-                setattr(cls, name, with_sentences(value))
-            elif isinstance(value, classmethod) and inspect.isfunction(value.__func__):
-                setattr(cls, name, classmethod(with_sentences(value.__func__)))
-
-    def __call__(self, *args, **keywords):
-        name = type(self).__name__
-        hint = general_hint(type(self), dir(self))
-        msg = f"an object {name!r} is no function, and attributes stand without parentheses; {hint}"
-        raise TypeError(msg.removesuffix("; "))
 
     @property
     def _other_names(self):
@@ -86,7 +66,7 @@ class Interactive(metaclass=_Hinted):
             # half-made copies have no parts yet
             value = getattr(vars(self).get(part), name, None)
             # methods of a part would return another object than users expect
-            if value is not None and not inspect.isroutine(value):
+            if value is not None and not callable(value):
                 return value
         raise UnknownAttributeError(self, name)
 

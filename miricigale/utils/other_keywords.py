@@ -57,46 +57,6 @@ def takes_other_keywords(target=None, *, options_of=()):
     return _renaming(target, target.__qualname__.removesuffix(".__init__"), {}, options_of)
 
 
-def with_sentences(function):
-    """
-    Let a function answer a call whose arguments it does not take as those of `takes_other_keywords` do.
-
-    Nothing is done, nor looked up, in calls that it takes.
-
-    Parameters
-    ----------
-    function : callable
-
-    Returns
-    -------
-    function : callable
-        The same where calls are checked already.
-    """
-    if hasattr(function, "keyword_names"):
-        return function
-
-    @functools.wraps(function)
-    def call(*args, **keywords):
-        try:
-            return function(*args, **keywords)
-        except TypeError:
-            if _takes(function, args, keywords):
-                raise
-        # the function did not begin
-        return takes_other_keywords(function)(*args, **keywords)
-
-    return call
-
-
-def _takes(function, args, keywords):
-    """Whether a function takes these arguments."""
-    try:
-        inspect.signature(function).bind(*args, **keywords)
-    except TypeError:
-        return False
-    return True
-
-
 def _renaming(function, label, settings, options_of=()):
     """Return the function, which takes the other keywords of a label, those of settings and of what it calls."""
     parameters = dict(inspect.signature(function).parameters)

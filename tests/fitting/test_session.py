@@ -80,8 +80,6 @@ def test_calls_that_results_do_not_take_end_in_those_that_they_do(results):
     assert_array_equal(results.loc(key).chi2, results.loc[key].chi2)
     refuses("plot_sed.id., or results.0.*takes ax, model, filters", results[0].plot_sed, *range(9),
             error=TypeError)  # fmt: skip
-    refuses("is no function.*results.name., mean.name.", results, "mass", error=TypeError)
-    refuses("FitResults.mean.. needs 'name'", results.mean, error=TypeError)
 
 
 def test_a_table_without_units_is_fitted_in_the_unit_that_is_said(fitter, photometry, results):
