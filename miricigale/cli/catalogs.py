@@ -4,6 +4,8 @@ import contextlib
 import inspect
 import sys
 
+import numpy as np
+
 from miricigale.cli.options import filled, read_input, refuse, workers
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import attributes, without_none
@@ -169,8 +171,23 @@ def photometry(args):
     if to_screen:
         table.write(sys.stdout, format="ascii.ecsv")
     else:
-        print(f"{len(table)} sources in {args.output}; page: {page}")
+        text = f"{len(table)} sources in {args.output}"
+        n_new = _count_new(table)
+        if n_new:
+            text += f", {n_new} of them found on the residual (flag NOT_IN_CATALOG)"
+        print(f"{text}; page: {page}")
     return 0
+
+
+def _count_new(table):
+    """Count the sources of a table of photometry that the prior does not have."""
+    from miricigale.photometry import ForcedFlags
+
+    is_new = np.zeros(len(table), bool)
+    for name in table.colnames:
+        if name.endswith("_flags"):
+            is_new |= (np.ma.filled(table[name], 0) & int(ForcedFlags.NOT_IN_CATALOG)) != 0
+    return int(is_new.sum())
 
 
 def _prior_of(args, path):

@@ -119,6 +119,11 @@ def test_linear_model_has_the_posterior_and_evidence_of_the_closed_form(engine):
     assert_allclose(results[0].samples()["a"], drawn["a"])
     assert results[0].samples("b").colnames == results.samples(0, "b").colnames == ["b"]
     refuses("'key' must be the id of an object", results.samples)
+    few = results[0].samples(n_draws=100, seed=3)
+    assert_allclose(few["a"].value.mean(), mean[0], atol=0.4 * np.sqrt(covariance[0, 0]))
+    assert set(few["a"].value) <= set(drawn["a"].value)
+    assert_array_equal(few["a"], results[0].samples(n_draws=100, seed=3)["a"])
+    refuses("'n_draws' must be at most", results.samples, 0, n_draws=10**6)
     both = np.cov(drawn["a"].value, drawn["b"].value)
     # 1000 draws of two variables that are correlated by 0.43
     assert_allclose(both, covariance, atol=0.15 * np.sqrt(np.prod(np.diag(covariance))))

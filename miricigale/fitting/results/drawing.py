@@ -11,14 +11,15 @@ from miricigale.sed.cosmology import distance
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.named_values import places
 from miricigale.utils.options import check_names, check_that
+from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_table
-from miricigale.utils.units import FNU, to_array
+from miricigale.utils.units import FNU, check_count, to_array
 
 #: Parameters of a corner plot by default, in their order.
 CORNER = ("redshift", "stellar_mass", "sfr", "a_v", "frac_agn")
 
 
-def samples(results, key=None, *names):
+def samples(results, key=None, *names, n_draws=None, seed=None):
     """
     Tabulate the draws of a sampler from the posterior of one object, all of the same weight.
 
@@ -28,6 +29,10 @@ def samples(results, key=None, *names):
         Id of the object; left out of a single one: ``results[0].samples()``.
     *names : str, optional
         Parameters to keep; all by default.
+    n_draws : int, optional
+        Number of draws, taken at random; all by default.
+    seed : int, optional
+        Seed of these.
 
     Returns
     -------
@@ -61,6 +66,15 @@ def samples(results, key=None, *names):
     columns = {n: (u.Quantity(v, results.unit(n)), results._meaning(n)) for n, v in values}
     if names:
         columns = {name: columns[name] for name in names}
+    if n_draws is not None:
+        n_all = len(result.draws)
+        n_draws = check_count(n_draws, "n_draws")
+        check_that(
+            n_draws <= n_all, "n_draws", f"at most {n_all}, the draws that there are", n_draws
+        )
+        rng = stream(check_seed(seed))
+        rows = np.sort(rng.choice(n_all, n_draws, replace=False))
+        columns = {name: (values[rows], text) for name, (values, text) in columns.items()}
     return described_table(columns, dict(results.meta) | {"id": str(result.ids)})
 
 
