@@ -88,7 +88,11 @@ def test_a_band_that_is_not_fitted_is_predicted(grid):
         ({"settings": SamplerSettings()}, ValueError, "'settings' must be GridSettings"),
         ({"filters": ["band0", "band0"]}, ValueError, "must be different names, at least one"),
         ({"filters": []}, ValueError, "'filters' must be different names, at least one"),
-        ({"priors": ["tau"]}, ValueError, "'priors' must be a dict of parameters, got list"),
+        (
+            {"priors": ["tau"]},
+            ValueError,
+            "'priors' must be a dict of parameter name to prior, got list",
+        ),
         ({"n_bands_min": True}, ValueError, "'n_bands_min' must be an integer >= 1, got True"),
         ({"scale_error": "no"}, ValueError, "'scale_error' must be True, False or None, got 'no'"),
         ({"n_bands_min": 0}, ValueError, "'n_bands_min' must be an integer >= 1"),

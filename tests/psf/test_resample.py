@@ -216,7 +216,7 @@ MANY = [
     (average_psf, ([BLOB, ON_SKY],), {}, "'psfs' must be alike in frame"),
     (average_psf, ([BLOB, blob(1.0, 0.0, scale=0.06)],), {}, "'psfs' must be alike in pixel_scale"),
     (average_psf, ([BLOB, blob(1.0, 0.0, n=101)],), {}, r"'psfs' must be alike in (shape|origin)"),
-    (average_psf, ([],), {}, "'psfs' must be at least one"),
+    (average_psf, ([],), {}, "'psfs' must be a list of PSFs, at least one"),
     (psf_mosaic, (BLOB, FINE), {}, "'pa' must be the position angle"),
     (psf_mosaic, (ON_SKY, FINE), {"resampling": "lanczos"}, "'resampling' must be 'drizzle' or N"),
     (psf_mosaic, (ON_SKY, 0 * FINE), {}, "'pixel_scale' must be positive"),

@@ -148,7 +148,7 @@ class MockResult:
     >>> mock = mock_analysis(fitter, fitter.fit(photometry), photometry, seed=1)
     >>> mock
     <MockResult of 2 objects, 2 fitted>
-    >>> mock.true("redshift").round(2)
+    >>> mock.true("redshift").round(1)
     <Quantity [0.5, 1. ]>
     """
 

@@ -568,7 +568,8 @@ def read_mosaic(path, **options):
     >>> image = read_mosaic("f444w_sci.fits.gz", weight="f444w_wht.fits.gz")  # doctest: +SKIP
     """
     wanted = "the path of a file; miricigale.photometry.chi_image joins several images"
-    check_that(is_path(path), "path", wanted, type(path).__name__)
+    is_file = is_path(path) or isinstance(path, fits.HDUList)
+    check_that(is_file, "path", wanted, type(path).__name__)
     return MosaicFile(path, **options).read()
 
 
