@@ -1,6 +1,5 @@
 """BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 from miricigale.filters.band_names import known_filter
@@ -9,6 +8,7 @@ from miricigale.fitting.data import fitted_bands
 from miricigale.fitting.data.likelihood import PhotometryReader, filter_names, per_band
 from miricigale.fitting.fitter_options import (
     check_nuclei,
+    check_priors,
     check_scale_error,
     chosen_settings,
     errors_of_expected_flux,
@@ -37,7 +37,7 @@ from miricigale.fitting.survey.defaults import (
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.sed.presets import grid_name
 from miricigale.utils.meta import provenance
-from miricigale.utils.options import check_that, check_type
+from miricigale.utils.options import check_that
 from miricigale.utils.other_keywords import takes_other_keywords
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import check_count
@@ -229,8 +229,7 @@ class BayesFitter(CatalogFits):
         if on_grid and default_axes is not axes:
             changed_axes = axes
             axes = default_axes
-        if priors is not None:
-            check_type(priors, "priors", Mapping, "a dict of parameter name to prior")
+        check_priors(priors)
         self.curves = own_curves(filters)
         self._options = {
             "model": model,

@@ -1,5 +1,7 @@
 """Checks of the options of a fitter, before anything is made of them."""
 
+from collections.abc import Mapping
+
 from miricigale.fitting.data.likelihood import filter_names, is_filter
 from miricigale.fitting.data.nuclei import WHOLE
 from miricigale.fitting.data.settings import GridSettings, SamplerSettings
@@ -66,6 +68,12 @@ def check_nuclei(nuclei, engine):
     is_choice = isinstance(nuclei, bool) or nuclei == WHOLE
     check_that(is_choice, "nuclei", f"True or False, or {WHOLE!r}", repr(nuclei))
     check_that(engine == "grid" or not nuclei, "nuclei", "False with a sampler", repr(nuclei))
+
+
+def check_priors(priors):
+    """Raise a `ValueError` if ``priors`` is neither None nor a dict."""
+    if priors is not None:
+        check_type(priors, "priors", Mapping, "a dict of parameter name to prior")
 
 
 def errors_of_expected_flux(bands, error_part):

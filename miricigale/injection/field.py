@@ -189,19 +189,12 @@ class PriorField:
         n = 0
         if sources is not None:
             n = len(sources)
-        file = self.file
-        light = None
-        added_variance = None
-        if image_file is not None:
-            file = image_file
-        elif n:
-            light, added_variance = light_with_photons(self, sources, psfs[0], photons)
         prior_light = None
         if n:
             prior_light = light_on_file(
                 inputs.highres, sources, sources["prior_flux"], psfs[1], self.n_threads
             )
-        image = file.read(light, added_variance)
+        image = image_with_sources(self, sources, psfs, photons, image_file)
         pixels = Pixels(inputs.highres.read(prior_light), [], {self.band: image})
         segments, catalog = inputs.find_sources(pixels, inputs.catalog)
         detected = inputs.segmentation is None and inputs.catalog is None
@@ -247,32 +240,31 @@ class PriorField:
         return fitted_shapes(pixels.prior, segments, catalog, psf, self.n_threads)
 
 
-def light_with_photons(field, sources, psf, photons):
+def image_with_sources(field, sources, psfs, photons, image_file=None):
     """
-    Return the light of sources on the image of a field, with its photon noise.
+    Read the image of a field with the light of sources and its photon noise.
 
     Parameters
     ----------
     field : `PriorField` or `ImageField`
         The field.
-    sources : `~astropy.table.QTable`
-        ``sky``, ``profile``, shapes and ``flux``.
-    psf : `~miricigale.psf.InstrumentPSF`
-        PSF of the image in the frame of the sky.
-    photons : dict or None
+    sources, psfs, photons, image_file
         As for `PriorField.measure`.
 
     Returns
     -------
-    light : `~numpy.ndarray`, shape (ny, nx)
-        In MJy/sr.
-    variance : `~numpy.ndarray`, shape (ny, nx), or None
-        By which the variance of the image grows, in (MJy/sr)^2.
+    image : `~astropy.nddata.CCDData`
+        In MJy/sr; its variance grows by that of the photon noise where its errors have such noise.
     """
-    light = light_on_file(field.file, sources, sources["flux"], psf, field.n_threads)
-    if photons is None:
-        return light, None
-    return field.photon_noise.add(light, **photons)
+    if image_file is not None:
+        return image_file.read()
+    if sources is None or not len(sources):
+        return field.file.read()
+    light = light_on_file(field.file, sources, sources["flux"], psfs[0], field.n_threads)
+    added_variance = None
+    if photons is not None:
+        light, added_variance = field.photon_noise.add(light, **photons)
+    return field.file.read(light, added_variance)
 
 
 def joined_segments(segments, detected, places):
@@ -370,14 +362,7 @@ class ImageField:
         n = 0
         if sources is not None:
             n = len(sources)
-        file = self.file
-        light = None
-        added_variance = None
-        if image_file is not None:
-            file = image_file
-        elif n:
-            light, added_variance = light_with_photons(self, sources, psfs[0], photons)
-        image = own_pixels(file.read(light, added_variance))
+        image = own_pixels(image_with_sources(self, sources, psfs, photons, image_file))
         segments = None
         if former is None:
             segmentation, catalog = detect_sources(image, preset=self.preset)

@@ -32,8 +32,9 @@ _SPECTRA = (
     ("C6", ":"),
     ("C8", "-"),
 )
-#: Wavelengths in um that an axis of photometry is labeled with.
+#: Highest emission line that is shown, over the upper limit by the fluxes.
 _MOST_ABOVE = 100.0
+#: Wavelengths in um that an axis of photometry is labeled with.
 _WAVELENGTHS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 #: Part of the largest density above which an axis shows a posterior, and of all its weight for a single value.
 _SHOWN = 0.01

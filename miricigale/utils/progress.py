@@ -8,9 +8,7 @@ from tqdm import tqdm
 
 #: Seconds between lines where no bar is drawn.
 _EVERY = 60.0
-
-
-#: Seconds after which a bar that nobody asked for is drawn.
+#: Seconds after which a bar is drawn that shows by default in interactive sessions.
 _DELAY = 3.0
 
 
